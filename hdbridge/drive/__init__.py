@@ -1,0 +1,1 @@
+"""CiA-402 over CANopen: states, objects, PDOs, boot-up, supervision."""

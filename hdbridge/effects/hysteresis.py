@@ -1,0 +1,196 @@
+"""The nonlinear-elastic part: hysteresis of the flexspline after each reversal of the motor.
+
+The law is the rolling-friction law of the transmission-error literature, made exact in three places where it
+is usually left open:
+
+* At a reversal the error is continuous: each branch starts from the value that the last one reached, and
+  rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
+* It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would
+  be a relay that jumps by twice the offset at each reversal.)
+* At rest the last direction holds.
+
+For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised angle must not be fed in: one
+encoder count of chatter is several arcseconds. Drive it from the command.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Motion, Shape, Start, Tracker
+
+
+def rise(xi: FloatArray, n: float) -> FloatArray:
+    """The branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
+
+    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; written with expm1 so that it is
+    exact on both sides of n = 2 and through it.
+    """
+    clipped = np.minimum(xi, 1.0)
+    result = np.zeros_like(clipped)
+    inside = clipped > 0.0
+    logs = -np.log(clipped[inside])
+    m = 2.0 - n
+    bulge = logs if m == 0.0 else np.expm1(m * logs) / m
+    result[inside] = clipped[inside] * (1.0 + bulge)
+    return result
+
+
+def rise_at(xi: float, n: float) -> float:
+    """`rise` for one number, in plain floats for the control loop."""
+    if xi <= 0.0:
+        return 0.0
+    if xi >= 1.0:
+        return 1.0
+    log = -math.log(xi)
+    m = 2.0 - n
+    return xi * (1.0 + (log if m == 0.0 else math.expm1(m * log) / m))
+
+
+class Hysteresis(Effect):
+    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, limited to the offset."""
+
+    name: ClassVar[str] = "hysteresis"
+    about: ClassVar[Cause] = Cause(
+        title="nonlinear-elastic transmission error (hysteresis)",
+        equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; xi = |theta_M - theta_M,rev| / width",
+        signature="a loop of constant height between the two directions; after a reversal it takes a fixed motor angle to cross",
+        consequence="the load arrives short of its target, from either side",
+        remedy="compensate it; it grows with preload and friction in the mesh",
+        experiment="slow sines of several amplitudes, some smaller than the width",
+        aliases=("backlash",),
+        source="rolling-friction law with exponent n; the height is twice the offset",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("width_deg", 0.5, 120.0, logarithmic=True),
+        Shape("exponent", 1.02, 4.0),
+    )
+
+    offset_arcsec: Annotated[
+        float, Field(ge=0, le=3600, description="half the height of the loop, at the load")
+    ]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        return self.offset_arcsec * self._unit(motion.motor_deg, start)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; its first `advance` only says where the motor stands."""
+        return _HysteresisTracker(self.offset_arcsec, self.width_deg, self.exponent, start)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """The loop of unit offset, shape (n, 1): the law is homogeneous in its offset."""
+        return self._unit(motion.motor_deg, start)[:, np.newaxis]
+
+    def coefficients(self) -> FloatArray:
+        """The offset, arcsec, shape (1,)."""
+        return np.array([self.offset_arcsec])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Another offset, and another width and exponent where given."""
+        return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
+
+    def bound_arcsec(self) -> float:
+        """The offset."""
+        return self.offset_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: along its path hysteresis only rises."""
+        return 0.0
+
+    def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
+        """The loop for an offset of one, branch by branch."""
+        result = np.empty(len(motor_deg))
+        if not len(motor_deg):
+            return result
+        turning, signs = branches(motor_deg, start)
+        value = float(start.value)
+        result[: turning[0] + 1] = value
+        virgin = start is Start.VIRGIN
+        for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
+            span = slice(first + 1, last + 1)
+            xi = np.abs(motor_deg[span] - motor_deg[first]) / self.width_deg
+            height = rise(2.0 * xi, self.exponent) if virgin else 2.0 * rise(xi, self.exponent)
+            branch = np.minimum(sign * value + height, 1.0)
+            result[span] = sign * branch
+            value = float(result[last])
+            virgin = False
+        return result
+
+
+def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
+    """Indices between which the motor moves in one direction (rest included), and that direction.
+
+    Returns ``turning`` of length b + 1 (first index, each turning point, last index) and ``signs`` of length
+    b. A saturated start counts as a direction: going on in it begins no new branch worth telling apart.
+    """
+    steps = np.sign(np.diff(motor_deg))
+    moving = np.flatnonzero(steps)
+    if not len(moving):
+        return [len(motor_deg) - 1], []
+    held = steps[moving]
+    change = np.flatnonzero(np.diff(held)) + 1
+    turning = [
+        0 if start is Start.VIRGIN else int(moving[0]),
+        *moving[change].tolist(),
+        len(motor_deg) - 1,
+    ]
+    return turning, [int(held[0]), *held[change].astype(int).tolist()]
+
+
+class _HysteresisTracker(Tracker):
+    """State: the present branch (where it began, from which value, in which direction) and the last angle."""
+
+    __slots__ = (
+        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_value", "_virgin", "_width",
+    )  # fmt: skip
+
+    def __init__(self, offset: float, width: float, exponent: float, start: Start) -> None:
+        self._offset = offset
+        self._width = width
+        self._exponent = exponent
+        self._sign = start.value
+        self._value = start.value * offset
+        self._virgin = start is Start.VIRGIN
+        self._angle: float | None = None
+        self._branch_angle = 0.0
+        self._branch_value = self._value
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        last = self._angle
+        if last is None or motor_deg == last:
+            return self._value
+        sign = 1 if motor_deg > last else -1
+        if sign == self._sign:
+            return self._on_branch(motor_deg, self._branch_angle, self._branch_value, sign, self._virgin)
+        return self._on_branch(motor_deg, last, self._value, sign, self._virgin and self._sign == 0)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        last = self._angle
+        if last is None:
+            self._angle = self._branch_angle = motor_deg
+            return self._value
+        value = self.peek(motor_deg, moment)
+        if motor_deg != last:
+            sign = 1 if motor_deg > last else -1
+            if sign != self._sign:
+                self._virgin = self._virgin and self._sign == 0
+                self._branch_angle, self._branch_value, self._sign = last, self._value, sign
+            self._angle = motor_deg
+            self._value = value
+        return value
+
+    def _on_branch(self, motor_deg: float, origin: float, value: float, sign: int, virgin: bool) -> float:
+        xi = abs(motor_deg - origin) / self._width
+        if virgin:
+            height = self._offset * rise_at(2.0 * xi, self._exponent)
+        else:
+            height = 2.0 * self._offset * rise_at(xi, self._exponent)
+        return sign * min(sign * value + height, self._offset)

@@ -1,0 +1,58 @@
+"""Every error that hdbridge raises on purpose, and the exit status that a command gives it.
+
+    HdbridgeError
+    ├── InputError        2   a file, option or value is wrong: nothing was written, nothing moved
+    ├── BusError          3   the CAN interface cannot be opened, or it went away
+    ├── DriveError        4   the drive is absent, refuses, is not the one expected, or reports a fault
+    │   ├── SdoError          an object could not be read or written
+    │   ├── IdentityError     object 1018h, the ratio or the direction is not what the axis file says
+    │   └── TransitionError   a CiA-402 transition that is not allowed, or did not come about in time
+    └── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
+
+A message says what is wrong, where (file:line:column, node and object), what was expected, and what to do.
+Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
+"""
+
+from typing import ClassVar
+
+
+class HdbridgeError(Exception):
+    """Base of all errors raised on purpose; its text is one line that a person can act on."""
+
+    exit_status: ClassVar[int] = 1
+
+
+class InputError(HdbridgeError):
+    """A file, an option or a value is wrong. Nothing was written and nothing moved."""
+
+    exit_status = 2
+
+
+class BusError(HdbridgeError):
+    """The CAN interface cannot be opened or has gone away."""
+
+    exit_status = 3
+
+
+class DriveError(HdbridgeError):
+    """The drive is absent, refuses, is not the one expected, or reports a fault."""
+
+    exit_status = 4
+
+
+class SdoError(DriveError):
+    """An object could not be read from or written to a node."""
+
+
+class IdentityError(DriveError):
+    """The node is not the drive that the axis file describes."""
+
+
+class TransitionError(DriveError):
+    """A CiA-402 transition is not allowed in the present state, or did not come about in time."""
+
+
+class SafetyStop(HdbridgeError):
+    """The supervision stopped the axis while it ran; the stop is latched until an explicit reset."""
+
+    exit_status = 5

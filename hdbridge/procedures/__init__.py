@@ -1,0 +1,1 @@
+"""What a bench does with an axis, as pure generators."""

@@ -1,0 +1,1 @@
+"""The simulated drive: plant, firmware, CANopen node."""
