@@ -1,0 +1,202 @@
+"""From a load target to the motor target that puts the load there: the transmission model's inverse.
+
+The compensated motor angle solves ``theta_M / N + w TE(theta_M) = theta_L``, where TE is the model's error
+coming from its present state and w the ramp's weight. Three choices matter:
+
+* It is driven by the command, never by a measured angle: near a reversal the elastic law's slope is infinite
+  and one count of encoder chatter would become several arcseconds.
+* The root is bracketed. The left side rises with theta_M as long as the repeating part cannot fall faster
+  than the gear rises (refused otherwise), so there is exactly one root; a naive fixed point does not
+  contract near a reversal.
+* The model's state moves on only when a command is issued (`Compensation.command`), with the angle issued,
+  whatever caps and ramps have made of it.
+
+Pure: no clock, no bus.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hdbridge.effects import Moment, Start, Tracker
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.units import ARCSEC_PER_DEG
+
+_TOLERANCE_ARCSEC = 5e-7
+_STEEPEST_FALL = 0.9
+_NOWHERE = Moment()
+
+
+@dataclass(frozen=True, slots=True)
+class CompensationLimits:
+    """How far and how fast the compensation may move the motor away from the uncompensated target."""
+
+    maximum_arcsec: float = 300.0
+    """Cap on the correction, arcsec at the load."""
+    slew_arcsec_s: float = 20_000.0
+    """Cap on how fast the correction may change, arcsec at the load per second."""
+    ramp_s: float = 0.5
+    """Time over which the correction is faded in or out."""
+
+
+class Inverse:
+    """The model's inverse, coming from the state that `advance` has left."""
+
+    __slots__ = ("_error", "_fall", "_motor_deg", "_slope", "_timeless", "_tracker")
+
+    def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
+        """Refuses (InputError) a model whose repeating part is too steep to have one inverse."""
+        self._tracker: Tracker = model.tracker(start)
+        self._slope = ARCSEC_PER_DEG / model.ratio
+        self._fall = sum(each.slope_bound_arcsec_per_deg() for each in model.effects)
+        if self._fall > _STEEPEST_FALL * self._slope:
+            raise InputError(
+                f"the model's error can fall by {self._fall:.3g} arcsec per motor degree, "
+                f"more than {_STEEPEST_FALL:g} of the gear's own {self._slope:.3g}: "
+                "it has no usable inverse; check the amplitudes and orders"
+            )
+        self._motor_deg = 0.0
+        self._error = 0.0
+        # Without channels the error at rest is what it was when the command was issued: not asked twice.
+        self._timeless = not any(each.channels for each in model.effects)
+
+    def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
+        """The command is issued: move the state on; returns the model's error there, arcsec."""
+        self._motor_deg = motor_deg
+        self._error = self._tracker.advance(motor_deg, moment)
+        return self._error
+
+    def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
+        """Motor angle in degrees that puts the load at ``load_deg``; the state does not change.
+
+        ``weight`` scales the error (0: uncompensated). Exact to 1e-6 arcsec at the load, or to the
+        last bit of the motor angle where the law is so steep that this comes first.
+        """
+        peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
+        goal = ARCSEC_PER_DEG * load_deg
+        here = self._error if self._timeless else peek(last, moment)
+        gap = goal - slope * last - weight * here
+        if abs(gap) <= _TOLERANCE_ARCSEC:
+            return last
+        # In plain travel the gear's own slope nearly is the whole slope: a few secants and it is there.
+        x0, f0 = last, -gap
+        x1 = last + gap / slope
+        for _ in range(4):
+            f1 = slope * x1 + weight * peek(x1, moment) - goal
+            if abs(f1) <= _TOLERANCE_ARCSEC:
+                return x1
+            if f1 == f0:
+                break
+            x0, x1, f0 = x1, x1 - f1 * (x1 - x0) / (f1 - f0), f1
+        # The error falls at most by `fall` per degree, so the root is no farther than this.
+        far = last + gap / (slope - weight * self._fall) * (1.0 + 1e-9)
+        return self._bracketed(goal, moment, weight, last, -gap, far)
+
+    def _bracketed(self, goal: float, moment: Moment, weight: float, a: float, fa: float, b: float) -> float:
+        """Chandrupatla's method: inverse quadratic steps where they are safe, bisection elsewhere."""
+        peek, slope = self._tracker.peek, self._slope
+        fb = slope * b + weight * peek(b, moment) - goal
+        c, fc = a, fa
+        t = 0.5
+        for _ in range(200):
+            x = a + t * (b - a)
+            fx = slope * x + weight * peek(x, moment) - goal
+            if (fx > 0.0) == (fa > 0.0):
+                c, fc = a, fa
+            else:
+                c, fc, b, fb = b, fb, a, fa
+            a, fa = x, fx
+            best, fbest = (a, fa) if abs(fa) < abs(fb) else (b, fb)
+            width = abs(b - a)
+            if abs(fbest) <= _TOLERANCE_ARCSEC or width <= 4.0 * math.ulp(best):
+                return best
+            xi = (a - b) / (c - b)
+            phi = (fa - fb) / (fc - fb)
+            t = 0.5
+            if phi * phi < xi and (1.0 - phi) * (1.0 - phi) < 1.0 - xi:
+                t = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+                edge = 2.0 * math.ulp(best) / width
+                t = min(max(t, edge), 1.0 - edge)
+        return best
+
+
+class Compensation:
+    """The inverse with caps and ramps: what the control cycle asks, once per cycle.
+
+    It begins disengaged: the motor target is N times the load target. `engage` and `disengage` fade the
+    correction in and out, so switching never jumps the axis.
+    """
+
+    __slots__ = (
+        "_correction", "_inverse", "_maximum", "_ratio", "_slew_step", "_target", "_weight", "_weight_step",
+        "limited",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        model: TransmissionModel,
+        limits: CompensationLimits,
+        period_s: float,
+        start: Start = Start.VIRGIN,
+    ) -> None:
+        """``period_s`` is the control cycle; ``start`` what is known of the gear's past."""
+        self._inverse = Inverse(model, start)
+        self._ratio = model.ratio
+        self._maximum = limits.maximum_arcsec
+        self._slew_step = limits.slew_arcsec_s * period_s
+        self._weight_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
+        self._weight = 0.0
+        self._target = 0.0
+        self._correction = 0.0
+        self.limited = 0
+        """Cycles in which a cap or the slew limit was at work."""
+
+    @property
+    def correction_arcsec(self) -> float:
+        """The correction at work, arcsec at the load: the error that the motor target makes up for."""
+        return self._correction
+
+    @property
+    def weight(self) -> float:
+        """The ramp's weight: 0 off, 1 fully on."""
+        return self._weight
+
+    def engage(self) -> None:
+        """Fade the correction in from the next command on."""
+        self._target = 1.0
+
+    def disengage(self) -> None:
+        """Fade the correction out from the next command on."""
+        self._target = 0.0
+
+    def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
+        """The motor stands at ``motor_deg`` and nothing is being corrected: begin from there."""
+        self._weight = self._correction = 0.0
+        self._inverse.advance(motor_deg, moment)
+
+    def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        """Motor target in degrees for this cycle's load target; the model's state moves on with it."""
+        weight = self._weight
+        if weight != self._target:
+            step = self._weight_step
+            weight += min(max(self._target - weight, -step), step)
+            self._weight = weight
+        motor = self._inverse.solve(load_deg, moment, weight)
+        wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
+        slew = self._slew_step
+        allowed = min(max(wanted, self._correction - slew), self._correction + slew)
+        allowed = min(max(allowed, -self._maximum), self._maximum)
+        if allowed != wanted:
+            self.limited += 1
+            motor = self._ratio * (load_deg - allowed / ARCSEC_PER_DEG)
+        self._correction = allowed
+        self._inverse.advance(motor, moment)
+        return motor
+
+    def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        """Motor target in degrees with the correction frozen: for a cycle whose feedback is missing."""
+        motor = self._ratio * (load_deg - self._correction / ARCSEC_PER_DEG)
+        self._inverse.advance(motor, moment)
+        return motor
