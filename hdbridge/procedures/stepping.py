@@ -1,0 +1,74 @@
+"""The stepping test: how far the load is from where it was told to be, at rest, step after step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """One step at rest."""
+
+    target_deg: float
+    """Load target, degrees."""
+    error_arcsec: float
+    """Load encoder minus target, mean over the settled window, arcsec."""
+    settle_s: float
+    """Time from the end of the move until the load stood still."""
+
+
+@dataclass(frozen=True, slots=True)
+class SteppingOutcome:
+    """Every step of both directions."""
+
+    cw: tuple[Standing, ...]
+    """The first pass, towards positive angles."""
+    ccw: tuple[Standing, ...]
+    """The way back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stepping:
+    """``count`` steps of ``step_deg`` at the motor one way, then back.
+
+    It begins with a pre-conditioning move (back by ``precondition_deg`` and forth again), so that the gear's
+    elastic state is that of an axis that last moved forward.
+    """
+
+    count: int = 240
+    step_deg: float = 43.56
+    start_deg: float = 0.0
+    """Load angle of the start."""
+    precondition_deg: float = 2.0
+    """Load degrees; more than any hysteresis is wide."""
+    settle: Settle = Settle()
+
+    def travel(self, axis: AxisView) -> tuple[float, float]:
+        """From the pre-conditioning move to the last step."""
+        far = self.start_deg + self.count * self.step_deg / axis.ratio
+        return min(self.start_deg - self.precondition_deg, far), max(self.start_deg, far)
+
+    def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
+        """Each step a jerk-limited move and a settle."""
+        yield MoveTo(self.start_deg - self.precondition_deg, kind="precondition")
+        yield MoveTo(self.start_deg, kind="precondition")
+        passes: list[tuple[Standing, ...]] = []
+        for order in (range(1, self.count + 1), range(self.count - 1, -1, -1)):
+            stands: list[Standing] = []
+            for index in order:
+                target = self.start_deg + index * self.step_deg / axis.ratio
+                yield MoveTo(target, kind="step")
+                samples = yield self.settle
+                stands.append(_standing(target, samples, self.settle))
+            passes.append(tuple(stands))
+        return SteppingOutcome(cw=passes[0], ccw=passes[1])
+
+
+def _standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
+    window = settle.window(samples)
+    mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
+    return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

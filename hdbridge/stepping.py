@@ -1,0 +1,91 @@
+"""What a stepping test says: scatter and mean per direction and pooled, and the floor under it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import SteppingOutcome
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+
+class Scheme(Enum):
+    """Which parts of the model the compensation uses."""
+
+    NONE = "none"
+    SYNCHRONOUS = "synchronous"
+    HYSTERESIS = "hysteresis"
+    BOTH = "both"
+    EXTENDED = "extended"
+
+    def of(self, model: TransmissionModel) -> TransmissionModel:
+        """The model with this scheme's effects only."""
+        match self:
+            case Scheme.NONE:
+                return model.only(())
+            case Scheme.SYNCHRONOUS | Scheme.HYSTERESIS:
+                return model.only((self.value,))
+            case Scheme.BOTH:
+                return model.only(("synchronous", "hysteresis"))
+            case Scheme.EXTENDED:
+                return model
+
+    @staticmethod
+    def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
+        """The article's four, and `EXTENDED` where the model has more than the two parts."""
+        four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
+        more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
+        return (*four, Scheme.EXTENDED) if more else four
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """Three standard deviations and the mean of a set of errors at rest, arcsec."""
+
+    three_sigma_arcsec: float
+    mean_arcsec: float
+
+    @classmethod
+    def of(cls, errors_arcsec: Sequence[float]) -> Scatter:
+        """Population standard deviation, as the literature's 3 sigma has it."""
+        errors = np.asarray(errors_arcsec)
+        return cls(3.0 * float(np.std(errors)), float(np.mean(errors)))
+
+
+@dataclass(frozen=True, slots=True)
+class SchemeResult:
+    """One scheme's stepping test."""
+
+    cw: Scatter
+    ccw: Scatter
+    pooled: Scatter
+    outcome: SteppingOutcome
+
+    @classmethod
+    def of(cls, outcome: SteppingOutcome) -> SchemeResult:
+        """Statistics per direction, and of both directions together."""
+        cw = [each.error_arcsec for each in outcome.cw]
+        ccw = [each.error_arcsec for each in outcome.ccw]
+        return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract of ``hdbridge step --json``."""
+        return {
+            name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
+            for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
+        }
+
+
+def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
+    """Three sigma at the load of a motor target rounded to whole counts: a uniform error of one count.
+
+    No compensation by motor targets can point better than this, however good its model.
+    """
+    count = DEG_PER_TURN * ARCSEC_PER_DEG / (motor_counts_per_turn * ratio)
+    return 3.0 * count / math.sqrt(12.0)
