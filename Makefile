@@ -1,0 +1,39 @@
+# Each target makes its own virtual environment; nothing needs to be installed by hand.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+
+.PHONY: help demo test unit check format test-socketcan clean
+
+help:            ## this list
+	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: $(READY)   ## the main job: step a simulated axis under four compensation schemes
+	$(BIN)/hdbridge demo
+
+test: check test-socketcan unit  ## everything that CI runs
+
+unit: $(READY)   ## the tests on the virtual bus
+	$(BIN)/python -m pytest -q -n 2 --ignore=tests/socketcan
+
+test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
+	tools/socketcan.sh --or-skip $(BIN)/python -m pytest -q -rs tests/socketcan
+
+check: $(READY)  ## format, lint, types, import contracts
+	$(BIN)/ruff format --check hdbridge tests tools
+	$(BIN)/ruff check hdbridge tests tools
+	$(BIN)/mypy hdbridge
+	$(BIN)/lint-imports
+
+format: $(READY) ## format and mend what can be mended
+	$(BIN)/ruff format hdbridge tests tools
+	$(BIN)/ruff check --fix hdbridge tests tools
+
+clean:           ## remove the environment and what the commands made
+	rm -rf $(VENV) demo-output dist build

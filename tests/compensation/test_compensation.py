@@ -1,0 +1,191 @@
+"""The compensation inverts the model, and never jumps the axis."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdbridge.compensation import Compensation, CompensationLimits, Inverse
+from hdbridge.effects import Hysteresis, Moment, MotorOrder, Start, Synchronous
+from hdbridge.effects.hysteresis import rise_at
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+
+NOW = Moment()
+PERIOD = 0.004
+
+
+def model(ratio=50.0, amplitude=12.0, offset=40.0, width=20.0, exponent=1.6) -> TransmissionModel:
+    orders = tuple(
+        MotorOrder(order=k, amplitude_arcsec=amplitude / k, phase_deg=40.0 * k) for k in (1, 2, 4, 8)
+    )
+    loop = Hysteresis(offset_arcsec=offset, width_deg=width, exponent=exponent)
+    return TransmissionModel(ratio, (Synchronous(orders=orders), loop))
+
+
+def models() -> st.SearchStrategy[TransmissionModel]:
+    return st.builds(
+        model,
+        ratio=st.floats(30, 160),
+        amplitude=st.floats(0, 15),
+        offset=st.floats(0, 80),
+        width=st.floats(5, 40),
+        exponent=st.floats(1.2, 2.8),
+    )
+
+
+# Reversals of every size: from far below an encoder count to several times the width.
+load_paths = st.lists(
+    st.tuples(st.sampled_from([-1, 1]), st.floats(-6, 0.3)).map(lambda each: each[0] * 10 ** each[1]),
+    min_size=1,
+    max_size=80,
+).map(lambda steps: np.cumsum(steps).tolist())
+
+
+@settings(deadline=None)
+@given(model=models(), path=load_paths, start=st.sampled_from(list(Start)))
+def test_the_inverse_inverts(model, path, start):
+    inverse, gear = Inverse(model, start), model.tracker(start)
+    inverse.advance(0.0)
+    gear.advance(0.0, NOW)
+    for load_deg in path:
+        motor_deg = inverse.solve(load_deg)
+        inverse.advance(motor_deg)
+        reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
+        # 1e-6 arcsec, or two bits of the motor angle where the law is so steep that this is coarser.
+        loop = model.effects[1]
+        bits = 2 * loop.offset_arcsec * rise_at(2 * math.ulp(motor_deg) / loop.width_deg, loop.exponent)
+        assert abs(reached - load_deg) * 3600 <= max(1e-6, 2 * bits)
+
+
+def test_the_inverse_inverts_the_article_to_a_millionth_of_an_arcsecond():
+    article = model()
+    inverse, gear = Inverse(article), article.tracker()
+    inverse.advance(0.0)
+    gear.advance(0.0, NOW)
+    rng = np.random.default_rng(3)
+    load = 0.0
+    for _ in range(5000):
+        load += float(rng.choice([1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5]) * rng.choice([-1, 1]))
+        motor = inverse.solve(load)
+        inverse.advance(motor)
+        assert abs(3600 * (motor / 50 - load) + gear.advance(motor, NOW)) <= 1e-6
+
+
+def test_solving_changes_nothing_and_rest_stays_rest():
+    inverse = Inverse(model())
+    inverse.advance(0.0)
+    motor = inverse.solve(0.3)
+    assert inverse.solve(-5.0) != motor
+    assert inverse.solve(0.3) == motor
+    inverse.advance(motor)
+    assert [inverse.solve(0.3) for _ in range(5)] == [motor] * 5
+
+
+def test_weight_zero_is_the_plain_gear():
+    inverse = Inverse(model())
+    inverse.advance(0.0)
+    assert inverse.solve(1.5, weight=0.0) == pytest.approx(75.0, abs=1e-9)
+
+
+def test_a_model_too_steep_to_invert_is_refused():
+    steep = TransmissionModel(
+        50.0, (Synchronous(orders=(MotorOrder(order=100, amplitude_arcsec=60, phase_deg=0),)),)
+    )
+    with pytest.raises(InputError, match=r"fall by 105 arcsec per motor degree.*check the amplitudes"):
+        Inverse(steep)
+
+
+def travel(seconds: float, speed_deg_s: float = 10.0) -> list[float]:
+    return [speed_deg_s * PERIOD * i for i in range(round(seconds / PERIOD))]
+
+
+def test_disengaged_it_is_the_plain_gear():
+    compensation = Compensation(model(), CompensationLimits(), PERIOD)
+    compensation.reset(0.0)
+    for load in travel(1.0):
+        assert compensation.command(load) == pytest.approx(50 * load, abs=1e-9)
+
+
+def test_engaged_it_puts_the_load_on_target():
+    gear_model = model()
+    compensation = Compensation(gear_model, CompensationLimits(), PERIOD)
+    gear = gear_model.tracker()
+    compensation.reset(0.0)
+    gear.advance(0.0, NOW)
+    compensation.engage()
+    for index, load in enumerate(travel(2.0)):
+        motor = compensation.command(load)
+        error = 3600 * (motor / 50 - load) + gear.advance(motor, NOW)
+        if index * PERIOD > 0.6:
+            assert abs(error) < 1e-6
+    assert compensation.weight == 1.0
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_switching_at_rest_moves_the_axis_only_along_the_ramp(on):
+    limits = CompensationLimits(ramp_s=0.5)
+    compensation = Compensation(model(), limits, PERIOD)
+    compensation.reset(0.0)
+    if not on:
+        compensation.engage()
+    for load in travel(2.0):
+        last = compensation.command(load)
+    (compensation.engage if on else compensation.disengage)()
+    moved = []
+    for _ in range(200):
+        motor = compensation.command(load)
+        moved.append(abs(motor - last) / 50 * 3600)
+        last = motor
+    assert max(moved) < 3.0, "arcsec in one cycle"
+    assert compensation.weight == (1.0 if on else 0.0)
+    assert (
+        abs(compensation.correction_arcsec) > 10 if on else compensation.correction_arcsec == pytest.approx(0)
+    )
+
+
+def test_the_cap_holds():
+    compensation = Compensation(model(), CompensationLimits(maximum_arcsec=15.0), PERIOD)
+    compensation.reset(0.0)
+    compensation.engage()
+    for load in travel(2.0):
+        motor = compensation.command(load)
+        assert abs(motor / 50 - load) * 3600 <= 15.0 + 1e-9
+    assert compensation.limited > 0
+
+
+def test_the_slew_limit_holds_through_a_reversal():
+    limits = CompensationLimits(slew_arcsec_s=500.0)
+    compensation = Compensation(model(), limits, PERIOD)
+    compensation.reset(0.0)
+    compensation.engage()
+    before = 0.0
+    there = travel(2.0)
+    for load in there + there[::-1]:
+        compensation.command(load)
+        assert abs(compensation.correction_arcsec - before) <= 500.0 * PERIOD + 1e-9
+        before = compensation.correction_arcsec
+    assert compensation.limited > 0
+
+
+def test_hold_freezes_the_correction():
+    compensation = Compensation(model(), CompensationLimits(), PERIOD)
+    compensation.reset(0.0)
+    compensation.engage()
+    loads = travel(2.0)
+    for load in loads[:400]:
+        compensation.command(load)
+    frozen = compensation.correction_arcsec
+    motor = compensation.hold(loads[400])
+    assert compensation.correction_arcsec == frozen
+    assert motor == pytest.approx(50 * (loads[400] - frozen / 3600))
+
+
+def test_reset_begins_without_a_correction_wherever_the_motor_stands():
+    compensation = Compensation(model(), CompensationLimits(), PERIOD)
+    compensation.reset(1234.5)
+    compensation.engage()
+    first = compensation.command(1234.5 / 50)
+    assert abs(first - 1234.5) < 0.05
