@@ -1,0 +1,33 @@
+"""Nested reversals: first-order reversal curves, which show whether a gear remembers return points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.procedures.moves import AxisView, MoveTo, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Reversals:
+    """For each depth: back by it, forth by half of it, back again, then forth until all is forgotten.
+
+    Angles in ``depths_deg`` are motor degrees; ``reach_deg`` must be more than the hysteresis is wide.
+    """
+
+    centre_deg: float = 0.0
+    depths_deg: tuple[float, ...] = (2.0, 4.0, 8.0, 12.0, 16.0, 24.0)
+    reach_deg: float = 60.0
+    velocity_deg_s: float = 0.2
+    """At the load."""
+
+    def travel(self, axis: AxisView) -> tuple[float, float]:
+        """From the reach below the centre to the centre."""
+        return self.centre_deg - (self.reach_deg + max(self.depths_deg)) / axis.ratio, self.centre_deg
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Starts each curve on the forward branch, at the centre."""
+        for depth_deg in self.depths_deg:
+            depth = depth_deg / axis.ratio
+            yield MoveTo(self.centre_deg - self.reach_deg / axis.ratio)
+            for place in (0.0, -depth, -0.5 * depth, -depth, 0.0):
+                yield MoveTo(self.centre_deg + place, self.velocity_deg_s, kind="reversal")

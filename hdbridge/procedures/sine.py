@@ -1,0 +1,30 @@
+"""Slow sines of several amplitudes: Lissajous loops of the hysteresis, some smaller than its width."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Sine, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Sines:
+    """Sines of ``amplitudes_deg`` (at the motor) about ``centre_deg`` (at the load), one after the other."""
+
+    centre_deg: float = 0.0
+    amplitudes_deg: tuple[float, ...] = (180.0, 45.0, 5.0)
+    frequency_hz: float = 0.05
+    periods: float = 2.0
+
+    def travel(self, axis: AxisView) -> tuple[float, float]:
+        """The widest sine."""
+        reach = max(self.amplitudes_deg) / axis.ratio
+        return self.centre_deg - reach, self.centre_deg + reach
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Each sine begins at its upper extreme."""
+        for amplitude_deg in self.amplitudes_deg:
+            amplitude = amplitude_deg / axis.ratio
+            yield MoveTo(self.centre_deg + amplitude)
+            yield Dwell(0.2, kind="move")
+            yield Sine(self.centre_deg, amplitude, self.frequency_hz, self.periods)

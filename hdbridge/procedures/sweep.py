@@ -1,0 +1,28 @@
+"""Slow sweeps both ways: the synchronous part, load orders, and the height of the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.procedures.moves import AxisView, MoveTo, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """From ``low_deg`` to ``high_deg`` and back at a constant speed, ``laps`` times."""
+
+    low_deg: float
+    high_deg: float
+    velocity_deg_s: float
+    laps: int = 1
+
+    def travel(self, axis: AxisView) -> tuple[float, float]:
+        """Its two ends."""
+        return self.low_deg, self.high_deg
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Each lap there and back; the elastic state is that of an axis coming from ``low_deg``."""
+        yield MoveTo(self.low_deg)
+        for _ in range(self.laps):
+            yield MoveTo(self.high_deg, self.velocity_deg_s, kind="sweep")
+            yield MoveTo(self.low_deg, self.velocity_deg_s, kind="sweep")
