@@ -79,11 +79,7 @@ Steps = Generator[Move, Sequence[Sample], Outcome]
 
 
 class Procedure(Protocol[Outcome]):
-    """A bench procedure: where it goes, and how."""
-
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """Lowest and highest load angle that it visits, degrees; checked before anything moves."""
-        ...
+    """What a bench does with an axis."""
 
     def moves(self, axis: AxisView) -> Steps[Outcome]:
         """The generator of moves; its return value is the procedure's outcome."""

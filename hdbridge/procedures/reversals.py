@@ -20,10 +20,6 @@ class Reversals:
     velocity_deg_s: float = 0.2
     """At the load."""
 
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """From the reach below the centre to the centre."""
-        return self.centre_deg - (self.reach_deg + max(self.depths_deg)) / axis.ratio, self.centre_deg
-
     def moves(self, axis: AxisView) -> Steps[None]:
         """Starts each curve on the forward branch, at the centre."""
         for depth_deg in self.depths_deg:

@@ -16,11 +16,6 @@ class Sines:
     frequency_hz: float = 0.05
     periods: float = 2.0
 
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """The widest sine."""
-        reach = max(self.amplitudes_deg) / axis.ratio
-        return self.centre_deg - reach, self.centre_deg + reach
-
     def moves(self, axis: AxisView) -> Steps[None]:
         """Each sine begins at its upper extreme."""
         for amplitude_deg in self.amplitudes_deg:

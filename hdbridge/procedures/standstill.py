@@ -17,10 +17,6 @@ class Precondition:
     load_deg: float = 0.0
     back_deg: float = 2.0
 
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """Back and forth."""
-        return self.load_deg - self.back_deg, self.load_deg
-
     def moves(self, axis: AxisView) -> Steps[None]:
         """Two moves."""
         yield MoveTo(self.load_deg - self.back_deg, kind="precondition")
@@ -33,10 +29,6 @@ class Standstill:
 
     load_deg: float = 0.0
     duration_s: float = 10.0
-
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """One place."""
-        return self.load_deg, self.load_deg
 
     def moves(self, axis: AxisView) -> Steps[None]:
         """Go there and stand."""

@@ -47,11 +47,6 @@ class Stepping:
     """Load degrees; more than any hysteresis is wide."""
     settle: Settle = Settle()
 
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """From the pre-conditioning move to the last step."""
-        far = self.start_deg + self.count * self.step_deg / axis.ratio
-        return min(self.start_deg - self.precondition_deg, far), max(self.start_deg, far)
-
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
         """Each step a jerk-limited move and a settle."""
         yield MoveTo(self.start_deg - self.precondition_deg, kind="precondition")

@@ -16,10 +16,6 @@ class Sweep:
     velocity_deg_s: float
     laps: int = 1
 
-    def travel(self, axis: AxisView) -> tuple[float, float]:
-        """Its two ends."""
-        return self.low_deg, self.high_deg
-
     def moves(self, axis: AxisView) -> Steps[None]:
         """Each lap there and back; the elastic state is that of an axis coming from ``low_deg``."""
         yield MoveTo(self.low_deg)

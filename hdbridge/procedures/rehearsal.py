@@ -1,0 +1,53 @@
+"""A procedure walked through on an ideal axis, before anything moves: how long, how far, how many legs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.errors import InputError
+from hdbridge.procedures.moves import AxisView, Procedure, Sample
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What a procedure will ask of its axis."""
+
+    duration_s: float
+    """At an ideal axis; a real one takes longer to settle."""
+    lowest_deg: float
+    highest_deg: float
+    legs: int
+
+
+def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0) -> Rehearsal:
+    """Walk through the procedure; InputError where it would leave the limits or break one.
+
+    Every leg's path is made as the bench will make it, so what is refused here never reaches the axis.
+    """
+    limits = axis.limits
+    duration, legs = 0.0, 0
+    place = lowest = highest = start_deg
+    steps = procedure.moves(axis)
+    try:
+        move = next(steps)
+        while True:
+            path = move.path(place, limits)
+            lowest, highest = min(lowest, path.lowest_deg), max(highest, path.highest_deg)
+            for edge in (path.lowest_deg, path.highest_deg):
+                if not limits.position_min_deg <= edge <= limits.position_max_deg:
+                    raise InputError(
+                        f"{type(procedure).__name__.lower()} would move the load to {edge:.6g} deg; the axis file "
+                        f"allows {limits.position_min_deg:g} to {limits.position_max_deg:g} (limits): "
+                        "nothing was moved; choose fewer or smaller steps, or another start"
+                    )
+            place = path.at(path.duration_s)
+            motor = place * axis.ratio
+            samples = [
+                Sample(duration + share * path.duration_s, place, motor, motor, place, 0.0)
+                for share in (0.0, 0.5, 1.0)
+            ]
+            duration += path.duration_s
+            legs += 1
+            move = steps.send(samples)
+    except StopIteration:
+        return Rehearsal(duration, lowest, highest, legs)
