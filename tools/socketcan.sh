@@ -1,0 +1,151 @@
+#!/usr/bin/env bash
+# Run a command with the SocketCAN interface vcan0 up, on this machine's kernel or in user-mode-linux.
+#
+#   tools/socketcan.sh [--timeout SECONDS] [--uml] [--check] COMMAND [ARGUMENT...]
+#
+# The command runs in the present folder with the present environment; its standard output, standard error and
+# exit status are passed through; its standard input is empty. In this order:
+#   1. vcan0 exists and is up: the command simply runs.
+#   2. The kernel has vcan and we may add interfaces: vcan0 is made, and removed afterwards.
+#   3. Otherwise Debian's user-mode-linux (a Linux kernel that runs as a process, with the CAN modules that the
+#      host lacks) boots on this machine's own file system. It has one CPU: good for function and faults, not
+#      for judging timing below 4 ms. Missing Debian packages are installed when we are root.
+#
+#   --timeout SECONDS   end everything after that long (default 600); exit status 124
+#   --uml               use user-mode-linux even where the kernel has vcan
+#   --check             run nothing: exit 0 when one of the ways above is possible, 69 and the reason otherwise
+#
+# Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had; 70 user-mode-linux did not come up.
+# SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux.
+set -u
+
+readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+readonly unavailable=69 broken=70 timed_out=124
+readonly packages=(user-mode-linux kmod iproute2 can-utils)
+limit_s=600 force_uml=no check_only=no
+
+say() { echo "socketcan: $*" >&2; }
+
+while [ $# -gt 0 ]; do
+    case $1 in
+        --timeout) limit_s=${2:?--timeout needs seconds}; shift 2 ;;
+        --timeout=*) limit_s=${1#*=}; shift ;;
+        --uml) force_uml=yes; shift ;;
+        --check) check_only=yes; shift ;;
+        --) shift; break ;;
+        -*) say "unknown option $1"; exit 2 ;;
+        *) break ;;
+    esac
+done
+if [ $# -eq 0 ] && [ $check_only = no ]; then
+    sed -n '2,/^set/{/^set/d;s/^# \{0,1\}//;p}' "$0" >&2
+    exit 2
+fi
+
+as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@" 2>/dev/null; fi; }
+interface_is_up() { [ "$(cat /sys/class/net/vcan0/type 2>/dev/null)" = 280 ] && ip link show vcan0 2>/dev/null | grep -q '[<,]UP[,>]'; }
+
+make_native() {
+    command -v ip >/dev/null || return 1
+    as_root modprobe vcan >/dev/null 2>&1 || true
+    as_root ip link add dev vcan0 type vcan >/dev/null 2>&1 || return 1
+    as_root ip link set up vcan0 >/dev/null 2>&1 || { as_root ip link delete vcan0; return 1; }
+}
+
+uml_is_complete() {
+    local program
+    for program in linux.uml insmod ip candump; do command -v $program >/dev/null || return 1; done
+    find /usr/lib/uml/modules -name vcan.ko 2>/dev/null | grep -q .
+}
+
+install_uml() {
+    uml_is_complete && return 0
+    if [ "$(id -u)" != 0 ]; then say "needs root to install: apt-get install ${packages[*]}"; return 1; fi
+    if ! command -v apt-get >/dev/null; then say "no apt-get here to install ${packages[*]}"; return 1; fi
+    say "installing ${packages[*]}"
+    { apt-get install -qy --no-install-recommends "${packages[@]}" ||
+        { apt-get update -q && apt-get install -qy --no-install-recommends "${packages[@]}"; }
+    } >"$work/apt.log" 2>&1 </dev/null || { tail -n 5 "$work/apt.log" >&2; say "apt-get could not install them"; return 1; }
+    uml_is_complete || { say "user-mode-linux is still incomplete after installation"; return 1; }
+}
+
+# In its own session, so that one signal to the group ends user-mode-linux and every process in it.
+run_uml() {
+    export -p | grep -vE '^declare -[a-zA-Z]*r' >"$work/environment"
+    printf '%q ' "$@" >"$work/command"
+    pwd >"$work/folder"
+    : >"$work/stdout" >"$work/stderr"
+    # A kernel's command line cannot hold a path with spaces.
+    cp "$here/uml/init.sh" "$work/init.sh"
+    setsid linux.uml "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw \
+        "init=$work/init.sh" "SOCKETCAN_WORK=$work" "uml_dir=$work/" umid=uml \
+        con=null con0=null,fd:1 ssl=null quiet \
+        >"$work/boot.log" 2>&1 </dev/null &
+    uml=$!
+    tail -q -n +1 -f -s 0.1 --pid=$uml "$work/stdout" &
+    local followers=$!
+    tail -q -n +1 -f -s 0.1 --pid=$uml "$work/stderr" >&2 &
+    followers+=" $!"
+    local deadline=$((SECONDS + limit_s)) status=$broken
+    while kill -0 $uml 2>/dev/null; do
+        if [ $SECONDS -ge $deadline ]; then
+            say "not finished after $limit_s s: ended"
+            end_uml
+            # shellcheck disable=SC2086
+            wait $followers
+            return $timed_out
+        fi
+        sleep 0.1
+    done
+    end_uml
+    # shellcheck disable=SC2086
+    wait $followers
+    if [ -s "$work/status" ]; then
+        status=$(cat "$work/status")
+    else
+        say "user-mode-linux ended without running the command to its end:"
+        tail -qn 15 "$work/boot.log" "$work/init.log" >&2
+    fi
+    return "$status"
+}
+
+end_uml() {
+    [ -n "${uml:-}" ] || return 0
+    kill -KILL -- "-$uml" 2>/dev/null
+    wait "$uml" 2>/dev/null
+    uml=
+}
+
+finish() {
+    end_uml
+    [ "${made_native:-no}" = no ] || as_root ip link delete vcan0 2>/dev/null
+    [ -z "${work:-}" ] || rm -rf "$work"
+}
+trap finish EXIT
+trap 'exit 130' INT
+trap 'exit 143' TERM HUP
+
+made_native=no work=
+if [ $force_uml = no ]; then
+    if interface_is_up; then
+        way=present
+    elif make_native; then
+        way=native made_native=yes
+    fi
+fi
+if [ -z "${way:-}" ]; then
+    if [ "$(uname -s)-$(uname -m)" != Linux-x86_64 ]; then
+        say "this kernel has no vcan, and user-mode-linux is for Linux on x86-64 only"
+        exit $unavailable
+    fi
+    work=$(mktemp -d /tmp/socketcan.XXXXXX) || exit $broken
+    install_uml || { say "this kernel has no vcan, and user-mode-linux is not to be had"; exit $unavailable; }
+    way=uml
+fi
+[ $check_only = no ] || { say "vcan0: $way"; exit 0; }
+
+case $way in
+    uml) run_uml "$@" ;;
+    *) timeout --kill-after=5 "$limit_s" "$@" </dev/null ;;
+esac
+exit $?
