@@ -1,0 +1,155 @@
+"""What a field of a pydantic model expects, in words: for complaints and for reference pages."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+_PLAIN: dict[Any, str] = {int: "an integer", float: "a number", str: "text", bool: "true or false"}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A place in a model: its type, its constraints and its description."""
+
+    annotation: Any
+    metadata: tuple[Any, ...] = ()
+    description: str = ""
+
+    def types(self) -> Iterator[Any]:
+        """The members of its type, with unions and annotations taken apart, None left out."""
+        for member in _members(self.annotation):
+            if member is not type(None):
+                yield member
+
+    def choices(self) -> list[str]:
+        """The texts that it accepts, where there is a closed set of them."""
+        found: list[str] = []
+        for member in self.types():
+            if get_origin(member) is Literal:
+                found += [str(each) for each in get_args(member)]
+            elif isinstance(member, type) and issubclass(member, Enum):
+                found += [str(each.value) for each in member]
+        return found
+
+
+def key_of(name: str, field: FieldInfo) -> str:
+    """A field's key in the file."""
+    return field.alias or name
+
+
+def field_names(model: type[BaseModel], at: Sequence[str | int]) -> list[str]:
+    """The keys that a mapping at a location may have."""
+    place = field_at(model, at)
+    models = [each for each in place.types() if _is_model(each)] if place else []
+    return [key_of(name, field) for each in models for name, field in each.model_fields.items()]
+
+
+def field_at(model: type[BaseModel], at: Sequence[str | int]) -> Field | None:
+    """The field at a location of a model, or None where the model leaves it open."""
+    here: Field | None = Field(model)
+    for step in at:
+        if here is None:
+            return None
+        here = _item(here) if isinstance(step, int) else _member(here, step)
+    return here
+
+
+def expected_words(field: Field | None) -> str:
+    """For example "an integer from 1 to 127 (node id of the drive)"."""
+    if field is None:
+        return "a value"
+    words = type_words(field)
+    return f"{words} ({field.description})" if field.description else words
+
+
+def type_words(field: Field) -> str:
+    """For example "a number above 0, at most 3600"."""
+    words = " or ".join(dict.fromkeys(_words(each) for each in field.types())) or "nothing"
+    return words + _range_words(field.metadata)
+
+
+def _words(member: Any) -> str:
+    if member in _PLAIN:
+        return _PLAIN[member]
+    choices = Field(member).choices()
+    if choices:
+        return " or ".join(f"'{each}'" if isinstance(each, str) else str(each) for each in choices)
+    if _is_model(member) or member is dict or get_origin(member) is dict:
+        return "a mapping"
+    if member in {list, tuple} or get_origin(member) in {list, tuple}:
+        return "a list"
+    return "a value"
+
+
+def _range_words(metadata: Sequence[Any]) -> str:
+    limits = {name: getattr(each, name) for each in metadata for name in _LIMITS if hasattr(each, name)}
+    if "ge" in limits and "le" in limits:
+        return f" from {_number(limits['ge'])} to {_number(limits['le'])}"
+    parts = [words.format(_number(limits[name])) for name, words in _LIMITS.items() if name in limits]
+    return " " + ", ".join(parts) if parts else ""
+
+
+_LIMITS = {
+    "gt": "above {}", "ge": "of at least {}", "lt": "below {}", "le": "at most {}",
+    "min_length": "with at least {}", "max_length": "with at most {}",
+}  # fmt: skip
+
+
+def _number(value: Any) -> str:
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
+
+
+def _is_model(member: Any) -> bool:
+    return isinstance(member, type) and issubclass(member, BaseModel)
+
+
+def _members(annotation: Any) -> Iterator[Any]:
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        yield from _members(get_args(annotation)[0])
+    elif origin in {Union, types.UnionType}:
+        for each in get_args(annotation):
+            yield from _members(each)
+    else:
+        yield annotation
+
+
+def _member(place: Field, key: str) -> Field | None:
+    for member in place.types():
+        if _is_model(member):
+            for name, field in member.model_fields.items():
+                if key_of(name, field) == key:
+                    return Field(field.annotation, tuple(field.metadata), field.description or "")
+        elif get_origin(member) is dict:
+            return _annotated(get_args(member)[1])
+    # pydantic puts the name of a union's member into its locations; it is no step of ours
+    return place if len(list(place.types())) > 1 else None
+
+
+def _item(place: Field) -> Field | None:
+    for member in place.types():
+        if get_origin(member) in {list, tuple}:
+            return _annotated(get_args(member)[0])
+    return None
+
+
+def _annotated(annotation: Any) -> Field:
+    if get_origin(annotation) is Annotated:
+        inner, *metadata = get_args(annotation)
+        flat: list[Any] = []
+        description = ""
+        for each in metadata:
+            if isinstance(each, FieldInfo):
+                flat += each.metadata
+                description = each.description or description
+            else:
+                flat.append(each)
+        return Field(inner, tuple(flat), description)
+    return Field(annotation)

@@ -1,0 +1,381 @@
+"""Strict YAML: what stands in a file is read exactly, or refused in one line that says where and why.
+
+The dialect is the core schema of YAML 1.2 (so `off` and `2025-01-31` are text, `1e-3` is a number and `0x402`
+an integer), one document of plain mappings, lists and scalars: no tags, anchors or aliases, no key twice, and
+limits on size and depth. Content is validated by a pydantic model, in pydantic's strict mode; every complaint
+becomes ``file:line:column: key.path: what is wrong; expected ...; did you mean 'nearest'?``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from hdbridge.atomic import write_atomically
+from hdbridge.errors import InputError
+from hdbridge.expectation import expected_words, field_at, field_names
+
+__all__ = [
+    "Document", "FileError", "Hex", "document_from_text", "dump_yaml", "load_yaml", "nearest", "read_yaml",
+    "write_atomically", "wrong",
+]  # fmt: skip
+
+Location = tuple[str | int, ...]
+M = TypeVar("M", bound=BaseModel)
+
+MAXIMUM_BYTES = 4 << 20
+MAXIMUM_DEPTH = 32
+MAXIMUM_DIGITS = 400
+
+
+class FileError(InputError):
+    """A file is wrong. The text is the first complaint; `details` has every one, a line each."""
+
+    def __init__(self, *lines: str) -> None:
+        more = len(lines) - 1
+        super().__init__(lines[0] + (f" (and {more} more)" if more else ""))
+        self.details = lines
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A value of the file with its position (line and column count from 1)."""
+
+    line: int
+    column: int
+    value: Any
+    """Plain Python: dict, list, str, int, float, bool or None."""
+    found: str
+    """The value in words, as a complaint shows it."""
+    children: dict[str, tuple[Node, Node]] | list[Node] | None = None
+    """Of a mapping: key -> (key's node, value's node)."""
+
+
+def load_yaml(path: Path | str, model: type[M]) -> M:
+    """The file's content as an instance of ``model``; InputError with file, line and column otherwise."""
+    return read_yaml(path).validate(model)
+
+
+def read_yaml(path: Path | str) -> Document:
+    """The file as plain data with positions, not yet validated."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAXIMUM_BYTES + 1)
+    except FileNotFoundError:
+        raise FileError(f"{path}: no such file") from None
+    except OSError as problem:
+        raise FileError(f"{path}: cannot be read: {problem.strerror}") from None
+    if len(content) > MAXIMUM_BYTES:
+        raise FileError(f"{path}: larger than {MAXIMUM_BYTES >> 20} MiB; expected a small YAML file")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        line = content.count(b"\n", 0, problem.start) + 1
+        column = problem.start - content.rfind(b"\n", 0, problem.start)
+        raise FileError(f"{path}:{line}:{column}: not UTF-8 text; expected a YAML file in UTF-8") from None
+    return document_from_text(text, path)
+
+
+def document_from_text(text: str, path: Path | str) -> Document:
+    """YAML text as a document; ``path`` only names it in complaints."""
+    path = Path(path)
+    return Document(path, _Composer(text, path).document())
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """One YAML document: its data, and where each value stands."""
+
+    path: Path
+    root: Node
+
+    @property
+    def data(self) -> Any:
+        """The content as plain dicts, lists and scalars."""
+        return self.root.value
+
+    def validate(self, model: type[M], at: Location = ()) -> M:
+        """The value at a location as an instance of ``model``."""
+        value = self._nodes(at)[-1].value
+        try:
+            # JSON, because pydantic's strict mode for JSON knows that a file has lists and text where a
+            # model has tuples and enums; in Python mode strictness would refuse them.
+            return model.model_validate_json(json.dumps(value), strict=True)
+        except ValidationError as problem:
+            errors = problem.errors(include_url=False, include_input=False)
+            raise FileError(*self._complaints(model, at, errors)) from None
+
+    def error(self, at: Location, message: str, *, key: bool = False) -> FileError:
+        """A complaint about the value (or the key) at a location."""
+        return FileError(self._line(at, message, key=key))
+
+    def _complaints(self, model: type[BaseModel], at: Location, errors: list[ErrorDetails]) -> list[str]:
+        schema = [each for each in errors if each["loc"] == ("schema",)]
+        if schema:  # whatever else is wrong follows from it being another kind of file
+            errors = schema
+        unknown = {each["loc"][:-1]: each["loc"][-1] for each in errors if each["type"] == "extra_forbidden"}
+        rows = []
+        for error in errors:
+            place, message, key = self._complaint(model, error)
+            if error["type"] == "missing" and place in unknown:
+                close = nearest(str(unknown[place]), [str(error["loc"][-1])])
+                if close:  # one slip of the pen, already told as the unknown key
+                    continue
+            node = self._nodes(at + place, key=key)[-1]
+            line = self._line(at + place, message, key=key)
+            rows.append((error["type"] == "missing", node.line, node.column, line))
+        return [row[-1] for row in sorted(rows)]
+
+    def _complaint(self, model: type[BaseModel], error: ErrorDetails) -> tuple[Location, str, bool]:
+        """Location, message, and whether the key is meant rather than its value."""
+        place, kind = error["loc"], error["type"]
+        if kind == "extra_forbidden":
+            names = field_names(model, place[:-1])
+            listed = "expected " + ", ".join(names) if names else "expected no keys here"
+            return place, f"unknown key; {_hint(str(place[-1]), names) or listed}", True
+        if kind == "missing":
+            what = expected_words(field_at(model, place))
+            return place[:-1], f"key '{place[-1]}' is missing; expected {what}", False
+        if kind == "hdbridge":
+            inner: Location = tuple(error["ctx"]["at"])
+            return place + inner, error["msg"], False
+        if kind in {"value_error", "assertion_error"}:
+            return place, error["msg"].split(", ", 1)[1], False
+        node = self._nodes(place)[-1]
+        field = field_at(model, place)
+        what = expected_words(field) if field else error["msg"][0].lower() + error["msg"][1:]
+        hint = _hint(node.value, field.choices()) if isinstance(node.value, str) and field else ""
+        return place, f"found {node.found}; expected {what}" + (f"; {hint}" if hint else ""), False
+
+    def _line(self, at: Location, message: str, *, key: bool = False) -> str:
+        node = self._nodes(at, key=key)[-1]
+        where = f"{self.path}:{node.line}:{node.column}"
+        keys = dotted(at)
+        return f"{where}: {keys}: {message}" if keys else f"{where}: {message}"
+
+    def _nodes(self, at: Location, *, key: bool = False) -> list[Node]:
+        """The nodes on the way to a location, as far as it exists (pydantic adds names of union members)."""
+        nodes = [self.root]
+        for depth, step in enumerate(at):
+            children = nodes[-1].children
+            if isinstance(children, dict) and step in children:
+                pair = children[str(step)]
+                nodes.append(pair[0] if key and depth == len(at) - 1 else pair[1])
+            elif isinstance(children, list) and isinstance(step, int) and step < len(children):
+                nodes.append(children[step])
+        return nodes
+
+
+def wrong(message: str, *at: str | int) -> PydanticCustomError:
+    """For validators: a complaint about a part (``at``) of the value being validated, without a prefix."""
+    return PydanticCustomError("hdbridge", "{message}", {"message": message, "at": at})
+
+
+def nearest(word: str, choices: Sequence[str]) -> str | None:
+    """The choice that ``word`` was probably meant to be."""
+    close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
+    return next((each for each in choices if close and each.lower() == close[0]), None)
+
+
+def dotted(at: Location) -> str:
+    """A location as a person writes it: ``effects[0].parameters.width_deg``."""
+    text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in at)
+    return text.removeprefix(".")
+
+
+def _hint(word: str, choices: Sequence[str]) -> str:
+    close = nearest(word, choices)
+    return f"did you mean '{close}'?" if close else ""
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Reading: events of the YAML parser -> nodes with positions
+
+_INTEGER = re.compile(r"[-+]?[0-9]+")
+_HEX = re.compile(r"0x[0-9a-fA-F]+")
+_OCTAL = re.compile(r"0o[0-7]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_WORDS: dict[str, bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+_CONVERSIONS: tuple[tuple[re.Pattern[str], Callable[[str], int | float]], ...] = (
+    (_INTEGER, int),
+    (_HEX, lambda text: int(text, 16)),
+    (_OCTAL, lambda text: int(text, 8)),
+    (_FLOAT, float),
+    (_INFINITE, lambda text: float(text.replace(".", ""))),
+)
+
+
+class _Composer:
+    """Builds nodes from parser events, refusing what a configuration has no use for."""
+
+    def __init__(self, text: str, path: Path) -> None:
+        self._path = path
+        self._text = text
+        self._events = self._parse()
+
+    def document(self) -> Node:
+        event = next(self._events)
+        while not isinstance(event, yaml.DocumentStartEvent):
+            if isinstance(event, yaml.StreamEndEvent):
+                raise FileError(f"{self._path}:1:1: the file is empty")
+            event = next(self._events)
+        root = self._node(next(self._events), 0)
+        next(self._events)
+        end = next(self._events)
+        if not isinstance(end, yaml.StreamEndEvent):
+            raise self._error(end, "a second document begins here; expected one document per file")
+        return root
+
+    def _parse(self) -> Iterator[yaml.Event]:
+        fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        try:
+            yield from yaml.parse(self._text, Loader=fast)
+        except yaml.YAMLError:
+            # The pure parser says it better, and alike on every machine.
+            try:
+                for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
+                    pass
+            except yaml.MarkedYAMLError as problem:
+                mark = problem.problem_mark or problem.context_mark
+                place = f"{mark.line + 1}:{mark.column + 1}" if mark else "1:1"
+                problem_words = (problem.problem or "unreadable").replace("\n", " ")
+                while_words = f" ({problem.context})" if problem.context else ""
+                raise FileError(f"{self._path}:{place}: not YAML: {problem_words}{while_words}") from None
+            except yaml.reader.ReaderError as problem:
+                before = self._text[: problem.position]
+                line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
+                what = f"character U+{ord(self._text[problem.position]):04X} is not allowed in YAML"
+                raise FileError(f"{self._path}:{line}:{column}: not YAML: {what}") from None
+            raise
+
+    def _error(self, event: yaml.Event, message: str) -> FileError:
+        line, column = _position(event)
+        return FileError(f"{self._path}:{line}:{column}: {message}")
+
+    def _node(self, event: yaml.Event, depth: int) -> Node:
+        if isinstance(event, yaml.AliasEvent):
+            raise self._error(event, f"alias *{event.anchor}; expected values written out, without aliases")
+        if getattr(event, "anchor", None) is not None:
+            raise self._error(
+                event, f"anchor &{getattr(event, 'anchor', '')}; expected plain values, without anchors"
+            )
+        tag = getattr(event, "tag", None)
+        if tag is not None and tag != "!":
+            raise self._error(event, f"tag {tag}; expected plain values, without tags")
+        if depth > MAXIMUM_DEPTH:
+            raise self._error(event, f"nested deeper than {MAXIMUM_DEPTH} levels")
+        line, column = _position(event)
+        if isinstance(event, yaml.MappingStartEvent):
+            return self._mapping(line, column, depth)
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self._sequence(line, column, depth)
+        assert isinstance(event, yaml.ScalarEvent)
+        value = self._scalar(event)
+        return Node(line, column, value, _found(value, event.value))
+
+    def _mapping(self, line: int, column: int, depth: int) -> Node:
+        children: dict[str, tuple[Node, Node]] = {}
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            key = self._node(event, depth + 1)
+            if not isinstance(key.value, str):
+                raise self._error(event, f"key {key.found} is not text; expected a name")
+            if key.value in children:
+                first = children[key.value][0].line
+                raise self._error(event, f"key '{key.value}' stands twice; it stands first in line {first}")
+            children[key.value] = (key, self._node(next(self._events), depth + 1))
+        data = {name: child.value for name, (_, child) in children.items()}
+        return Node(line, column, data, "a mapping", children)
+
+    def _sequence(self, line: int, column: int, depth: int) -> Node:
+        children: list[Node] = []
+        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+            children.append(self._node(event, depth + 1))
+        return Node(line, column, [each.value for each in children], "a list", children)
+
+    def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
+        text: str = event.value
+        if event.style or event.tag == "!":
+            return text
+        if text in _WORDS:
+            return _WORDS[text]
+        for pattern, convert in _CONVERSIONS:
+            if pattern.fullmatch(text):
+                if len(text) > MAXIMUM_DIGITS:
+                    raise self._error(event, f"a number of {len(text)} digits; expected a plain number")
+                return convert(text)
+        return text
+
+
+def _position(event: yaml.Event) -> tuple[int, int]:
+    mark = event.start_mark
+    return (mark.line + 1, mark.column + 1) if mark else (1, 1)
+
+
+def _found(value: object, text: str) -> str:
+    if value is None:
+        return "nothing"
+    short = text if len(text) <= 40 else text[:37] + "..."
+    return repr(short) if isinstance(value, str) else short
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Writing
+
+
+class Hex(int):
+    """An integer that is written in hexadecimal: object indices, vendor and product numbers."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes whatever either dialect, 1.1 or 1.2, would read as something other than text."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write values out each time; aliases are refused on reading."""
+        return True
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """Indent the items of a list under its key."""
+        super().increase_indent(flow, False)
+
+
+for _tag, _pattern, _first in (
+    ("tag:yaml.org,2002:int", _INTEGER, "-+0123456789"),
+    ("tag:yaml.org,2002:int", _OCTAL, "0"),
+    ("tag:yaml.org,2002:float", _FLOAT, "-+.0123456789"),
+):
+    _Dumper.add_implicit_resolver(_tag, re.compile(f"^(?:{_pattern.pattern})$"), list(_first))
+_Dumper.add_representer(
+    Hex, lambda dumper, data: dumper.represent_scalar("tag:yaml.org,2002:int", f"{data:#x}")
+)
+
+
+def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    """In double quotes where other styles would fold or lose line breaks and marks of Unicode."""
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
+
+
+_BREAKS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
+_Dumper.add_representer(str, _text)
+
+
+def dump_yaml(data: Any) -> str:
+    """Plain data (dicts, lists, scalars) as YAML: block style, keys in the order given, numbers exact."""
+    text: str = yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=100000
+    )
+    return text
