@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
-from ruckig import InputParameter, Result, Ruckig, Trajectory
+from ruckig import InputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from hdbridge.errors import InputError
 
@@ -105,11 +105,14 @@ class MoveTo:
         demand.max_acceleration = [limits.acceleration_deg_s2]
         demand.max_jerk = [limits.jerk_deg_s3]
         trajectory = Trajectory(1)
-        result = Ruckig(1).calculate(demand, trajectory)
+        try:
+            result = Ruckig(1).calculate(demand, trajectory)
+        except RuckigError:  # not finite, or a limit that is not positive
+            result = Result.ErrorInvalidInput
         if result not in {Result.Working, Result.Finished}:
             raise InputError(
-                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg within the limits ({result}); "
-                "check velocity, acceleration and jerk in the axis file"
+                f"no trajectory from {start_deg:g} to {self.load_deg:g} deg in the limits ({result.name}): "
+                "check the target, and velocity, acceleration and jerk in the axis file"
             )
         at_time, duration, goal = trajectory.at_time, trajectory.duration, self.load_deg
 
