@@ -1,0 +1,215 @@
+"""Raw CAN frames in and out: the only place where the master touches python-can.
+
+It runs in the control cycle, so it adds as little as it can to the back end's own call. What it does add:
+every failure of the interface becomes a `BusError` that names it, frames that CANopen does not use are
+dropped and counted, and every deadline is on the monotonic clock that was passed in.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, Protocol
+
+import can
+
+from hdbridge.clock import Clock
+from hdbridge.errors import BusError
+
+_GONE: Final = frozenset(
+    {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.ENETUNREACH, errno.EBADF, errno.EIO}
+)
+_ERROR_FRAME_BUS_OFF: Final = 0x40
+"""CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""
+
+
+class TransmitBufferFull(BusError):  # noqa: N818 - the name says what happened
+    """The kernel's transmit queue is full (ENOBUFS); the frame was dropped and must not be sent late."""
+
+
+class Frame(NamedTuple):
+    """A received data frame with an 11-bit identifier."""
+
+    can_id: int
+    data: bytes
+    time_s: float
+    """When it was taken from the interface, on the link's clock."""
+
+
+@dataclass(slots=True)
+class Dropped:
+    """Frames that were received and thrown away, by kind."""
+
+    remote: int = 0
+    extended: int = 0
+    error: int = 0
+    fd: int = 0
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.remote + self.extended + self.error + self.fd
+
+
+class BusSettings(Protocol):
+    """The ``bus`` part of an axis file."""
+
+    @property
+    def interface(self) -> str: ...
+    @property
+    def channel(self) -> Any: ...
+    @property
+    def bitrate_bps(self) -> int | None: ...
+
+
+class Link:
+    """A CAN bus as the master sees it.
+
+    Once the interface has gone (ENETDOWN, ENODEV, bus-off), every call raises the same `BusError`: a
+    SocketCAN socket reports the loss *once* and then stays silent for ever, which would look like a quiet
+    bus. A new link on a newly opened bus is the way back.
+    """
+
+    __slots__ = ("_down", "_poll", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now")
+
+    def __init__(self, bus: can.BusABC, clock: Clock) -> None:
+        self.bus = bus
+        self.clock = clock
+        self.now = clock.now
+        self.name = str(getattr(bus, "channel_info", "") or type(bus).__name__)
+        self.dropped = Dropped()
+        self._down: str | None = None
+        self._send = bus.send
+        # BusABC.recv measures its remaining time on the *wall* clock: when that is set back during a wait,
+        # recv blocks for as long. Its hook has no such loop, so it is used where a back end relies on it.
+        own_recv = getattr(type(bus), "recv", None) is not can.BusABC.recv
+        self._raw_recv = None if own_recv else bus._recv_internal
+        self._recv = bus.recv
+
+    @property
+    def down(self) -> str | None:
+        """Why the interface is gone for good, or None."""
+        return self._down
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send a data frame with an 11-bit identifier; returns when the interface has taken it.
+
+        Raises `TransmitBufferFull` when the frame was dropped for want of room, `BusError` when the
+        interface failed.
+        """
+        if self._down is not None:
+            raise BusError(self._down)
+        try:
+            self._send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data))
+        except (can.CanError, OSError) as error:
+            raise self._failure("send", error) from error
+
+    def recv(self, deadline_s: float) -> Frame | None:
+        """The next data frame, or None when none came until ``deadline_s`` (a past one polls once).
+
+        Raises `BusError` when the interface failed.
+        """
+        if self._down is not None:
+            raise BusError(self._down)
+        while True:
+            timeout_s = max(deadline_s - self.now(), 0.0)
+            try:
+                message = self._receive(timeout_s)
+            except (can.CanError, OSError) as error:
+                raise self._failure("receive", error) from error
+            if message is None:
+                if timeout_s == 0.0 or self.now() >= deadline_s:
+                    return None
+                continue
+            if message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd:
+                self._drop(message)
+                continue
+            return Frame(message.arbitration_id, bytes(message.data), self.now())
+
+    def drain(self) -> list[Frame]:
+        """Everything that has arrived, without waiting."""
+        frames = []
+        now_s = self.now()
+        while (frame := self.recv(now_s)) is not None:
+            frames.append(frame)
+        return frames
+
+    def _receive(self, timeout_s: float) -> can.Message | None:
+        if self._raw_recv is None:
+            return self._recv(timeout_s)
+        message, filtered = self._raw_recv(timeout_s)
+        if message is None or filtered or self.bus._matches_filters(message):
+            return message
+        return None
+
+    def _drop(self, message: can.Message) -> None:
+        if message.is_error_frame:
+            self.dropped.error += 1
+            if self.name.startswith("socketcan") and message.arbitration_id & _ERROR_FRAME_BUS_OFF:
+                # During bus-off sends "succeed" and nothing arrives: this frame is the only sign.
+                self._down = (
+                    f"{self.name}: the CAN controller went bus-off; check wiring, bit rate and termination"
+                )
+                raise BusError(self._down)
+        elif message.is_remote_frame:
+            self.dropped.remote += 1
+        elif message.is_extended_id:
+            self.dropped.extended += 1
+        else:
+            self.dropped.fd += 1
+
+    def _failure(self, doing: str, error: Exception) -> BusError:
+        code = _errno(error)
+        text = str(error) or type(error).__name__
+        if code == errno.ENOBUFS or "buffer full" in text.lower():
+            return TransmitBufferFull(
+                f"{self.name}: the transmit queue is full, the frame was dropped; "
+                "check that another node acknowledges and that the bus is not overloaded"
+            )
+        message = f"{self.name}: cannot {doing}: {text}; check that the interface is up"
+        if code in _GONE or "closed bus" in text.lower():
+            self._down = message
+        return BusError(message)
+
+
+def _errno(error: BaseException | None) -> int | None:
+    """The operating system's error number, wherever python-can left it."""
+    while error is not None:
+        code = getattr(error, "error_code", None) or getattr(error, "errno", None)
+        if isinstance(code, int):
+            return code
+        error = error.__cause__
+    return None
+
+
+@contextmanager
+def open_bus(settings: BusSettings) -> Iterator[can.BusABC]:
+    """Open the bus of an axis file; `BusError` in one line when that is not possible.
+
+    Configuration files of python-can in the home folder are ignored: the axis file says it all.
+    """
+    name = f"{settings.interface}:{settings.channel}"
+    options: dict[str, Any] = {}
+    if settings.bitrate_bps is not None:
+        options["bitrate"] = settings.bitrate_bps
+    if settings.interface == "socketcan":
+        # CANopen uses 11-bit identifiers only: the kernel drops the others before they wake the process.
+        options["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
+    try:
+        bus = can.Bus(interface=settings.interface, channel=settings.channel, ignore_config=True, **options)
+    except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
+        if settings.interface not in can.VALID_INTERFACES:
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            what = f"python-can has no interface {settings.interface!r}; bus.interface may be one of {known}"
+        else:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            what = f"cannot open it: {reason}; check bus.channel and that the interface is up"
+        raise BusError(f"{name}: {what}") from error
+    try:
+        yield bus
+    finally:
+        # A device that has been unplugged may fail to close; there is nothing left to save then.
+        with suppress(can.CanError, OSError):
+            bus.shutdown()

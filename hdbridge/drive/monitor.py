@@ -1,0 +1,100 @@
+"""What the nodes say without being asked: heartbeats, boot-up messages, emergencies.
+
+Bookkeeping only; nothing is decided here. Whoever receives frames passes them on, so that a heartbeat that
+arrives in the middle of an SDO transfer is not lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from hdbridge.drive.link import Frame
+from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, NmtState
+
+EMERGENCIES_KEPT: Final = 64
+
+
+class Emergency(NamedTuple):
+    """One EMCY message. A short one is kept with what it has."""
+
+    time_s: float
+    code: int
+    register: int
+    vendor: bytes
+
+    def __str__(self) -> str:
+        """``EMCY 8611h, register 21h, 00 00 00 00 00``."""
+        return f"EMCY {self.code:04X}h, register {self.register:02X}h" + (
+            f", {self.vendor.hex(' ')}" if self.vendor else ""
+        )
+
+
+@dataclass(slots=True)
+class NodeStatus:
+    """What is known of a node from its own messages."""
+
+    node_id: int
+    nmt_state: int | None = None
+    """Last `NmtState` byte; None before the first heartbeat."""
+    heartbeat_s: float | None = None
+    """When the last heartbeat or boot-up message came, on the link's clock."""
+    boot_ups: int = 0
+    emergency_count: int = 0
+    """All emergencies, those that no longer fit the ring included."""
+    emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
+
+    def heartbeat_age_s(self, now_s: float) -> float:
+        """Seconds since the last heartbeat; infinite before the first."""
+        return float("inf") if self.heartbeat_s is None else now_s - self.heartbeat_s
+
+    @property
+    def last_error(self) -> Emergency | None:
+        """The newest emergency that reports an error rather than its end (code 00xxh)."""
+        return next((entry for entry in reversed(self.emergencies) if entry.code >> 8), None)
+
+
+class NetworkMonitor:
+    """Keeps a `NodeStatus` for each node that is watched."""
+
+    __slots__ = ("_emergency", "_heartbeat", "nodes")
+
+    def __init__(self, *node_ids: int) -> None:
+        self.nodes: dict[int, NodeStatus] = {}
+        self._heartbeat: dict[int, NodeStatus] = {}
+        self._emergency: dict[int, NodeStatus] = {}
+        for node_id in node_ids:
+            self.watch(node_id)
+
+    def watch(self, node_id: int) -> NodeStatus:
+        """The status of a node, watched from now on if it was not."""
+        status = self.nodes.get(node_id)
+        if status is None:
+            status = NodeStatus(node_id)
+            self.nodes[node_id] = status
+            self._heartbeat[COB_HEARTBEAT + node_id] = status
+            self._emergency[COB_EMCY + node_id] = status
+        return status
+
+    def dispatch(self, frame: Frame) -> bool:
+        """Take a frame; whether it was a heartbeat, boot-up message or emergency of a watched node."""
+        can_id, data, time_s = frame
+        status = self._heartbeat.get(can_id)
+        if status is not None:
+            if not data:
+                return True
+            # Bit 7 is the toggle bit of the older node guarding.
+            nmt_state = data[0] & 0x7F
+            status.nmt_state = nmt_state
+            status.heartbeat_s = time_s
+            if nmt_state == NmtState.BOOT_UP:
+                status.boot_ups += 1
+            return True
+        status = self._emergency.get(can_id)
+        if status is None:
+            return False
+        status.emergency_count += 1
+        code = int.from_bytes(data[:2], "little")
+        status.emergencies.append(Emergency(time_s, code, data[2] if len(data) > 2 else 0, bytes(data[3:8])))
+        return True

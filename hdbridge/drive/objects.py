@@ -1,0 +1,192 @@
+"""The objects of CiA 301 and CiA 402 that the master touches: address, type, name. Data only.
+
+Everything is keyed by (index, sub-index). A drive's EDS may give another type for an object than the
+profile does; the EDS then wins, because it is what the drive answers with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import Final
+
+from hdbridge.errors import InputError
+
+
+class IntegerType(Enum):
+    """An integer type of CiA 301 that can stand in a PDO, named as in the axis file."""
+
+    INT8 = "int8"
+    INT16 = "int16"
+    INT24 = "int24"
+    INT32 = "int32"
+    INT64 = "int64"
+    UINT8 = "uint8"
+    UINT16 = "uint16"
+    UINT24 = "uint24"
+    UINT32 = "uint32"
+    UINT64 = "uint64"
+
+    @property
+    def bits(self) -> int:
+        """Width in bits."""
+        return int(self.value.removeprefix("u").removeprefix("int"))
+
+    @property
+    def signed(self) -> bool:
+        """Whether the type has a sign."""
+        return not self.value.startswith("u")
+
+    @property
+    def minimum(self) -> int:
+        """Least value."""
+        return -(1 << (self.bits - 1)) if self.signed else 0
+
+    @property
+    def maximum(self) -> int:
+        """Greatest value."""
+        return (1 << (self.bits - self.signed)) - 1
+
+    def encode(self, value: int) -> bytes:
+        """Little-endian bytes of ``value``; the caller has checked the range."""
+        return value.to_bytes(self.bits // 8, "little", signed=self.signed)
+
+    def decode(self, data: bytes) -> int:
+        """Value of exactly ``bits / 8`` little-endian bytes."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    @classmethod
+    def named(cls, name: object) -> IntegerType:
+        """The type of that name ("int32"); a member of another string enum serves as well."""
+        text = getattr(name, "value", name)
+        try:
+            return cls(text)
+        except ValueError:
+            known = ", ".join(member.value for member in cls)
+            raise InputError(f"object type {text!r} is not known; use one of {known}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where an object is, what it holds, and what the profile calls it."""
+
+    index: int
+    sub: int
+    type: IntegerType
+    name: str
+
+    def __str__(self) -> str:
+        """``6041h:00 statusword``."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
+
+
+class Mode(IntEnum):
+    """Modes of operation (6060h), as far as they are used here."""
+
+    PP = 1
+    HM = 6
+    CSP = 8
+
+    @property
+    def supported_bit(self) -> int:
+        """Bit of 6502h that says that the drive has this mode."""
+        return 1 << (self.value - 1)
+
+
+class NmtCommand(IntEnum):
+    """First byte of an NMT message."""
+
+    START = 0x01
+    STOP = 0x02
+    PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+class NmtState(IntEnum):
+    """Byte of a heartbeat."""
+
+    BOOT_UP = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+# Function codes of the predefined connection set (CiA 301): add the node id where there is one.
+COB_NMT: Final = 0x000
+COB_SYNC: Final = 0x080
+COB_EMCY: Final = 0x080
+COB_TPDO1: Final = 0x180
+COB_RPDO1: Final = 0x200
+COB_TPDO2: Final = 0x280
+COB_SDO_ANSWER: Final = 0x580
+COB_SDO_REQUEST: Final = 0x600
+COB_HEARTBEAT: Final = 0x700
+PDO_INVALID: Final = 0x8000_0000
+"""Bit 31 of a PDO's COB-ID: the PDO does not exist."""
+
+DEVICE_PROFILE_402: Final = 402
+
+_U8, _U16, _U32 = IntegerType.UINT8, IntegerType.UINT16, IntegerType.UINT32
+_I8, _I16, _I32 = IntegerType.INT8, IntegerType.INT16, IntegerType.INT32
+
+DEVICE_TYPE: Final = Address(0x1000, 0, _U32, "device type")
+VENDOR_ID: Final = Address(0x1018, 1, _U32, "vendor id")
+PRODUCT_CODE: Final = Address(0x1018, 2, _U32, "product code")
+REVISION: Final = Address(0x1018, 3, _U32, "revision number")
+SERIAL: Final = Address(0x1018, 4, _U32, "serial number")
+HEARTBEAT_CONSUMER: Final = Address(0x1016, 1, _U32, "consumer heartbeat time")
+HEARTBEAT_PRODUCER: Final = Address(0x1017, 0, _U16, "producer heartbeat time")
+ERROR_BEHAVIOUR: Final = Address(0x1029, 1, _U8, "communication error behaviour")
+
+RPDO_COMMUNICATION: Final = 0x1400
+RPDO_MAPPING: Final = 0x1600
+TPDO_COMMUNICATION: Final = 0x1800
+TPDO_MAPPING: Final = 0x1A00
+
+ABORT_CONNECTION_OPTION: Final = Address(0x6007, 0, _I16, "abort connection option code")
+ERROR_CODE: Final = Address(0x603F, 0, _U16, "error code")
+CONTROLWORD: Final = Address(0x6040, 0, _U16, "controlword")
+STATUSWORD: Final = Address(0x6041, 0, _U16, "statusword")
+QUICK_STOP_OPTION: Final = Address(0x605A, 0, _I16, "quick stop option code")
+SHUTDOWN_OPTION: Final = Address(0x605B, 0, _I16, "shutdown option code")
+DISABLE_OPTION: Final = Address(0x605C, 0, _I16, "disable operation option code")
+HALT_OPTION: Final = Address(0x605D, 0, _I16, "halt option code")
+FAULT_REACTION_OPTION: Final = Address(0x605E, 0, _I16, "fault reaction option code")
+MODE: Final = Address(0x6060, 0, _I8, "modes of operation")
+MODE_DISPLAY: Final = Address(0x6061, 0, _I8, "modes of operation display")
+POSITION_DEMAND: Final = Address(0x6062, 0, _I32, "position demand value")
+POSITION_ACTUAL: Final = Address(0x6064, 0, _I32, "position actual value")
+FOLLOWING_WINDOW: Final = Address(0x6065, 0, _U32, "following error window")
+FOLLOWING_TIME: Final = Address(0x6066, 0, _U16, "following error time out")
+MAX_TORQUE: Final = Address(0x6072, 0, _U16, "max torque")
+RATED_TORQUE: Final = Address(0x6076, 0, _U32, "motor rated torque")
+TORQUE_ACTUAL: Final = Address(0x6077, 0, _I16, "torque actual value")
+TARGET_POSITION: Final = Address(0x607A, 0, _I32, "target position")
+HOME_OFFSET: Final = Address(0x607C, 0, _I32, "home offset")
+LIMIT_MIN: Final = Address(0x607D, 1, _I32, "software position limit min")
+LIMIT_MAX: Final = Address(0x607D, 2, _I32, "software position limit max")
+POLARITY: Final = Address(0x607E, 0, _U8, "polarity")
+MAX_MOTOR_SPEED: Final = Address(0x6080, 0, _U32, "max motor speed")
+PROFILE_VELOCITY: Final = Address(0x6081, 0, _U32, "profile velocity")
+PROFILE_ACCELERATION: Final = Address(0x6083, 0, _U32, "profile acceleration")
+PROFILE_DECELERATION: Final = Address(0x6084, 0, _U32, "profile deceleration")
+QUICK_STOP_DECELERATION: Final = Address(0x6085, 0, _U32, "quick stop deceleration")
+ENCODER_INCREMENTS: Final = Address(0x608F, 1, _U32, "encoder increments")
+ENCODER_REVOLUTIONS: Final = Address(0x608F, 2, _U32, "motor revolutions of the encoder")
+GEAR_MOTOR: Final = Address(0x6091, 1, _U32, "gear ratio motor revolutions")
+GEAR_SHAFT: Final = Address(0x6091, 2, _U32, "gear ratio shaft revolutions")
+FEED: Final = Address(0x6092, 1, _U32, "feed")
+FEED_SHAFT: Final = Address(0x6092, 2, _U32, "feed shaft revolutions")
+HOMING_METHOD: Final = Address(0x6098, 0, _I8, "homing method")
+HOMING_SPEED_SWITCH: Final = Address(0x6099, 1, _U32, "homing speed towards the switch")
+HOMING_SPEED_ZERO: Final = Address(0x6099, 2, _U32, "homing speed towards zero")
+HOMING_ACCELERATION: Final = Address(0x609A, 0, _U32, "homing acceleration")
+CYCLE_MANTISSA: Final = Address(0x60C2, 1, _U8, "interpolation time period value")
+CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
+SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
+
+STANDARD: Final[dict[tuple[int, int], Address]] = {
+    (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
+}
+"""Every object above by (index, sub-index)."""

@@ -1,0 +1,126 @@
+"""A PDO as bytes: what is mapped into it, and the way from frame to integers and back. No I/O.
+
+The layout is compiled once into a `struct`, because this runs in every control cycle. A frame of the wrong
+length is rejected whole, and nothing that is not an integer within its type's range is ever packed: NaN,
+infinity and an out-of-range target end here, before the bus.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from hdbridge.drive.objects import Address, IntegerType
+from hdbridge.errors import DriveError, InputError
+
+_FORMATS = {
+    IntegerType.INT8: "b",
+    IntegerType.INT16: "h",
+    IntegerType.INT24: "3s",
+    IntegerType.INT32: "i",
+    IntegerType.INT64: "q",
+    IntegerType.UINT8: "B",
+    IntegerType.UINT16: "H",
+    IntegerType.UINT24: "3s",
+    IntegerType.UINT32: "I",
+    IntegerType.UINT64: "Q",
+}
+MAX_BYTES = 8
+
+
+class PdoLengthError(DriveError):
+    """A PDO does not have the length of its mapping; treat it as lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class PdoEntry:
+    """One mapped object."""
+
+    index: int
+    sub: int
+    type: IntegerType
+
+    @classmethod
+    def of(cls, address: Address) -> PdoEntry:
+        """The entry that maps a known object."""
+        return cls(address.index, address.sub, address.type)
+
+    @property
+    def mapping(self) -> int:
+        """The value of a mapping parameter (1600h or 1A00h): index, sub-index, bits."""
+        return self.index << 16 | self.sub << 8 | self.type.bits
+
+    def __str__(self) -> str:
+        """``6064h:00 int32``."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.type.value}"
+
+
+class PdoCodec:
+    """Packs and unpacks one PDO.
+
+    ``entries`` are the mapped objects in order; 1 to 8 bytes together, no object twice, else `InputError`.
+    """
+
+    __slots__ = ("_limits", "_odd", "_struct", "_unpack", "entries", "length", "positions")
+
+    def __init__(self, entries: Iterable[PdoEntry]) -> None:
+        self.entries: tuple[PdoEntry, ...] = tuple(entries)
+        self._struct = struct.Struct("<" + "".join(_FORMATS[entry.type] for entry in self.entries))
+        self._unpack = self._struct.unpack
+        self.length: int = self._struct.size
+        """Bytes of the PDO, exactly."""
+        self.positions: dict[tuple[int, int], int] = {
+            (entry.index, entry.sub): place for place, entry in enumerate(self.entries)
+        }
+        """Place of an object's value in the tuple, by (index, sub-index)."""
+        self._limits = tuple((entry.type.minimum, entry.type.maximum) for entry in self.entries)
+        # struct has no 24-bit integer: such entries travel as three bytes and are converted apart.
+        self._odd = tuple(place for place, entry in enumerate(self.entries) if entry.type.bits == 24)
+        names = ", ".join(map(str, self.entries))
+        if not 1 <= self.length <= MAX_BYTES:
+            raise InputError(
+                f"a PDO carries 1 to {MAX_BYTES} bytes, but {names or 'nothing'} needs {self.length}"
+            )
+        if len(self.positions) != len(self.entries):
+            raise InputError(f"a PDO maps an object once, but got {names}")
+
+    def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:
+        """The mapped values in order; `PdoLengthError` unless ``data`` has exactly the mapped length."""
+        if len(data) != self.length:
+            raise PdoLengthError(
+                f"a PDO of {', '.join(map(str, self.entries))} has {self.length} bytes, not {len(data)}; "
+                "boot the drive again so that its mapping is what the master set"
+            )
+        values = self._unpack(data)
+        if not self._odd:
+            return values
+        decoded = list(values)
+        for place in self._odd:
+            decoded[place] = self.entries[place].type.decode(values[place])
+        return tuple(decoded)
+
+    def pack(self, values: Sequence[int]) -> bytes:
+        """The frame's data; `InputError` when a value is not an integer within the range of its type."""
+        if len(values) != len(self._limits):
+            raise InputError(
+                f"a PDO of {len(self._limits)} objects needs as many values, but got {len(values)}"
+            )
+        for value, (least, greatest) in zip(values, self._limits, strict=True):
+            # A float is refused even when it is whole: rounding is a decision, and NaN is a float too.
+            if not isinstance(value, int) or not least <= value <= greatest:
+                self._refuse(values)
+        if not self._odd:
+            return self._struct.pack(*values)
+        encoded: list[int | bytes] = list(values)
+        for place in self._odd:
+            encoded[place] = self.entries[place].type.encode(values[place])
+        return self._struct.pack(*encoded)
+
+    def _refuse(self, values: Sequence[int]) -> None:
+        for entry, value in zip(self.entries, values, strict=True):
+            if not isinstance(value, int) or not entry.type.minimum <= value <= entry.type.maximum:
+                raise InputError(
+                    f"object {entry}: {value!r} is not an integer in "
+                    f"[{entry.type.minimum}, {entry.type.maximum}]; nothing was sent"
+                )

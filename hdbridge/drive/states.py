@@ -1,0 +1,286 @@
+"""The power state machine of CiA 402, as tables.
+
+What may live here: the states, the rows of the decoding table, the rows of the transition table, and what
+follows from those rows alone: decoding, which command is legal where, the way from a state to another, the
+diagram. No bus, no clock, no objects, no modes of operation, no policy about *when* to move: those belong to
+`drive.py` and to the cycle. A drive that behaves differently gets another row, not an `if`.
+
+The rows are those of CiA 402-2, with its transition numbers. Three of them are never part of a way that
+is looked up, because somebody has to *want* them: leaving a fault (15), resuming out of a quick stop (16),
+and of course a fault (13).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from enum import Enum
+from typing import Final, NamedTuple
+
+from hdbridge.errors import TransitionError
+
+
+class State(Enum):
+    """State of the power drive system as the statusword tells it."""
+
+    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY_TO_SWITCH_ON = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    OPERATION_ENABLED = "operation enabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
+    FAULT_REACTION_ACTIVE = "fault reaction active"
+    FAULT = "fault"
+    UNKNOWN = "unknown"
+    """No statusword yet, or one that no row describes."""
+
+
+_DECODING: Final[tuple[tuple[State, int, int], ...]] = (
+    # state, mask, value: bits 0-3, 5, 6 of the statusword
+    (State.NOT_READY_TO_SWITCH_ON, 0x4F, 0x00),
+    (State.SWITCH_ON_DISABLED, 0x4F, 0x40),
+    (State.READY_TO_SWITCH_ON, 0x6F, 0x21),
+    (State.SWITCHED_ON, 0x6F, 0x23),
+    (State.OPERATION_ENABLED, 0x6F, 0x27),
+    (State.QUICK_STOP_ACTIVE, 0x6F, 0x07),
+    (State.FAULT_REACTION_ACTIVE, 0x4F, 0x0F),
+    (State.FAULT, 0x4F, 0x08),
+)
+
+
+class Command(Enum):
+    """What a controlword asks of the state machine: ``mask`` and ``word`` over bits 0-3 and 7."""
+
+    SHUTDOWN = ("shutdown", 0x87, 0x06)
+    SWITCH_ON = ("switch on", 0x8F, 0x07)
+    ENABLE_OPERATION = ("enable operation", 0x8F, 0x0F)
+    DISABLE_OPERATION = ("disable operation", 0x8F, 0x07)
+    DISABLE_VOLTAGE = ("disable voltage", 0x82, 0x00)
+    QUICK_STOP = ("quick stop", 0x86, 0x02)
+    FAULT_RESET = ("fault reset", 0x80, 0x80)
+    """An edge: bit 7 has to be seen low before."""
+
+    def __init__(self, label: str, mask: int, word: int) -> None:
+        self.label = label
+        self.mask = mask
+        self.word = word
+
+
+class Transition(NamedTuple):
+    """One row: in ``source``, ``command`` leads to ``target``; without a command the drive goes by itself."""
+
+    number: int
+    source: State
+    target: State
+    command: Command | None
+
+
+_S = State
+_C = Command
+TRANSITIONS: Final[tuple[Transition, ...]] = (
+    Transition(1, _S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, None),
+    Transition(2, _S.SWITCH_ON_DISABLED, _S.READY_TO_SWITCH_ON, _C.SHUTDOWN),
+    Transition(3, _S.READY_TO_SWITCH_ON, _S.SWITCHED_ON, _C.SWITCH_ON),
+    Transition(4, _S.SWITCHED_ON, _S.OPERATION_ENABLED, _C.ENABLE_OPERATION),
+    Transition(5, _S.OPERATION_ENABLED, _S.SWITCHED_ON, _C.DISABLE_OPERATION),
+    Transition(6, _S.SWITCHED_ON, _S.READY_TO_SWITCH_ON, _C.SHUTDOWN),
+    Transition(7, _S.READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE),
+    Transition(7, _S.READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _C.QUICK_STOP),
+    Transition(8, _S.OPERATION_ENABLED, _S.READY_TO_SWITCH_ON, _C.SHUTDOWN),
+    Transition(9, _S.OPERATION_ENABLED, _S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE),
+    Transition(10, _S.SWITCHED_ON, _S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE),
+    Transition(10, _S.SWITCHED_ON, _S.SWITCH_ON_DISABLED, _C.QUICK_STOP),
+    Transition(11, _S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _C.QUICK_STOP),
+    Transition(12, _S.QUICK_STOP_ACTIVE, _S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE),
+    Transition(13, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, None),
+    Transition(13, _S.READY_TO_SWITCH_ON, _S.FAULT_REACTION_ACTIVE, None),
+    Transition(13, _S.SWITCHED_ON, _S.FAULT_REACTION_ACTIVE, None),
+    Transition(13, _S.OPERATION_ENABLED, _S.FAULT_REACTION_ACTIVE, None),
+    Transition(13, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE, None),
+    Transition(14, _S.FAULT_REACTION_ACTIVE, _S.FAULT, None),
+    Transition(15, _S.FAULT, _S.SWITCH_ON_DISABLED, _C.FAULT_RESET),
+    Transition(16, _S.QUICK_STOP_ACTIVE, _S.OPERATION_ENABLED, _C.ENABLE_OPERATION),
+)
+NEVER_IMPLIED: Final = frozenset({13, 15, 16})
+"""Transitions that no search for a way may use."""
+
+HOLD: Final[dict[State, int]] = {
+    State.READY_TO_SWITCH_ON: Command.SHUTDOWN.word,
+    State.SWITCHED_ON: Command.SWITCH_ON.word,
+    State.OPERATION_ENABLED: Command.ENABLE_OPERATION.word,
+    State.QUICK_STOP_ACTIVE: Command.QUICK_STOP.word,
+}
+"""Controlword that leaves the drive where it is; in every other state that is 0, disable voltage."""
+
+
+def _decoded(bits: int) -> State:
+    return next((state for state, mask, value in _DECODING if bits & mask == value), State.UNKNOWN)
+
+
+_STATE_BITS: Final = 0x6F
+_DECODED: Final = tuple(_decoded(bits) for bits in range(_STATE_BITS + 1))
+
+
+def decode(statusword: int | None) -> State:
+    """The state that a statusword tells; UNKNOWN for None, for no 16-bit value and for undefined bits."""
+    if statusword is None or not 0 <= statusword <= 0xFFFF:
+        return State.UNKNOWN
+    return _DECODED[statusword & _STATE_BITS]
+
+
+def row_for(state: State, command: Command) -> Transition:
+    """The row that ``command`` takes in ``state``; `TransitionError` when there is none."""
+    for row in TRANSITIONS:
+        if row.source is state and row.command is command:
+            return row
+    legal = ", ".join(row.command.label for row in TRANSITIONS if row.source is state and row.command)
+    raise TransitionError(
+        f"'{command.label}' is not allowed in state '{state.value}'; "
+        + (f"allowed is {legal}" if legal else "no command is: wait for the drive or look at its fault")
+    )
+
+
+def _first_row(state: State, target: State) -> Transition | None:
+    """First row of the shortest way, breadth first, without the rows that are never implied."""
+    ways: deque[tuple[State, Transition | None]] = deque([(state, None)])
+    seen = {state}
+    while ways:
+        here, first = ways.popleft()
+        if here is target:
+            return first
+        for row in TRANSITIONS:
+            if row.source is here and row.number not in NEVER_IMPLIED and row.target not in seen:
+                seen.add(row.target)
+                ways.append((row.target, first or row))
+    return None
+
+
+_FIRST_ROWS: Final = {(a, b): _first_row(a, b) for a in State for b in State}
+
+
+def controlword_for(state: State, target: State) -> int:
+    """The controlword to send in ``state`` on the way to ``target``; at the target, the one that holds it.
+
+    Where the drive has to go first by itself, the word is 0 (disable voltage). Raises `TransitionError` when
+    no way leads there, which includes every way out of a fault (`PowerWalk.reset_fault`) or straight out of a
+    quick stop (by way of 'switch on disabled' only).
+    """
+    if state is target and state is not State.UNKNOWN:
+        return HOLD.get(state, 0)
+    row = _FIRST_ROWS[state, target]
+    if row is None:
+        hint = {
+            State.FAULT: "reset the fault first",
+            State.FAULT_REACTION_ACTIVE: "wait for the drive's fault reaction, then reset the fault",
+            State.UNKNOWN: "no valid statusword has arrived; check that the drive sends it",
+        }.get(state, "no command leads there")
+        raise TransitionError(f"cannot go from '{state.value}' to '{target.value}': {hint}")
+    return row.command.word if row.command is not None else 0
+
+
+_NO_RESET, _RESET_LOW, _RESET_HIGH = range(3)
+
+
+class PowerWalk:
+    """Walks a drive through its states, one statusword in and one controlword out at a time.
+
+    It has an aim and never invents one: a drive that leaves 'operation enabled' by itself is not enabled
+    again, and a fault is reset only when asked. A call that raises changes nothing.
+    """
+
+    __slots__ = ("_aim", "_reset", "_state", "_was_enabled")
+
+    def __init__(self) -> None:
+        self._state = State.UNKNOWN
+        self._aim = State.SWITCH_ON_DISABLED
+        self._reset = _NO_RESET
+        self._was_enabled = False
+
+    @property
+    def state(self) -> State:
+        """State of the last statusword."""
+        return self._state
+
+    @property
+    def aim(self) -> State:
+        """Where the walk is going."""
+        return self._aim
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the drive is where the walk was going."""
+        return self._state is self._aim
+
+    def observe(self, statusword: int | None) -> State:
+        """Take a statusword, give its state."""
+        state = _DECODED[statusword & _STATE_BITS] if statusword is not None else State.UNKNOWN
+        self._state = state
+        if state is State.OPERATION_ENABLED:
+            self._was_enabled = True
+        elif self._was_enabled:
+            self._was_enabled = False
+            if self._aim is State.OPERATION_ENABLED:
+                # It dropped out by itself. Where it went is where it is left, until somebody aims anew.
+                blind = state in (State.QUICK_STOP_ACTIVE, State.UNKNOWN)
+                self._aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
+        if state is not State.FAULT:
+            self._reset = _NO_RESET
+        return state
+
+    def go(self, target: State) -> None:
+        """Aim at a state; `TransitionError` when no way leads there from the present one."""
+        controlword_for(self._state, target)
+        self._aim = target
+        self._was_enabled = self._state is State.OPERATION_ENABLED
+
+    def quick_stop(self) -> None:
+        """Stop now: quick stop where power is on, disable voltage elsewhere. Always allowed."""
+        self._aim = (
+            State.QUICK_STOP_ACTIVE
+            if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN)
+            else State.SWITCH_ON_DISABLED
+        )
+        self._reset = _NO_RESET
+
+    def reset_fault(self) -> None:
+        """Ask for one fault reset; `TransitionError` unless the drive is in 'fault'."""
+        row_for(self._state, Command.FAULT_RESET)
+        self._reset = _RESET_LOW
+        self._aim = State.SWITCH_ON_DISABLED
+
+    def controlword(self) -> int:
+        """The word to send now. Bits 4-6 and 8-15 are zero: the mode of operation adds its own."""
+        if self._reset == _RESET_LOW:
+            # Bit 7 acts on its rising edge, so it is sent low once before it is sent high.
+            self._reset = _RESET_HIGH
+            return 0
+        if self._reset == _RESET_HIGH:
+            return Command.FAULT_RESET.word
+        if self._aim is State.QUICK_STOP_ACTIVE and self._state is not State.QUICK_STOP_ACTIVE:
+            # Also blind, when nothing is known about the drive: a quick stop harms in no state.
+            return Command.QUICK_STOP.word
+        if self._state is not self._aim and _FIRST_ROWS[self._state, self._aim] is None:
+            return 0
+        return controlword_for(self._state, self._aim)
+
+
+def states_on_the_way(state: State, target: State) -> Iterator[State]:
+    """The states from ``state`` to ``target``, both included; `TransitionError` when no way leads there."""
+    yield state
+    while state is not target:
+        controlword_for(state, target)
+        row = _FIRST_ROWS[state, target]
+        assert row is not None  # controlword_for has raised otherwise
+        state = row.target
+        yield state
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram; docs/master.md holds its text."""
+    lines = ["stateDiagram-v2"]
+    lines += [f"    {state.name}: {state.value}" for state in State if state is not State.UNKNOWN]
+    lines.append(f"    [*] --> {State.NOT_READY_TO_SWITCH_ON.name}")
+    for row in TRANSITIONS:
+        label = row.command.label if row.command else ("a fault occurs" if row.number == 13 else "by itself")
+        lines.append(f"    {row.source.name} --> {row.target.name}: {row.number} {label}")
+    return "\n".join(lines)
