@@ -38,6 +38,10 @@ class Frame(NamedTuple):
     """When it was taken from the interface, on the link's clock."""
 
 
+_new_tuple: Final = tuple.__new__
+"""Makes a Frame in half the time of its own constructor."""
+
+
 @dataclass(slots=True)
 class Dropped:
     """Frames that were received and thrown away, by kind."""
@@ -72,7 +76,7 @@ class Link:
     bus. A new link on a newly opened bus is the way back.
     """
 
-    __slots__ = ("_down", "_poll", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now")
+    __slots__ = ("_down", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now")
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         self.bus = bus
@@ -87,6 +91,7 @@ class Link:
         own_recv = getattr(type(bus), "recv", None) is not can.BusABC.recv
         self._raw_recv = None if own_recv else bus._recv_internal
         self._recv = bus.recv
+        self._matches = bus._matches_filters
 
     @property
     def down(self) -> str | None:
@@ -113,20 +118,29 @@ class Link:
         """
         if self._down is not None:
             raise BusError(self._down)
+        raw = self._raw_recv
+        now = self.now
         while True:
-            timeout_s = max(deadline_s - self.now(), 0.0)
+            timeout_s = deadline_s - now()
+            if timeout_s < 0.0:  # noqa: PLR1730 - max() costs three times as much, in every cycle
+                timeout_s = 0.0
             try:
-                message = self._receive(timeout_s)
+                if raw is None:
+                    message = self._recv(timeout_s)
+                else:
+                    message, filtered = raw(timeout_s)
+                    if message is not None and not filtered and not self._matches(message):
+                        continue
             except (can.CanError, OSError) as error:
                 raise self._failure("receive", error) from error
             if message is None:
-                if timeout_s == 0.0 or self.now() >= deadline_s:
+                if timeout_s == 0.0 or now() >= deadline_s:
                     return None
                 continue
             if message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd:
                 self._drop(message)
                 continue
-            return Frame(message.arbitration_id, bytes(message.data), self.now())
+            return _new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
 
     def drain(self) -> list[Frame]:
         """Everything that has arrived, without waiting."""
@@ -135,14 +149,6 @@ class Link:
         while (frame := self.recv(now_s)) is not None:
             frames.append(frame)
         return frames
-
-    def _receive(self, timeout_s: float) -> can.Message | None:
-        if self._raw_recv is None:
-            return self._recv(timeout_s)
-        message, filtered = self._raw_recv(timeout_s)
-        if message is None or filtered or self.bus._matches_filters(message):
-            return message
-        return None
 
     def _drop(self, message: can.Message) -> None:
         if message.is_error_frame:
