@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hdbridge.drive import objects
 from hdbridge.drive.objects import IntegerType
-from hdbridge.drive.pdo import PdoCodec, PdoEntry, PdoLengthError
+from hdbridge.drive.pdo import PdoCodec, PdoEntry
 from hdbridge.drive.states import PowerWalk
 from hdbridge.drive.unwrap import Unwrap, wrap_int32
 from hdbridge.errors import InputError
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -119,7 +119,7 @@ class ProcessImage:
         self._values: list[tuple[int, ...]] = [(0,) * len(slot[1].entries) for slot in self._slots.values()]
         self._unwrap_motor = Unwrap()
         self._unwrap_demand = Unwrap()
-        self._unwrap_load = Unwrap(1 << IntegerType.named(source.type).bits)
+        self._unwrap_load = Unwrap(source.wraps_at_counts)
         self.statusword: int | None = None
         """Newest statusword; None before the first."""
         self.motor_counts = 0
@@ -201,11 +201,11 @@ class ProcessImage:
 
     def motor_deg(self, counts: float) -> float:
         """Motor angle of motor counts, degrees of the motor, with the encoder's direction."""
-        return float(self.axis.motor_encoder.degrees(counts))
+        return self.axis.motor_encoder.degrees(counts)
 
     def load_deg(self, counts: float) -> float:
         """Load angle of load counts, degrees of the load, with the encoder's direction."""
-        return float(self.axis.load_encoder.degrees(counts))
+        return self.axis.load_encoder.degrees(counts)
 
     def target_counts_for(self, motor_deg: float) -> int:
         """Nearest motor counts of a motor angle; `InputError` when it is not finite or outside the limits."""
@@ -214,20 +214,3 @@ class ProcessImage:
         counts = round(self.axis.motor_encoder.counts(motor_deg))
         self.check_target(counts)
         return counts
-
-    @property
-    def counts_per_motor_turn(self) -> float:
-        """Motor counts of one turn, without the sign of the direction."""
-        return abs(float(self.axis.motor_encoder.counts(DEG_PER_TURN)))
-
-
-__all__ = [
-    "HALT_BIT",
-    "HEARTBEATS_PER_TIMEOUT",
-    "Layout",
-    "PdoLengthError",
-    "ProcessImage",
-    "position_limits_counts",
-    "rpdo_layout",
-    "tpdo_layouts",
-]

@@ -8,7 +8,7 @@ dropped and counted, and every deadline is on the monotonic clock that was passe
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol
@@ -66,6 +66,8 @@ class BusSettings(Protocol):
     def channel(self) -> Any: ...
     @property
     def bitrate_bps(self) -> int | None: ...
+    @property
+    def options(self) -> Mapping[str, str | int | float | bool]: ...
 
 
 class Link:
@@ -197,7 +199,7 @@ def open_bus(settings: BusSettings) -> Iterator[can.BusABC]:
     Configuration files of python-can in the home folder are ignored: the axis file says it all.
     """
     name = f"{settings.interface}:{settings.channel}"
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = dict(settings.options)
     if settings.bitrate_bps is not None:
         options["bitrate"] = settings.bitrate_bps
     if settings.interface == "socketcan":

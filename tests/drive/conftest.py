@@ -3,68 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
+from copy import deepcopy
 from typing import Any
 from uuid import uuid4
 
 import can
 import pytest
 
+from hdbridge.axis import AxisConfig
 
-def encoder(counts_per_turn: int, direction: int = 1, **extra: Any) -> SimpleNamespace:
-    per_deg = direction * counts_per_turn / 360.0
-    return SimpleNamespace(
-        counts_per_turn=counts_per_turn,
-        direction=direction,
-        counts=lambda deg: deg * per_deg,
-        degrees=lambda counts: counts / per_deg,
-        **extra,
-    )
+AXIS: dict[str, Any] = {
+    "schema": "hdbridge.axis/1",
+    "name": "test",
+    "bus": {"interface": "virtual", "channel": "test"},
+    "drive": {
+        "node_id": 1,
+        "eds": "none.eds",
+        "identity": {"vendor_id": 0x4844, "product_code": 0x402, "revision": 0x10000},
+        "cycle_ms": 4,
+        "heartbeat_ms": 50,
+        "following_error_deg": 5.0,
+        "rated_torque_nm": 0.32,
+    },
+    "motor_encoder": {"counts_per_turn": 8000},
+    "load_encoder": {"counts_per_turn": 2_880_000},
+    "gear": {"ratio": 50},
+    "limits": {
+        "position_min_deg": -400,
+        "position_max_deg": 400,
+        "velocity_deg_s": 20,
+        "acceleration_deg_s2": 200,
+        "jerk_deg_s3": 4000,
+        "torque_percent": 100,
+    },
+}
 
 
-def make_axis(**changes: Any) -> SimpleNamespace:
-    """An axis like that of profiles/article; ``changes`` are dotted names with __ for the dot."""
-    axis = SimpleNamespace(
-        name="test",
-        path="axis.yaml",
-        eds_path=None,
-        bus=SimpleNamespace(interface="virtual", channel="test", bitrate_bps=None),
-        drive=SimpleNamespace(
-            node_id=1,
-            identity=SimpleNamespace(vendor_id=0x4844, product_code=0x402, revision=0x10000, serial=None),
-            cycle_ms=4.0,
-            cycle_s=0.004,
-            heartbeat_ms=50,
-            master_node_id=127,
-            following_error_deg=5.0,
-            following_error_time_ms=20,
-            quick_stop_option=6,
-            halt_option=1,
-            rated_torque_nm=0.32,
-        ),
-        motor_encoder=encoder(8000),
-        load_encoder=encoder(
-            2_880_000,
-            source=SimpleNamespace(index=0x60E4, subindex=1, type="int32", via="tpdo", node=None),
-        ),
-        gear=SimpleNamespace(ratio=50.0, teeth=None),
-        limits=SimpleNamespace(
-            position_min_deg=-400.0,
-            position_max_deg=400.0,
-            velocity_deg_s=20.0,
-            acceleration_deg_s2=200.0,
-            jerk_deg_s3=4000.0,
-            torque_percent=100.0,
-        ),
-        compensation=SimpleNamespace(maximum_arcsec=300.0, slew_arcsec_s=20000.0, ramp_s=0.5),
-    )
+def make_axis(**changes: Any) -> AxisConfig:
+    """The axis above; ``changes`` are dotted names, with two underscores for the dot."""
+    content = deepcopy(AXIS)
     for name, value in changes.items():
         *parents, last = name.split("__")
-        target = axis
+        target = content
         for parent in parents:
-            target = getattr(target, parent)
-        setattr(target, last, value)
-    return axis
+            target = target.setdefault(parent, {})
+        target[last] = value
+    return AxisConfig.model_validate(content)
 
 
 class SteppedClock:
@@ -129,12 +113,12 @@ class PeerBus(can.BusABC):
 
 
 @pytest.fixture
-def axis() -> SimpleNamespace:
+def axis() -> AxisConfig:
     return make_axis()
 
 
 @pytest.fixture
-def build_axis() -> Callable[..., SimpleNamespace]:
+def build_axis() -> Callable[..., AxisConfig]:
     return make_axis
 
 
