@@ -28,15 +28,19 @@ class Field:
             if member is not type(None):
                 yield member
 
-    def choices(self) -> list[str]:
-        """The texts that it accepts, where there is a closed set of them."""
-        found: list[str] = []
+    def values(self) -> list[Any]:
+        """The values that it accepts, where there is a closed set of them."""
+        found: list[Any] = []
         for member in self.types():
             if get_origin(member) is Literal:
-                found += [str(each) for each in get_args(member)]
+                found += get_args(member)
             elif isinstance(member, type) and issubclass(member, Enum):
-                found += [str(each.value) for each in member]
+                found += [each.value for each in member]
         return found
+
+    def choices(self) -> list[str]:
+        """The texts among its `values`."""
+        return [each for each in self.values() if isinstance(each, str)]
 
 
 def key_of(name: str, field: FieldInfo) -> str:
@@ -72,15 +76,18 @@ def expected_words(field: Field | None) -> str:
 def type_words(field: Field) -> str:
     """For example "a number above 0, at most 3600"."""
     words = " or ".join(dict.fromkeys(_words(each) for each in field.types())) or "nothing"
-    return words + _range_words(field.metadata)
+    metadata = list(field.metadata)
+    for member in _unioned(field.annotation):
+        metadata += _annotated(member).metadata
+    return words + _range_words(metadata)
 
 
 def _words(member: Any) -> str:
     if member in _PLAIN:
         return _PLAIN[member]
-    choices = Field(member).choices()
-    if choices:
-        return " or ".join(f"'{each}'" if isinstance(each, str) else str(each) for each in choices)
+    values = Field(member).values()
+    if values:
+        return " or ".join(f"'{each}'" if isinstance(each, str) else str(each) for each in values)
     if _is_model(member) or member is dict or get_origin(member) is dict:
         return "a mapping"
     if member in {list, tuple} or get_origin(member) in {list, tuple}:
@@ -119,6 +126,11 @@ def _members(annotation: Any) -> Iterator[Any]:
             yield from _members(each)
     else:
         yield annotation
+
+
+def _unioned(annotation: Any) -> tuple[Any, ...]:
+    """The members of a union with their annotations, nothing for other types."""
+    return get_args(annotation) if get_origin(annotation) in {Union, types.UnionType} else ()
 
 
 def _member(place: Field, key: str) -> Field | None:

@@ -106,7 +106,7 @@ class Document:
 
     def validate(self, model: type[M], at: Location = ()) -> M:
         """The value at a location as an instance of ``model``."""
-        value = self._nodes(at)[-1].value
+        value = self._node(at).value
         try:
             # JSON, because pydantic's strict mode for JSON knows that a file has lists and text where a
             # model has tuples and enums; in Python mode strictness would refuse them.
@@ -126,17 +126,19 @@ class Document:
         unknown = {each["loc"][:-1]: each["loc"][-1] for each in errors if each["type"] == "extra_forbidden"}
         rows = []
         for error in errors:
-            place, message, key = self._complaint(model, error)
+            place, message, key = self._complaint(model, at, error)
             if error["type"] == "missing" and place in unknown:
                 close = nearest(str(unknown[place]), [str(error["loc"][-1])])
                 if close:  # one slip of the pen, already told as the unknown key
                     continue
-            node = self._nodes(at + place, key=key)[-1]
+            node = self._node(at + place, key=key)
             line = self._line(at + place, message, key=key)
             rows.append((error["type"] == "missing", node.line, node.column, line))
-        return [row[-1] for row in sorted(rows)]
+        return [row[-1] for row in sorted(set(rows))]
 
-    def _complaint(self, model: type[BaseModel], error: ErrorDetails) -> tuple[Location, str, bool]:
+    def _complaint(
+        self, model: type[BaseModel], at: Location, error: ErrorDetails
+    ) -> tuple[Location, str, bool]:
         """Location, message, and whether the key is meant rather than its value."""
         place, kind = error["loc"], error["type"]
         if kind == "extra_forbidden":
@@ -151,29 +153,41 @@ class Document:
             return place + inner, error["msg"], False
         if kind in {"value_error", "assertion_error"}:
             return place, error["msg"].split(", ", 1)[1], False
-        node = self._nodes(place)[-1]
+        node = self._node(at + place)
         field = field_at(model, place)
         what = expected_words(field) if field else error["msg"][0].lower() + error["msg"][1:]
         hint = _hint(node.value, field.choices()) if isinstance(node.value, str) and field else ""
         return place, f"found {node.found}; expected {what}" + (f"; {hint}" if hint else ""), False
 
     def _line(self, at: Location, message: str, *, key: bool = False) -> str:
-        node = self._nodes(at, key=key)[-1]
+        node = self._node(at, key=key)
         where = f"{self.path}:{node.line}:{node.column}"
-        keys = dotted(at)
+        keys = dotted(self._walk(at)[0])
         return f"{where}: {keys}: {message}" if keys else f"{where}: {message}"
 
-    def _nodes(self, at: Location, *, key: bool = False) -> list[Node]:
-        """The nodes on the way to a location, as far as it exists (pydantic adds names of union members)."""
-        nodes = [self.root]
-        for depth, step in enumerate(at):
-            children = nodes[-1].children
-            if isinstance(children, dict) and step in children:
-                pair = children[str(step)]
-                nodes.append(pair[0] if key and depth == len(at) - 1 else pair[1])
+    def _node(self, at: Location, *, key: bool = False) -> Node:
+        """The value at a location, or its key, or the innermost value around it that there is."""
+        kept, values = self._walk(at)
+        around = values[-2].children if key and len(values) > 1 else None
+        return around[str(kept[-1])][0] if isinstance(around, dict) else values[-1]
+
+    def _walk(self, at: Location) -> tuple[Location, list[Node]]:
+        """The steps that exist in the file, and the values on the way, the root first.
+
+        Others are left out: pydantic puts the names of a union's members into its locations.
+        """
+        kept: Location = ()
+        values = [self.root]
+        for step in at:
+            children = values[-1].children
+            if isinstance(children, dict) and isinstance(step, str) and step in children:
+                values.append(children[step][1])
             elif isinstance(children, list) and isinstance(step, int) and step < len(children):
-                nodes.append(children[step])
-        return nodes
+                values.append(children[step])
+            else:
+                continue
+            kept += (step,)
+        return kept, values
 
 
 def wrong(message: str, *at: str | int) -> PydanticCustomError:

@@ -1,0 +1,380 @@
+"""The axis file: which drive on which bus, its encoders and gear, and the limits within which it may move.
+
+``profiles/NAME/axis.yaml`` is written by a person and never rewritten by the program. Everything in it is
+checked before anything moves; a complaint names file, line and column.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic_core.core_schema import ValidationInfo
+
+from hdbridge.bundled import bundled_folder
+from hdbridge.errors import InputError
+from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.yamlfile import Document, document_from_text, read_yaml, wrong
+
+NodeId = Annotated[int, Field(ge=1, le=127)]
+Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
+Direction = Literal[1, -1]
+INT32_MAX = 2**31 - 1
+
+
+class _Part(BaseModel):
+    """A mapping of the file: frozen, no unknown keys, finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class BusConfig(_Part):
+    """The CAN bus, in the terms of python-can."""
+
+    interface: str = Field(
+        min_length=1, description="python-can interface: socketcan, virtual, udp_multicast, slcan, ..."
+    )
+    channel: str | int = Field(description="channel of that interface, for example can0")
+    bitrate_bps: int | None = Field(
+        None, ge=10_000, le=1_000_000, description="bit rate, where the interface sets it"
+    )
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, description="further options of the interface, handed on as they are"
+    )
+
+
+class Identity(_Part):
+    """The drive's identity object, 1018h; what is left out is not compared."""
+
+    vendor_id: Unsigned32 = Field(description="1018h:01")
+    product_code: Unsigned32 = Field(description="1018h:02")
+    revision: Unsigned32 | None = Field(None, description="1018h:03")
+    serial: Unsigned32 | None = Field(None, description="1018h:04")
+
+
+class DriveConfig(_Part):
+    """The servo drive: a CiA-402 node."""
+
+    node_id: NodeId = Field(description="CANopen node id of the drive")
+    eds: str = Field(
+        min_length=1, description="EDS file: relative to this file, else one of those that come with hdbridge"
+    )
+    identity: Identity = Field(description="which drive it must be")
+    cycle_ms: float = Field(
+        ge=0.5, le=255, description="SYNC period; 60C2h must express it: whole or with one decimal"
+    )
+    heartbeat_ms: int = Field(
+        50, ge=5, le=10_000, description="heartbeat period, of the drive (1017h) and of the master (1016h)"
+    )
+    master_node_id: NodeId = Field(127, description="node id under which the master sends its heartbeat")
+    following_error_deg: float = Field(
+        gt=0,
+        le=360,
+        description="following error window, 6065h, in degrees of the motor; it cannot be switched off",
+    )
+    following_error_time_ms: int = Field(20, ge=0, le=1000, description="following error time-out, 6066h")
+    quick_stop_option: int = Field(
+        6, ge=1, le=8, description="605Ah: 5 to 8 stay in QUICK STOP ACTIVE, 1 to 4 end in SWITCH ON DISABLED"
+    )
+    halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
+    rated_torque_nm: float = Field(
+        gt=0, le=10_000, description="rated torque of the motor, 6076h; unit of 6077h"
+    )
+
+    @field_validator("cycle_ms")
+    @classmethod
+    def _expressible(cls, cycle_ms: float) -> float:
+        if _interpolation_period(cycle_ms) is None:
+            raise ValueError(
+                f"60C2h cannot express {cycle_ms:g} ms: expected 1 to 255 whole milliseconds, "
+                "or 0.5 to 25.5 ms with one decimal"
+            )
+        return cycle_ms
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.heartbeat_ms < 2 * self.cycle_ms:
+            raise wrong(
+                f"a heartbeat of {self.heartbeat_ms} ms does not go with a cycle of {self.cycle_ms:g} ms; "
+                f"expected heartbeat_ms of at least {math.ceil(2 * self.cycle_ms)}",
+                "heartbeat_ms",
+            )
+        if self.master_node_id == self.node_id:
+            raise wrong(
+                f"node {self.node_id} is the drive (drive.node_id); expected another", "master_node_id"
+            )
+        return self
+
+    @property
+    def cycle_s(self) -> float:
+        """SYNC period in seconds."""
+        mantissa, exponent = self.interpolation_period
+        return float(f"{mantissa}e{exponent}")
+
+    @property
+    def interpolation_period(self) -> tuple[int, int]:
+        """60C2h: mantissa (:01) and exponent (:02) of the period in seconds."""
+        period = _interpolation_period(self.cycle_ms)
+        assert period is not None  # validated
+        return period
+
+
+class Encoder(_Part):
+    """An encoder: counts per turn and direction."""
+
+    counts_per_turn: int = Field(
+        ge=1, le=INT32_MAX, description="counts per turn of its own shaft, after multiplication"
+    )
+    direction: Direction = Field(
+        1, description="-1 where it counts down as the axis (as the axis file means it) turns forward"
+    )
+
+    def counts(self, deg: float) -> float:
+        """The reading, in (fractional) counts, at an angle of its shaft in degrees."""
+        return self.direction * deg * self.counts_per_turn / 360.0
+
+    def degrees(self, counts: float) -> float:
+        """The angle of its shaft in degrees at a reading."""
+        return self.direction * counts * 360.0 / self.counts_per_turn
+
+    @property
+    def resolution_arcsec(self) -> float:
+        """One count in arcseconds of its own shaft."""
+        return 1_296_000.0 / self.counts_per_turn
+
+
+class MotorEncoder(Encoder):
+    """The encoder of the motor, which the drive closes its loop on (6064h, 607Ah)."""
+
+
+class Source(_Part):
+    """The object that carries the load encoder's reading."""
+
+    WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}
+
+    index: int = Field(0x60E4, ge=0x1000, le=0xFFFF, description="index of the object")
+    subindex: int = Field(1, ge=0, le=255, description="sub-index of the object")
+    type: Literal["int32", "uint32", "int16", "uint16"] = Field("int32", description="type of the object")
+    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
+    node: NodeId | None = Field(
+        None, description="node id of the encoder, where it is a node of its own (for example CiA 406, 6004h)"
+    )
+    range_counts: int | None = Field(
+        None,
+        ge=2,
+        le=2**32,
+        description="reading at which it begins anew at zero (a single-turn encoder: its counts per turn); "
+        "without it the whole range of the type",
+    )
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if self.range_counts is not None and self.range_counts > self.WRAPS[self.type]:
+            raise wrong(f"{self.type} holds no more than {self.WRAPS[self.type]} counts", "range_counts")
+        return self
+
+    @property
+    def wraps_at_counts(self) -> int:
+        """The reading is known modulo this many counts."""
+        return self.range_counts or self.WRAPS[self.type]
+
+
+class LoadEncoder(Encoder):
+    """The encoder at the load, which says how true the axis points."""
+
+    source: Source = Field(default_factory=Source, description="where its reading comes from")
+
+
+class Teeth(_Part):
+    """Numbers of teeth of the gear, to check its ratio."""
+
+    flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
+    circular_spline: int = Field(ge=11, le=10_000, description="teeth of the circular spline, zc")
+    output: Literal["flexspline", "circular_spline"] = Field(
+        "flexspline", description="which of the two turns the load; the other is held"
+    )
+
+    @model_validator(mode="after")
+    def _circular_has_more(self) -> Self:
+        if self.circular_spline <= self.flexspline:
+            raise wrong(
+                f"{self.circular_spline} is not more than the flexspline's {self.flexspline}; "
+                "expected the flexspline's teeth and (as a rule) two more",
+                "circular_spline",
+            )
+        return self
+
+    @property
+    def ratio(self) -> float:
+        """Motor turns per load turn, without its sign."""
+        teeth = self.flexspline if self.output == "flexspline" else self.circular_spline
+        return teeth / (self.circular_spline - self.flexspline)
+
+
+class Gear(_Part):
+    """The harmonic gear."""
+
+    ratio: float = Field(
+        ge=1, le=1000, description="N: motor turns per load turn; a reversing gear: a direction of -1"
+    )
+    teeth: Teeth | None = Field(None, description="numbers of teeth; checked against the ratio")
+    load_torque: Literal["none"] = Field("none", description="where the load torque comes from")
+
+    @field_validator("teeth")
+    @classmethod
+    def _teeth_give_the_ratio(cls, teeth: Teeth | None, info: ValidationInfo) -> Teeth | None:
+        ratio = info.data.get("ratio")
+        if teeth is None or ratio is None or math.isclose(teeth.ratio, ratio, rel_tol=1e-9):
+            return teeth
+        zf, zc = teeth.flexspline, teeth.circular_spline
+        raise ValueError(
+            f"{zf} and {zc} teeth do not give a ratio of {ratio:g}: zf/(zc-zf) = {zf / (zc - zf):g} with "
+            f"flexspline output, {zc / (zc - zf):g} with circular-spline output; {ratio:g} needs "
+            + _teeth_for(ratio, zc - zf, teeth)
+        )
+
+
+class Limits(_Part):
+    """What the axis may do; all at the load."""
+
+    position_min_deg: float = Field(description="lowest position")
+    position_max_deg: float = Field(description="highest position")
+    velocity_deg_s: float = Field(gt=0, le=100_000, description="highest speed")
+    acceleration_deg_s2: float = Field(gt=0, le=1e7, description="highest acceleration")
+    jerk_deg_s3: float = Field(gt=0, le=1e9, description="highest jerk")
+    torque_percent: float = Field(gt=0, le=500, description="highest motor torque, of the rated one (6072h)")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.position_min_deg >= self.position_max_deg:
+            raise wrong(
+                f"found {self.position_max_deg:g}; expected more than position_min_deg, "
+                f"{self.position_min_deg:g}",
+                "position_max_deg",
+            )
+        return self
+
+    def contains(self, position_deg: float) -> bool:
+        """Whether a load position is permitted (NaN is not)."""
+        return self.position_min_deg <= position_deg <= self.position_max_deg
+
+
+class CompensationConfig(_Part):
+    """How far and how fast the compensation may move the target."""
+
+    maximum_arcsec: float = Field(300.0, gt=0, le=36_000, description="largest correction, at the load")
+    slew_arcsec_s: float = Field(
+        20_000.0, gt=0, le=1e7, description="fastest change of the correction, at the load"
+    )
+    ramp_s: float = Field(0.5, gt=0, le=60, description="time in which it is switched on or off")
+
+
+class AxisConfig(_Part):
+    """An axis: bus, drive, encoders, gear, limits and compensation."""
+
+    schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="kind and version of this file")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
+    )
+    bus: BusConfig = Field(description="the CAN bus")
+    drive: DriveConfig = Field(description="the servo drive")
+    motor_encoder: MotorEncoder = Field(description="the encoder of the motor")
+    load_encoder: LoadEncoder = Field(description="the encoder at the load")
+    gear: Gear = Field(description="the gear between them")
+    limits: Limits = Field(description="what the axis may do")
+    compensation: CompensationConfig = Field(
+        default_factory=CompensationConfig, description="how far and how fast the compensation may act"
+    )
+
+    _path: Path | None = PrivateAttr(None)
+    _eds_path: Path | None = PrivateAttr(None)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read an axis file, or the one in a profile's folder; InputError with file:line:column."""
+        path = Path(path)
+        return cls._from_document(read_yaml(path / "axis.yaml" if path.is_dir() else path))
+
+    @classmethod
+    def from_text(cls, text: str, path: Path | str = "axis.yaml") -> Self:
+        """An axis file's text; ``path`` names it in complaints and says where its EDS may lie."""
+        return cls._from_document(document_from_text(text, path))
+
+    @classmethod
+    def _from_document(cls, document: Document) -> Self:
+        axis = document.validate(cls)
+        places = [document.path.parent / axis.drive.eds, bundled_folder("eds") / axis.drive.eds]
+        found = next((place for place in places if place.is_file()), None)
+        if found is None:
+            raise document.error(
+                ("drive", "eds"),
+                f"there is no '{axis.drive.eds}' in {places[0].parent} nor among the bundled EDS files in "
+                f"{bundled_folder('eds')}; expected an EDS file there, or another name here",
+            )
+        axis._path = document.path
+        axis._eds_path = found.resolve()
+        return axis
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        node = self.load_encoder.source.node
+        if node is not None and node in {self.drive.node_id, self.drive.master_node_id}:
+            owner = "drive.node_id" if node == self.drive.node_id else "drive.master_node_id"
+            raise wrong(
+                f"node {node} is {owner}; expected another, or no key where the drive sends the reading",
+                "load_encoder", "source", "node",
+            )  # fmt: skip
+        for end in ("position_min_deg", "position_max_deg"):
+            position_deg: float = getattr(self.limits, end)
+            reach_deg = abs(position_deg) + self.compensation.maximum_arcsec / ARCSEC_PER_DEG
+            counts = abs(self.motor_encoder.counts(reach_deg * self.gear.ratio))
+            if counts > INT32_MAX:
+                raise wrong(
+                    f"{position_deg:g} deg is {counts:.3g} motor counts, more than 607Ah can hold "
+                    f"({INT32_MAX}); expected a smaller range",
+                    "limits",
+                    end,
+                )
+        return self
+
+    def on_bus(self, **changes: str | int | None) -> Self:
+        """The same axis on another bus (keys of `BusConfig`); options stay only with their interface."""
+        bus = {**self.bus.model_dump(), **changes}
+        if bus["interface"] != self.bus.interface:
+            bus.update(options={})
+        return self.model_copy(update={"bus": BusConfig.model_validate(bus)})
+
+    @property
+    def path(self) -> Path:
+        """The file that this axis was read from."""
+        return self._path or Path("axis.yaml")
+
+    @property
+    def eds_path(self) -> Path:
+        """The drive's EDS file, absolute; InputError where the axis was not read from a file and has none."""
+        if self._eds_path is None:
+            raise InputError(f"axis '{self.name}' was not read from a file: its EDS file is not known")
+        return self._eds_path
+
+
+def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
+    cycle = Decimal(repr(cycle_ms))
+    for exponent in (-3, -4):
+        mantissa = cycle.scaleb(-3 - exponent)
+        if mantissa == int(mantissa) and 1 <= mantissa <= 255:
+            return int(mantissa), exponent
+    return None
+
+
+def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
+    """Which teeth a ratio needs, for the output that the file states and the same difference of teeth."""
+    held = round(ratio * difference)
+    for more in (difference, 2, 1):
+        held = round(ratio * more)
+        if math.isclose(held, ratio * more, rel_tol=1e-9):
+            zf, zc = (held, held + more) if teeth.output == "flexspline" else (held - more, held)
+            return f"{zf} and {zc}"
+    return "other teeth"

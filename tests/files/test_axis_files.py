@@ -1,0 +1,213 @@
+"""The axis file: what it means, and one exact line for everything that can be wrong in it."""
+
+# ruff: noqa: E501  (the table of complaints shows each on one line)
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.axis import AxisConfig, MotorEncoder
+from hdbridge.bundled import bundled_folder, bundled_profile
+from hdbridge.errors import InputError
+
+GOOD = """\
+schema: hdbridge.axis/1
+name: test
+bus: {interface: virtual, channel: test}
+drive:
+  node_id: 1
+  eds: test.eds
+  identity: {vendor_id: 0x4844, product_code: 0x402}
+  cycle_ms: 4
+  following_error_deg: 5.0
+  rated_torque_nm: 0.32
+motor_encoder: {counts_per_turn: 8000}
+load_encoder: {counts_per_turn: 2880000, direction: -1}
+gear:
+  ratio: 50
+limits:
+  position_min_deg: -400
+  position_max_deg: 400
+  velocity_deg_s: 20
+  acceleration_deg_s2: 200
+  jerk_deg_s3: 4000
+  torque_percent: 100
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "test.eds").write_text("")
+    return tmp_path
+
+
+def load(folder: Path, text: str) -> AxisConfig:
+    (folder / "axis.yaml").write_text(text)
+    return AxisConfig.load(folder / "axis.yaml")
+
+
+def test_a_good_file_gives_nested_values_and_defaults(folder):
+    axis = load(folder, GOOD)
+    assert (axis.name, axis.drive.cycle_s, axis.drive.interpolation_period) == ("test", 0.004, (4, -3))
+    assert (axis.drive.heartbeat_ms, axis.drive.master_node_id, axis.drive.quick_stop_option) == (50, 127, 6)
+    assert (axis.load_encoder.source.index, axis.load_encoder.source.wraps_at_counts) == (0x60E4, 2**32)
+    assert (axis.compensation.maximum_arcsec, axis.compensation.slew_arcsec_s, axis.compensation.ramp_s) == (
+        300,
+        20000,
+        0.5,
+    )
+    assert axis.eds_path == (folder / "test.eds").resolve()
+    assert axis.path == folder / "axis.yaml"
+    assert axis.motor_encoder.resolution_arcsec / axis.gear.ratio == pytest.approx(3.24)
+    assert AxisConfig.load(folder) == axis
+
+
+def test_it_cannot_be_changed(folder):
+    axis = load(folder, GOOD)
+    with pytest.raises(ValueError, match="frozen"):
+        axis.gear.ratio = 40  # type: ignore[misc]
+
+
+TEETH = GOOD + "gear:\n  ratio: {}\n  teeth: {{flexspline: {}, circular_spline: {}, output: {}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "given", "expected"),
+    [
+        ("cycle_ms: 4", "cycle_ms: 4.25", "8:13: drive.cycle_ms: 60C2h cannot express 4.25 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
+        ("cycle_ms: 4", "cycle_ms: 25.6", "8:13: drive.cycle_ms: 60C2h cannot express 25.6 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
+        ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms does not go with a cycle of 40 ms; expected heartbeat_ms of at least 80"),
+        ("cycle_ms: 4", "cycle_sm: 4", "8:3: drive.cycle_sm: unknown key; did you mean 'cycle_ms'?"),
+        ("cycle_ms: 4", "master_node_id: 1\n  cycle_ms: 4", "8:19: drive.master_node_id: node 1 is the drive (drive.node_id); expected another"),
+        ("node_id: 1", "node_id: 0", "5:12: drive.node_id: found 0; expected an integer from 1 to 127 (CANopen node id of the drive)"),
+        ("node_id: 1", "node_id: 128", "5:12: drive.node_id: found 128; expected an integer from 1 to 127 (CANopen node id of the drive)"),
+        ("following_error_deg: 5.0", "following_error_deg: 0", "9:24: drive.following_error_deg: found 0; expected a number above 0, at most 360 (following error window, 6065h, in degrees of the motor; it cannot be switched off)"),
+        ("following_error_deg: 5.0", "following_error_deg: off", "9:24: drive.following_error_deg: found 'off'; expected a number above 0, at most 360 (following error window, 6065h, in degrees of the motor; it cannot be switched off)"),
+        ("following_error_deg: 5.0\n  ", "", "5:3: drive: key 'following_error_deg' is missing; expected a number above 0, at most 360 (following error window, 6065h, in degrees of the motor; it cannot be switched off)"),
+        ("product_code: 0x402", "product_code: 0x100000000", "7:47: drive.identity.product_code: found 0x100000000; expected an integer from 0 to 4294967295 (1018h:02)"),
+        ("product_code: 0x402", "product_code: 0x402, serial: -1", "7:62: drive.identity.serial: found -1; expected an integer from 0 to 4294967295 (1018h:04)"),
+        (", product_code: 0x402", "", "7:13: drive.identity: key 'product_code' is missing; expected an integer from 0 to 4294967295 (1018h:02)"),
+        ("direction: -1", "direction: 0", "12:53: load_encoder.direction: found 0; expected 1 or -1 (-1 where it counts down as the axis (as the axis file means it) turns forward)"),
+        ("counts_per_turn: 8000", "counts_per_turn: 8000.0", "11:34: motor_encoder.counts_per_turn: found 8000.0; expected an integer from 1 to 2147483647 (counts per turn of its own shaft, after multiplication)"),
+        ("direction: -1", "source: {type: float}", "12:57: load_encoder.source.type: found 'float'; expected 'int32' or 'uint32' or 'int16' or 'uint16' (type of the object)"),
+        ("direction: -1", "source: {via: sdo}", "12:56: load_encoder.source.via: found 'sdo'; expected 'tpdo' (how it comes; an SDO is too slow for the cycle)"),
+        ("direction: -1", "source: {node: 1}", "12:57: load_encoder.source.node: node 1 is drive.node_id; expected another, or no key where the drive sends the reading"),
+        ("direction: -1", "source: {node: 127}", "12:57: load_encoder.source.node: node 127 is drive.master_node_id; expected another, or no key where the drive sends the reading"),
+        ("direction: -1", "source: {type: int16, range_counts: 65537}", "12:78: load_encoder.source.range_counts: int16 holds no more than 65536 counts"),
+        ("ratio: 50", "ratio: -50", "14:10: gear.ratio: found -50; expected a number from 1 to 1000 (N: motor turns per load turn; a reversing gear: a direction of -1)"),
+        ("ratio: 50", "ratio: .inf", "14:10: gear.ratio: found .inf; expected a number from 1 to 1000 (N: motor turns per load turn; a reversing gear: a direction of -1)"),
+        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 80, circular_spline: 82}", "15:10: gear.teeth: 80 and 82 teeth do not give a ratio of 50: zf/(zc-zf) = 40 with flexspline output, 41 with circular-spline output; 50 needs 100 and 102"),
+        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 80, circular_spline: 82, output: circular_spline}", "15:10: gear.teeth: 80 and 82 teeth do not give a ratio of 50: zf/(zc-zf) = 40 with flexspline output, 41 with circular-spline output; 50 needs 98 and 100"),
+        ("ratio: 50", "ratio: 50.3\n  teeth: {flexspline: 100, circular_spline: 102}", "15:10: gear.teeth: 100 and 102 teeth do not give a ratio of 50.3: zf/(zc-zf) = 50 with flexspline output, 51 with circular-spline output; 50.3 needs other teeth"),
+        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 102, circular_spline: 100}", "15:45: gear.teeth.circular_spline: 100 is not more than the flexspline's 102; expected the flexspline's teeth and (as a rule) two more"),
+        ("ratio: 50", "ratio: 50\n  teeth: {flexspline: 100, circular_spline: 102, output: flexsplin}", "15:58: gear.teeth.output: found 'flexsplin'; expected 'flexspline' or 'circular_spline' (which of the two turns the load; the other is held); did you mean 'flexspline'?"),
+        ("position_min_deg: -400", "position_min_deg: 400", "17:21: limits.position_max_deg: found 400; expected more than position_min_deg, 400"),
+        ("position_max_deg: 400", "position_max_deg: 2.0e+6", "17:21: limits.position_max_deg: 2e+06 deg is 2.22e+09 motor counts, more than 607Ah can hold (2147483647); expected a smaller range"),
+        ("position_max_deg: 400", "position_max_deg: .nan", "17:21: limits.position_max_deg: found .nan; expected a number (highest position)"),
+        ("  velocity_deg_s: 20\n", "", "16:3: limits: key 'velocity_deg_s' is missing; expected a number above 0, at most 100000 (highest speed)"),
+        ("velocity_deg_s: 20", "velocity_deg_s: 0", "18:19: limits.velocity_deg_s: found 0; expected a number above 0, at most 100000 (highest speed)"),
+        ("name: test", "name: a b", "2:7: name: found 'a b'; expected text (name: letters, digits, '.', '_', '-')"),
+        ("channel: test", "channel: [1]", "3:36: bus.channel: found a list; expected text or an integer (channel of that interface, for example can0)"),
+        ("channel: test", "chanel: test", "3:27: bus.chanel: unknown key; did you mean 'channel'?"),
+        ("hdbridge.axis/1", "hdbridge.model/1", "1:9: schema: found 'hdbridge.model/1'; expected 'hdbridge.axis/1' (kind and version of this file); did you mean 'hdbridge.axis/1'?"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_gets_one_exact_line(folder, wanted, given, expected):
+    assert wanted in GOOD
+    with pytest.raises(InputError) as caught:
+        load(folder, GOOD.replace(wanted, given, 1))
+    assert str(caught.value) == f"{folder / 'axis.yaml'}:{expected}"
+
+
+def test_without_limits_there_is_no_axis(folder):
+    with pytest.raises(
+        InputError,
+        match=r"axis\.yaml:1:1: key 'limits' is missing; expected a mapping \(what the axis may do\)$",
+    ):
+        load(folder, GOOD.split("limits:", maxsplit=1)[0])
+
+
+def test_a_missing_eds_is_one_line_with_both_places(folder):
+    with pytest.raises(InputError) as caught:
+        load(folder, GOOD.replace("test.eds", "other.eds"))
+    assert str(caught.value) == (
+        f"{folder / 'axis.yaml'}:6:8: drive.eds: there is no 'other.eds' in {folder} nor among the bundled EDS files "
+        f"in {bundled_folder('eds')}; expected an EDS file there, or another name here"
+    )
+
+
+@pytest.mark.parametrize(
+    ("flexspline", "circular", "output", "ratio"),
+    [(100, 102, "flexspline", 50), (80, 82, "flexspline", 40), (80, 82, "circular_spline", 41), (160, 161, "flexspline", 160)],
+)  # fmt: skip
+def test_teeth_that_give_the_ratio_are_accepted(folder, flexspline, circular, output, ratio):
+    teeth = f"{{flexspline: {flexspline}, circular_spline: {circular}, output: {output}}}"
+    axis = load(folder, GOOD.replace("ratio: 50", f"ratio: {ratio}\n  teeth: {teeth}"))
+    assert axis.gear.teeth is not None
+    assert axis.gear.teeth.ratio == axis.gear.ratio == ratio
+
+
+@given(st.integers(5, 255), st.sampled_from([1, 10]))
+def test_the_interpolation_period_is_the_cycle(tenths, factor):
+    axis = AxisConfig.from_text(
+        GOOD.replace("test.eds", str(Path(__file__))).replace(
+            "cycle_ms: 4", f"cycle_ms: {tenths * factor / 10}\n  heartbeat_ms: 600"
+        )
+    )
+    mantissa, exponent = axis.drive.interpolation_period
+    assert 1 <= mantissa <= 255
+    assert (
+        axis.drive.cycle_s
+        == float(f"{mantissa}e{exponent}")
+        == pytest.approx(axis.drive.cycle_ms / 1000, rel=1e-15)
+    )
+
+
+@given(st.integers(1, 2**31 - 1), st.sampled_from([1, -1]), st.floats(-1e6, 1e6))
+def test_counts_and_degrees_are_inverses_and_keep_the_direction(counts_per_turn, direction, deg):
+    encoder = MotorEncoder(counts_per_turn=counts_per_turn, direction=direction)
+    assert encoder.degrees(encoder.counts(deg)) == pytest.approx(deg, rel=1e-14, abs=1e-300)
+    assert encoder.counts(360.0) == direction * counts_per_turn
+
+
+def test_another_bus_keeps_everything_else(folder):
+    axis = load(folder, GOOD.replace("channel: test", "channel: test, options: {receive_own_messages: true}"))
+    other = axis.on_bus(interface="socketcan", channel="vcan0")
+    assert (other.bus.interface, other.bus.channel, other.bus.options) == ("socketcan", "vcan0", {})
+    assert axis.on_bus(channel="x").bus.options == {"receive_own_messages": True}
+    assert (other.drive, other.limits, other.eds_path, other.path) == (
+        axis.drive,
+        axis.limits,
+        axis.eds_path,
+        axis.path,
+    )
+
+
+@pytest.mark.parametrize("name", ["article", "demo"])
+def test_the_bundled_profiles_are_right(name):
+    axis = AxisConfig.load(bundled_profile(name))
+    assert axis.name == name
+    assert axis.gear.ratio == 50
+    assert axis.eds_path.parent == bundled_folder("eds")
+
+
+def test_an_unknown_profile_names_those_that_there_are():
+    with pytest.raises(InputError) as caught:
+        bundled_profile("articel")
+    assert str(caught.value) == (
+        "articel: no such file or folder, nor a bundled profile; expected a path or one of: article, demo; "
+        "did you mean 'article'?"
+    )
+
+
+def test_bundled_files_are_found_in_a_wheel_and_in_a_working_copy(tmp_path):
+    package = tmp_path / "site-packages" / "hdbridge"
+    (package / "_bundled" / "eds").mkdir(parents=True)
+    (package.parent / "eds").mkdir()  # somebody else's package of that name
+    assert bundled_folder("eds", package) == package / "_bundled" / "eds"
+    copy = tmp_path / "copy"
+    (copy / "eds").mkdir(parents=True)
+    (copy / "pyproject.toml").write_text("")
+    assert bundled_folder("eds", copy / "hdbridge") == copy / "eds"
