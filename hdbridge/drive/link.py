@@ -21,6 +21,7 @@ from hdbridge.errors import BusError
 _GONE: Final = frozenset(
     {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.ENETUNREACH, errno.EBADF, errno.EIO}
 )
+_DRAIN_AT_MOST: Final = 4096
 _ERROR_FRAME_BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""
 
@@ -145,10 +146,10 @@ class Link:
             return _new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
 
     def drain(self) -> list[Frame]:
-        """Everything that has arrived, without waiting."""
-        frames = []
+        """Everything that has arrived, without waiting; at most 4096 frames, so that it ends on any bus."""
+        frames: list[Frame] = []
         now_s = self.now()
-        while (frame := self.recv(now_s)) is not None:
+        while len(frames) < _DRAIN_AT_MOST and (frame := self.recv(now_s)) is not None:
             frames.append(frame)
         return frames
 

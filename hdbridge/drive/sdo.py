@@ -1,0 +1,306 @@
+"""Reading and writing a node's objects, in the caller's own thread.
+
+The SDO protocol itself is that of `canopen`; what is replaced is how it waits. canopen's client needs a
+notifier thread that feeds a queue, and that thread dies for good when the interface goes down. Here the
+caller's thread receives until the answer is there, until a deadline on the passed clock; every other frame
+that arrives meanwhile goes to the network monitor. Added besides: retries that repeat the whole transfer, a
+cap on what a node may send, a check of every answer's length, and errors that say what to do.
+
+Never used inside the control cycle.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Final
+
+import canopen
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+from canopen.sdo.client import SdoClient as CanopenSdoClient
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.objects import COB_SDO_ANSWER, COB_SDO_REQUEST, STANDARD, Address, IntegerType
+from hdbridge.errors import InputError, SdoError
+
+DEFAULT_TIMEOUT_S: Final = 0.5
+DEFAULT_ATTEMPTS: Final = 3
+DEFAULT_SIZE_CAP: Final = 4096
+"""Longest object that is read, bytes: names and versions are the longest that are wanted."""
+_TIMEOUTS_PER_TRANSFER: Final = 20
+_FRAME_BYTES: Final = 8
+_ABORT: Final = 0x80
+_ABORT_TIMED_OUT: Final = 0x0504_0000
+_ABORT_OUT_OF_MEMORY: Final = 0x0504_0005
+_HEADER: Final = struct.Struct("<BHB")
+
+_TYPES: Final = {
+    datatypes.BOOLEAN: IntegerType.UINT8,
+    datatypes.INTEGER8: IntegerType.INT8,
+    datatypes.INTEGER16: IntegerType.INT16,
+    datatypes.INTEGER24: IntegerType.INT24,
+    datatypes.INTEGER32: IntegerType.INT32,
+    datatypes.INTEGER64: IntegerType.INT64,
+    datatypes.UNSIGNED8: IntegerType.UINT8,
+    datatypes.UNSIGNED16: IntegerType.UINT16,
+    datatypes.UNSIGNED24: IntegerType.UINT24,
+    datatypes.UNSIGNED32: IntegerType.UINT32,
+    datatypes.UNSIGNED64: IntegerType.UINT64,
+}
+
+_ADVICE: Final = {
+    0x0601_0000: "the drive does not support this access",
+    0x0601_0002: "the object is read-only on this drive",
+    0x0602_0000: "the drive does not have the object: check that drive.eds is the EDS of this drive",
+    0x0604_0041: "the drive cannot map it to a PDO: choose another object in load_encoder.source",
+    0x0604_0042: "the mapped objects do not fit the PDO",
+    0x0609_0011: "the drive does not have this sub-index: check that drive.eds is the EDS of this drive",
+    0x0609_0030: "the drive refuses the value: change it in the axis file",
+    0x0609_0031: "the drive refuses the value as too high: lower it in the axis file",
+    0x0609_0032: "the drive refuses the value as too low: raise it in the axis file",
+    0x0800_0021: "another controller holds the drive (local or fieldbus): release it there",
+    0x0800_0022: "the drive refuses in its present state: disable it or reset its fault first",
+}
+
+
+def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
+    """The object dictionary of an EDS file; `InputError` when it cannot be read."""
+    try:
+        return canopen.import_od(str(path), node_id)
+    except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"{path}: cannot be read as an EDS: {reason}; give drive.eds the drive's own EDS file"
+        ) from error
+
+
+class SdoAbortError(SdoError):
+    """The node refused with an abort code: it is there, and it means it."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class _NoAnswerError(SdoCommunicationError):
+    """The node did not answer in time."""
+
+
+class _Channel(CanopenSdoClient):
+    """canopen's SDO protocol, receiving in the caller's thread."""
+
+    def __init__(self, link: Link, monitor: NetworkMonitor, node_id: int, od: ObjectDictionary) -> None:
+        super().__init__(COB_SDO_REQUEST + node_id, COB_SDO_ANSWER + node_id, od)  # type: ignore[no-untyped-call]
+        self.link = link
+        self.monitor = monitor
+        self.timeout_s = DEFAULT_TIMEOUT_S
+        self.transfer_ends_s = 0.0
+        """A node may answer every segment in time and never end: the transfer as a whole has a bound too."""
+        self.strays = 0
+
+    def send_request(self, request: bytes | bytearray) -> None:
+        self.link.send(self.rx_cobid, bytes(request))
+
+    def abort(self, abort_code: int = 0x0800_0000) -> None:
+        self.send_request(struct.pack("<BHBL", _ABORT, 0, 0, abort_code))
+
+    def request_response(self, sdo_request: bytes | bytearray) -> bytes:
+        for stale in self.link.drain():
+            self._set_aside(stale)
+        command, index, sub = _HEADER.unpack_from(sdo_request)
+        initiates = command >> 5 in (1, 2)
+        self.send_request(sdo_request)
+        deadline_s = min(self.link.now() + self.timeout_s, self.transfer_ends_s)
+        # The second condition ends the wait on a bus that is never quiet.
+        while (frame := self.link.recv(deadline_s)) is not None and frame.time_s <= deadline_s:
+            if frame.can_id != self.tx_cobid:
+                self._set_aside(frame)
+                continue
+            answer = frame.data
+            if len(answer) != _FRAME_BYTES:
+                self.abort()
+                raise SdoCommunicationError(f"the answer has {len(answer)} bytes instead of {_FRAME_BYTES}")
+            if initiates and _HEADER.unpack_from(answer)[1:] != (index, sub):
+                self._set_aside(frame)
+                continue
+            if answer[0] == _ABORT:
+                raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
+            return answer
+        self.abort(_ABORT_TIMED_OUT)
+        raise _NoAnswerError(f"no answer within {self.timeout_s:g} s")
+
+    def _set_aside(self, frame: Frame) -> None:
+        if frame.can_id == self.tx_cobid:
+            # The late answer to an earlier request, or to somebody else's.
+            self.strays += 1
+        else:
+            self.monitor.dispatch(frame)
+
+    def fetch(self, index: int, sub: int, cap: int) -> bytes:
+        with self.open(index, sub, buffering=0) as stream:  # type: ignore[no-untyped-call]
+            announced = stream.size
+            data = bytearray()
+            self._check_size(announced or 0, cap)
+            while chunk := stream.read(7):
+                data += chunk
+                self._check_size(len(data), cap)
+            if not stream._done:
+                self.abort()
+                raise SdoCommunicationError("the node sends empty segments without an end")
+        if announced is not None and len(data) != announced:
+            raise SdoCommunicationError(f"the node announced {announced} bytes and sent {len(data)}")
+        return bytes(data)
+
+    def _check_size(self, size: int, cap: int) -> None:
+        if size > cap:
+            self.abort(_ABORT_OUT_OF_MEMORY)
+            raise SdoCommunicationError(f"the node sends more than the {cap} bytes that are taken")
+
+
+class SdoClient:
+    """Reads and writes the objects of one node. Not for several threads, not for the control cycle.
+
+    ``od`` is the node's object dictionary, or None where the types of CiA 301 and CiA 402 suffice.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        monitor: NetworkMonitor,
+        node_id: int,
+        od: ObjectDictionary | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        attempts: int = DEFAULT_ATTEMPTS,
+        size_cap: int = DEFAULT_SIZE_CAP,
+    ) -> None:
+        self.node_id = node_id
+        self.od = ObjectDictionary() if od is None else od  # type: ignore[no-untyped-call]
+        self.attempts = attempts
+        self.size_cap = size_cap
+        self._channel = _Channel(link, monitor, node_id, self.od)
+        self._channel.timeout_s = timeout_s
+
+    @property
+    def strays(self) -> int:
+        """SDO answers that nobody had asked for: late ones, or those to another client."""
+        return self._channel.strays
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists the object."""
+        return self._variable(index, sub) is not None
+
+    def _variable(self, index: int, sub: int) -> ODVariable | None:
+        # Not od.get_variable: it makes up any member of an array from the first one.
+        entry = self.od.get(index)
+        if isinstance(entry, ODVariable):
+            return entry if sub == 0 else None
+        return entry.subindices.get(sub) if entry is not None else None
+
+    def type_of(self, index: int, sub: int) -> IntegerType:
+        """Integer type of an object by the EDS, else by the profile; `SdoError` when neither has it."""
+        variable = self._variable(index, sub)
+        if variable is not None:
+            data_type = variable.data_type
+            if data_type not in _TYPES:
+                raise SdoError(
+                    f"{self.describe(index, sub)}: is not an integer by the EDS (type {data_type}h)"
+                )
+            return _TYPES[data_type]
+        known = STANDARD.get((index, sub))
+        if known is None:
+            raise SdoError(
+                f"{self.describe(index, sub)}: is in neither the EDS nor the profile; check drive.eds"
+            )
+        return known.type
+
+    def describe(self, index: int, sub: int) -> str:
+        """``node 1, object 607Ah:00 'Target position'``, the name by the EDS or the profile."""
+        name = ""
+        variable = self._variable(index, sub)
+        if variable is not None:
+            name = variable.qualname
+        elif (index, sub) in STANDARD:
+            name = STANDARD[index, sub].name
+        return f"node {self.node_id}, object {index:04X}h:{sub:02X}" + (f" '{name}'" if name else "")
+
+    def read(self, index: int, sub: int = 0, type: IntegerType | None = None) -> int:  # noqa: A002
+        """Value of an integer object; `SdoError` when it cannot be had or has the wrong length."""
+        kind = type or self.type_of(index, sub)
+        data = self.read_bytes(index, sub)
+        size = kind.bits // 8
+        if len(data) < size or (len(data) > size and not self._is_extension(data, size, kind)):
+            raise SdoError(
+                f"{self.describe(index, sub)}: answered {len(data)} bytes, but {kind.value} has {size}; "
+                "check that drive.eds is the EDS of this drive"
+            )
+        return kind.decode(data[:size])
+
+    def write(self, index: int, sub: int, value: int, type: IntegerType | None = None) -> None:  # noqa: A002
+        """Write an integer object; `InputError` when the value does not fit it, `SdoError` on refusal."""
+        kind = type or self.type_of(index, sub)
+        if not isinstance(value, int) or not kind.minimum <= value <= kind.maximum:
+            raise InputError(
+                f"{self.describe(index, sub)}: {value!r} is not an integer in "
+                f"[{kind.minimum}, {kind.maximum}] ({kind.value}); nothing was written"
+            )
+        self.write_bytes(index, sub, kind.encode(value))
+
+    def fetch(self, address: Address) -> int:
+        """`read` of a known object."""
+        return self.read(address.index, address.sub)
+
+    def store(self, address: Address, value: int) -> None:
+        """`write` of a known object."""
+        self.write(address.index, address.sub, value)
+
+    def read_text(self, index: int, sub: int = 0) -> str:
+        """Value of a string object; what is not ASCII becomes a question mark."""
+        return (
+            self.read_bytes(index, sub)
+            .decode("ascii", errors="replace")
+            .rstrip("\x00 ")
+            .replace("\ufffd", "?")
+        )
+
+    def read_bytes(self, index: int, sub: int) -> bytes:
+        """Raw bytes of an object, at most ``size_cap``; an expedited answer without a size has four."""
+        return self._transfer("read", index, sub, None)
+
+    def write_bytes(self, index: int, sub: int, data: bytes) -> None:
+        """Write raw bytes, expedited up to four and in segments beyond."""
+        self._transfer("write", index, sub, data)
+
+    def _transfer(self, doing: str, index: int, sub: int, data: bytes | None) -> bytes:
+        problem = "no attempt was made"
+        for _ in range(self.attempts):
+            self._channel.transfer_ends_s = (
+                self._channel.link.now() + _TIMEOUTS_PER_TRANSFER * self._channel.timeout_s
+            )
+            try:
+                if data is None:
+                    return self._channel.fetch(index, sub, self.size_cap)
+                self._channel.download(index, sub, data)
+            except SdoAbortedError as error:
+                advice = _ADVICE.get(error.code, "see the drive's manual for this code")
+                text = SdoAbortedError.CODES.get(error.code, "vendor-specific")
+                raise SdoAbortError(
+                    f"{self.describe(index, sub)}: {doing} refused with abort code "
+                    f"{error.code:08X}h ({text}); {advice}",
+                    error.code,
+                ) from error
+            except _NoAnswerError as error:
+                problem = f"{error}; check that the node is powered and its node id and bit rate are right"
+            except SdoCommunicationError as error:
+                problem = f"{error}; check that no second SDO client is active"
+            else:
+                return b""
+        times = f"{self.attempts} attempts" if self.attempts != 1 else "one attempt"
+        raise SdoError(f"{self.describe(index, sub)}: {doing} failed after {times}: {problem}")
+
+    @staticmethod
+    def _is_extension(data: bytes, size: int, kind: IntegerType) -> bool:
+        # Some drives answer every object with four bytes; harmless when the rest repeats the sign.
+        fill = 0xFF if kind.signed and data[size - 1] & 0x80 else 0
+        return len(data) <= 4 and all(byte in (fill, 0) for byte in data[size:])

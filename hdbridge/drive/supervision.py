@@ -1,0 +1,192 @@
+"""The fault table: what a fault in a control cycle leads to. Pure: no bus, no clock.
+
+The cycle says which faults it saw; the table says what follows. A stop is latched: only `Supervision.reset`
+leads back, and after a `Reaction.LATCH` only when everything about the drive has been verified again.
+
+The table is data. A fault with another reaction is another row, not an `if`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from enum import Enum, IntEnum
+from typing import Final, NamedTuple
+
+from hdbridge.errors import SafetyStop
+
+
+class Reaction(IntEnum):
+    """What the cycle does, in rising order of severity."""
+
+    GO = 0
+    """Go on; the fault is counted."""
+    FREEZE = 1
+    """Go on with the compensation's correction held: this cycle's feedback is the last good one."""
+    QUICK_STOP = 2
+    """Command a quick stop until the drive reports it; latched."""
+    LATCH = 3
+    """Send no more RPDOs; latched until the drive has been verified from identity to limits again."""
+
+
+class Fault(Enum):
+    """What can be wrong in one cycle."""
+
+    LOST_TPDO = "a TPDO is missing"
+    OVERRUN = "the cycle started too late"
+    DUPLICATE_TPDO = "a TPDO came twice or out of its cycle"
+    DISCARDED_FRAME = "a frame had the wrong length or kind"
+    FLOOD = "more frames waited than one cycle reads"
+    EMERGENCY = "the drive sent an emergency message"
+    DRIVE_FAULT = "the drive reports a fault"
+    DROPPED_OUT = "the drive left 'operation enabled' by itself"
+    BOOT_UP = "a node restarted"
+    NMT_CHANGE = "a node is not operational"
+    HEARTBEAT_LOST = "the drive's heartbeat stays away"
+    OWN_ID_ELSEWHERE = "another node sends with an identifier of this master"
+    FOREIGN_SYNC = "another node sends SYNC"
+    ENCODER_JUMP = "an encoder moved faster than the axis can"
+    FOLLOWING_ERROR = "the drive does not follow its demand"
+    BAD_TARGET = "the target is not a number within the limits"
+    BUS_DOWN = "the CAN interface went away"
+    TRANSMIT_FULL = "the transmit queue is full"
+
+
+class Row(NamedTuple):
+    """One fault's reactions: ``first`` at once, ``then`` from the ``threshold``-th cycle in a row on."""
+
+    fault: Fault
+    first: Reaction
+    threshold: int
+    then: Reaction
+    hint: str
+    """What a person does about it."""
+
+
+_GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
+
+TABLE: Final[tuple[Row, ...]] = (
+    Row(Fault.LOST_TPDO, _FREEZE, 2, _STOP, "check the cable, the bus load and the drive's PDOs"),
+    Row(Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this machine carries"),
+    Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
+    Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),
+    Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that babbles"),
+    Row(Fault.EMERGENCY, _GO, 1, _GO, "look the code up in the drive's manual"),
+    Row(Fault.DRIVE_FAULT, _STOP, 1, _STOP, "read its error code (603Fh), remove the cause, reset the fault"),
+    Row(Fault.DROPPED_OUT, _STOP, 1, _STOP, "check the enable input, the supply and the limit switches"),
+    Row(Fault.BOOT_UP, _LATCH, 1, _LATCH, "check its supply, then boot and verify the drive again"),
+    Row(Fault.NMT_CHANGE, _LATCH, 1, _LATCH, "look for another NMT master, then boot the drive again"),
+    Row(Fault.HEARTBEAT_LOST, _STOP, 1, _STOP, "check that the drive runs and that the cable is whole"),
+    Row(Fault.OWN_ID_ELSEWHERE, _STOP, 1, _STOP, "stop the other master on this bus"),
+    Row(Fault.FOREIGN_SYNC, _STOP, 1, _STOP, "switch the other SYNC producer off (object 1005h, bit 30)"),
+    Row(Fault.ENCODER_JUMP, _FREEZE, 2, _STOP, "check the encoder, its cable and counts_per_turn"),
+    Row(Fault.FOLLOWING_ERROR, _GO, 2, _STOP, "check for an obstacle, the tuning and following_error_deg"),
+    Row(Fault.BAD_TARGET, _STOP, 1, _STOP, "correct what computes the target"),
+    Row(Fault.BUS_DOWN, _LATCH, 1, _LATCH, "bring the interface up, open it anew and boot the drive again"),
+    Row(Fault.TRANSMIT_FULL, _STOP, 1, _STOP, "check that another node acknowledges and the bus load"),
+)
+ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
+
+EVENTS_KEPT: Final = 1000
+
+
+class Event(NamedTuple):
+    """A fault as it was seen."""
+
+    cycle: int
+    fault: Fault
+    reaction: Reaction
+    detail: str
+
+    def __str__(self) -> str:
+        """``cycle 120: a TPDO is missing (282h): freeze``."""
+        detail = f" ({self.detail})" if self.detail else ""
+        return (
+            f"cycle {self.cycle}: {self.fault.value}{detail}: {self.reaction.name.lower().replace('_', ' ')}"
+        )
+
+
+class Supervision:
+    """Judges each cycle by the table, keeps the latch and the list of everything seen.
+
+    Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
+    """
+
+    __slots__ = ("_frozen", "_runs", "counts", "events", "stop")
+
+    def __init__(self) -> None:
+        self._runs: dict[Fault, int] = {}
+        self._frozen = False
+        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        """Every fault seen, oldest first."""
+        self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
+        """Cycles in which each fault was seen."""
+        self.stop: Event | None = None
+        """What stopped the axis (the gravest, of equals the first), or None while it may run."""
+
+    @property
+    def quiet(self) -> bool:
+        """Whether a cycle without faults would change nothing: `judge` need not be called for it."""
+        return not self._runs and self.stop is None
+
+    @property
+    def reaction(self) -> Reaction:
+        """The latched reaction; GO when nothing is latched."""
+        return self.stop.reaction if self.stop is not None else Reaction.GO
+
+    def judge(self, cycle: int, faults: Iterable[tuple[Fault, str]]) -> Reaction:
+        """The reaction to one cycle's faults, each with its detail for a person; none is a good cycle.
+
+        Returns the latched reaction once there is one, however good the cycle was. Two cycles in a row
+        without usable feedback are a stop, whichever faults spoilt them.
+        """
+        previous, self._runs = self._runs, {}
+        frozen, self._frozen = self._frozen, False
+        worst = Reaction.GO
+        for fault, detail in faults:
+            if fault not in self._runs:
+                worst = max(worst, self._note(cycle, fault, detail, previous.get(fault, 0) + 1, frozen))
+        return max(worst, self.reaction)
+
+    def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
+        """One more fault of the cycle that `judge` has judged: one that came of answering it."""
+        self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
+        return self.reaction
+
+    def _note(self, cycle: int, fault: Fault, detail: str, run: int, frozen: bool) -> Reaction:
+        self._runs[fault] = run
+        row = ROWS[fault]
+        reaction = row.then if run >= row.threshold else row.first
+        if reaction is Reaction.FREEZE:
+            self._frozen = True
+            if frozen:
+                reaction = Reaction.QUICK_STOP
+        event = Event(cycle, fault, reaction, detail)
+        self.events.append(event)
+        self.counts[fault] += 1
+        if reaction >= Reaction.QUICK_STOP and reaction > self.reaction:
+            self.stop = event
+        return reaction
+
+    def error(self) -> SafetyStop:
+        """The latched stop as the error to raise."""
+        stop = self.stop
+        assert stop is not None, "there is no stop to report"
+        row = ROWS[stop.fault]
+        detail = f" ({stop.detail})" if stop.detail else ""
+        again = ", the second cycle in a row" if row.first < row.then else ""
+        done = "quick stop" if stop.reaction is Reaction.QUICK_STOP else "set-points stopped"
+        return SafetyStop(
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}: {done}, latched; {row.hint}"
+        )
+
+    def reset(self, *, verified: bool = False) -> None:
+        """Release the latch. After a LATCH, ``verified`` states that the drive was booted and verified again.
+
+        Raises `SafetyStop` and changes nothing when that was needed and not done. Events are kept.
+        """
+        if self.reaction is Reaction.LATCH and not verified:
+            raise self.error()
+        self.stop = None
+        self._runs = {}
+        self._frozen = False
