@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from hdbridge.errors import InputError
-from hdbridge.yamlfile import nearest
+from hdbridge.expectation import nearest
 
 _PACKAGE = Path(__file__).resolve().parent
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import types
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -41,6 +42,12 @@ class Field:
     def choices(self) -> list[str]:
         """The texts among its `values`."""
         return [each for each in self.values() if isinstance(each, str)]
+
+
+def nearest(word: str, choices: Sequence[str]) -> str | None:
+    """The choice that ``word`` was probably meant to be."""
+    close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
+    return next((each for each in choices if close and each.lower() == close[0]), None)
 
 
 def key_of(name: str, field: FieldInfo) -> str:

@@ -1,19 +1,29 @@
-"""The transmission model: a gear ratio and a sum of effects."""
+"""The transmission model: a gear ratio and a sum of effects, and the file that holds it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from hdbridge.axis import AxisConfig, Identity, Teeth
 from hdbridge.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
+from hdbridge.errors import InputError
+from hdbridge.modelfile import Provenance, binding, content_of, text_of
+from hdbridge.yamlfile import Document, document_from_text, read_yaml, write_atomically
 
 
 @dataclass(frozen=True)
 class TransmissionModel:
-    """theta_TE = theta_L - theta_M / N as a sum of effects, arcsec at the load."""
+    """theta_TE = theta_L - theta_M / N as a sum of effects, arcsec at the load.
+
+    The model says nothing of the gear's past: which state it starts from is told to `predict` and `tracker`
+    (`Start`), because it depends on the move before the record or the run, not on the gear.
+    """
 
     ratio: float
     """N: motor turns per load turn, positive."""
@@ -21,7 +31,9 @@ class TransmissionModel:
     uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Per effect name: parameter name -> 95 % half width, in the parameter's unit."""
     provenance: dict[str, Any] = field(default_factory=dict)
-    """Where the numbers come from: recording, date, versions, drive identity."""
+    """Where the numbers come from: recording, date, versions, drive identity (`Provenance`)."""
+    path: Path | None = field(default=None, compare=False)
+    """The file that it was read from."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Transmission error in arcsec for each sample of a motion, shape (n,)."""
@@ -38,6 +50,73 @@ class TransmissionModel:
         """The same model with no other effects than those named (unknown names are not an error)."""
         wanted = set(names)
         return replace(self, effects=tuple(each for each in self.effects if each.name in wanted))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a model file; InputError with file:line:column and the nearest right name."""
+        return cls._from_document(read_yaml(path))
+
+    @classmethod
+    def from_text(cls, text: str, path: Path | str = "model.yaml") -> Self:
+        """A model file's text; ``path`` names it in complaints."""
+        return cls._from_document(document_from_text(text, path))
+
+    @classmethod
+    def _from_document(cls, document: Document) -> Self:
+        content = content_of(document)
+        return cls(*content, path=document.path)
+
+    def dump(self) -> str:
+        """The model file's text; what it says reads back exactly."""
+        return text_of(self.ratio, self.effects, self.uncertainty, self.provenance)
+
+    def save(self, path: Path | str) -> None:
+        """Write the model file atomically."""
+        write_atomically(path, self.dump())
+
+    def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
+        """The same model, bound to an axis and the drive that answered there (else the axis file's)."""
+        return replace(self, provenance={**self.provenance, **binding(axis, identity)})
+
+    def check_ratio(self, axis: AxisConfig) -> None:
+        """Refuse (InputError) a model of another gear ratio than the axis file's."""
+        if not math.isclose(self.ratio, axis.gear.ratio, rel_tol=1e-9):
+            raise InputError(
+                f"{self._name()}: ratio: this model is of a gear with ratio {self.ratio:g}, but "
+                f"{axis.path} says {axis.gear.ratio:g}; use the model of this gear, or calibrate it"
+            )
+
+    def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Refuse (InputError) a model of another drive, axis or gear.
+
+        ``identity`` is what the drive answered; without it the axis file's is taken. What the model or the
+        drive leaves open is not compared, and neither is the revision: new firmware does not change a gear.
+        """
+        self.check_ratio(axis)
+        bound = Provenance.model_validate(self.provenance)
+        if bound.axis is not None and bound.axis != axis.name:
+            raise self._of_another("axis", f"'{bound.axis}'", f"'{axis.name}'", axis)
+        teeth = bound.gear.teeth if bound.gear else None
+        if teeth and axis.gear.teeth and teeth != axis.gear.teeth:
+            raise self._of_another("gear", _teeth_words(teeth), _teeth_words(axis.gear.teeth), axis)
+        present = identity or axis.drive.identity
+        for name in ("vendor_id", "product_code", "serial"):
+            theirs, ours = getattr(bound.drive, name, None), getattr(present, name)
+            if theirs is not None and ours is not None and theirs != ours:
+                raise self._of_another("drive", f"{name} {theirs:#x}", f"{ours:#x}", axis)
+
+    def _of_another(self, what: str, theirs: str, ours: str, axis: AxisConfig) -> InputError:
+        return InputError(
+            f"{self._name()}: provenance.{what}: this model was made for {theirs}, but the {what} here is "
+            f"{ours} ({axis.path}); use the model of this {what}, or calibrate it"
+        )
+
+    def _name(self) -> str:
+        return str(self.path) if self.path else "this model"
+
+
+def _teeth_words(teeth: Teeth) -> str:
+    return f"{teeth.flexspline}/{teeth.circular_spline} teeth, {teeth.output} output"
 
 
 class ModelTracker(Tracker):

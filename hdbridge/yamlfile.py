@@ -8,7 +8,6 @@ becomes ``file:line:column: key.path: what is wrong; expected ...; did you mean 
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +21,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from hdbridge.atomic import write_atomically
 from hdbridge.errors import InputError
-from hdbridge.expectation import expected_words, field_at, field_names
+from hdbridge.expectation import expected_words, field_at, field_names, nearest
 
 __all__ = [
     "Document", "FileError", "Hex", "document_from_text", "dump_yaml", "load_yaml", "nearest", "read_yaml",
@@ -193,12 +192,6 @@ class Document:
 def wrong(message: str, *at: str | int) -> PydanticCustomError:
     """For validators: a complaint about a part (``at``) of the value being validated, without a prefix."""
     return PydanticCustomError("hdbridge", "{message}", {"message": message, "at": at})
-
-
-def nearest(word: str, choices: Sequence[str]) -> str | None:
-    """The choice that ``word`` was probably meant to be."""
-    close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
-    return next((each for each in choices if close and each.lower() == close[0]), None)
 
 
 def dotted(at: Location) -> str:

@@ -1,0 +1,142 @@
+"""The model file: its schema, how it is read with complaints that name the place, how it is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.axis import AxisConfig, Identity, Teeth
+from hdbridge.effects import CATALOGUE, Effect
+from hdbridge.expectation import nearest
+from hdbridge.yamlfile import Document, Hex, dump_yaml
+
+_HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.md describes its keys.\n"
+
+
+class GearOfModel(BaseModel):
+    """The gear that a model was measured on."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
+    teeth: Teeth | None = Field(None, description="numbers of teeth")
+
+
+class Provenance(BaseModel):
+    """Where a model comes from and what it is bound to; further keys are kept as they are."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    axis: str | None = Field(None, description="name of the axis that it was measured on")
+    drive: Identity | None = Field(None, description="identity of the drive that it was measured with")
+    gear: GearOfModel | None = Field(None, description="the gear that it was measured on")
+    date: str | None = Field(None, description="when it was made, ISO 8601")
+    reason: str | None = Field(None, description="why it was made, in words")
+
+
+class EffectEntry(BaseModel):
+    """One effect of the model file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    effect: str = Field(description="name of the effect in the catalogue")
+    parameters: dict[str, Any] = Field(description="its parameters, with the unit in the name")
+    uncertainty: dict[str, Any] = Field(
+        default_factory=dict, description="half width of the 95 % interval of parameters, in their units"
+    )
+
+
+class ModelFile(BaseModel):
+    """The model file as it stands; the parameters are checked by the effect that they belong to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
+    ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
+    effects: tuple[EffectEntry, ...] = Field(description="the effects whose sum is the transmission error")
+    provenance: Provenance | None = Field(None, description="where the numbers come from")
+
+
+class Content(NamedTuple):
+    """What a model file says."""
+
+    ratio: float
+    effects: tuple[Effect, ...]
+    uncertainty: dict[str, dict[str, Any]]
+    provenance: dict[str, Any]
+
+
+def content_of(document: Document) -> Content:
+    """Read a model file's document; InputError with file:line:column and the nearest right name."""
+    file = document.validate(ModelFile)
+    effects: list[Effect] = []
+    uncertainty: dict[str, dict[str, Any]] = {}
+    for number, entry in enumerate(file.effects):
+        effect = _effect(document, number, entry, [each.name for each in effects])
+        effects.append(effect)
+        if entry.uncertainty:
+            uncertainty[effect.name] = entry.uncertainty
+    return Content(file.ratio, tuple(effects), uncertainty, document.data.get("provenance") or {})
+
+
+def text_of(
+    ratio: float,
+    effects: Sequence[Effect],
+    uncertainty: Mapping[str, Mapping[str, Any]],
+    provenance: Mapping[str, Any],
+) -> str:
+    """A model file's text; what it says reads back exactly."""
+    entries = [
+        {"effect": each.name, "parameters": each.parameters()}
+        | ({"uncertainty": dict(uncertainty[each.name])} if uncertainty.get(each.name) else {})
+        for each in effects
+    ]
+    data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": ratio, "effects": entries}
+    if provenance:
+        data["provenance"] = _hexadecimal(provenance)
+    return _HEADER + dump_yaml(data)
+
+
+def binding(axis: AxisConfig, identity: Identity | None = None) -> dict[str, Any]:
+    """What binds a model to an axis: entries of its provenance."""
+    return {
+        "axis": axis.name,
+        "drive": (identity or axis.drive.identity).model_dump(exclude_none=True),
+        "gear": axis.gear.model_dump(include={"ratio", "teeth"}, exclude_none=True),
+    }
+
+
+def _effect(document: Document, number: int, entry: EffectEntry, before: list[str]) -> Effect:
+    at = ("effects", number)
+    kind = CATALOGUE.get(entry.effect)
+    if kind is None:
+        close = nearest(entry.effect, list(CATALOGUE))
+        hint = f"; did you mean '{close}'?" if close else ""
+        raise document.error(
+            (*at, "effect"),
+            f"no effect is called '{entry.effect}'; expected one of {', '.join(CATALOGUE)}{hint}",
+        )
+    if entry.effect in before:
+        raise document.error((*at, "effect"), f"'{entry.effect}' stands twice; expected each effect once")
+    for name, value in entry.uncertainty.items():
+        where = (*at, "uncertainty", name)
+        if name not in kind.model_fields:
+            close = nearest(name, list(kind.model_fields))
+            hint = f"did you mean '{close}'?" if close else f"expected {', '.join(kind.model_fields)}"
+            raise document.error(where, f"unknown parameter of {kind.name}; {hint}", key=True)
+        if isinstance(value, int | float) and not (value >= 0 and math.isfinite(value)):
+            raise document.error(where, f"found {value}; expected a half width of at least 0")
+    return document.validate(kind, (*at, "parameters"))
+
+
+def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """The drive's identity in hexadecimal, as data sheets have it."""
+    data = dict(provenance)
+    if isinstance(data.get("drive"), Mapping):
+        data["drive"] = {
+            name: Hex(value) if isinstance(value, int) else value for name, value in data["drive"].items()
+        }
+    return data
