@@ -1,16 +1,22 @@
 """CiA-402 over CANopen: states, objects, PDOs, boot-up, supervision."""
 
+from hdbridge.drive.bootup import BootReport
+from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.image import Layout, ProcessImage
 from hdbridge.drive.link import BusSettings, Dropped, Frame, Link, TransmitBufferFull, open_bus
 from hdbridge.drive.monitor import Emergency, NetworkMonitor, NodeStatus
 from hdbridge.drive.objects import IntegerType, Mode, NmtCommand, NmtState
 from hdbridge.drive.pdo import PdoCodec, PdoEntry, PdoLengthError
+from hdbridge.drive.plan import PlannedWrite, plan
+from hdbridge.drive.sdo import SdoAbortError, SdoClient, load_eds
 from hdbridge.drive.states import Command, PowerWalk, State, Transition, controlword_for, decode
-from hdbridge.drive.unwrap import Unwrap
+from hdbridge.drive.unwrap import Unwrap, wrap_int32
 
 __all__ = [
+    "BootReport",
     "BusSettings",
     "Command",
+    "Drive",
     "Dropped",
     "Emergency",
     "Frame",
@@ -25,13 +31,20 @@ __all__ = [
     "PdoCodec",
     "PdoEntry",
     "PdoLengthError",
+    "PlannedWrite",
+    "Positions",
     "PowerWalk",
     "ProcessImage",
+    "SdoAbortError",
+    "SdoClient",
     "State",
     "Transition",
     "TransmitBufferFull",
     "Unwrap",
     "controlword_for",
     "decode",
+    "load_eds",
     "open_bus",
+    "plan",
+    "wrap_int32",
 ]

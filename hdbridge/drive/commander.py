@@ -1,0 +1,169 @@
+"""Commanding the drive by SDO, outside the control cycle: walk its states, wait for its statusword.
+
+While it waits it does the master's duties: it takes in heartbeats and emergencies, and it sends the
+master's own heartbeat, because the drive stops when that stays away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Final
+
+from hdbridge.drive import objects
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
+from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.objects import Mode, NmtState
+from hdbridge.drive.sdo import SdoClient
+from hdbridge.drive.states import State, controlword_for, decode, states_on_the_way
+from hdbridge.drive.unwrap import wrap_int32
+from hdbridge.errors import DriveError, TransitionError
+
+STEP_TIMEOUT_S: Final = 1.0
+"""How long a drive may take for one transition, or for a change of mode."""
+BRAKE_TIMEOUT_S: Final = 3.0
+POLL_S: Final = 0.005
+_STILL_COUNTS: Final = 2
+_STILL_POLL_S: Final = 0.02
+_FAILED_STATES: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
+
+class Commander:
+    """The statusword and the controlword of one drive, by SDO."""
+
+    def __init__(self, link: Link, monitor: NetworkMonitor, sdo: SdoClient, image: ProcessImage) -> None:
+        self.link = link
+        self.monitor = monitor
+        self.sdo = sdo
+        self.image = image
+        self.axis = image.axis
+        self._heartbeat_due_s = 0.0
+
+    @property
+    def name(self) -> str:
+        """The drive, for messages."""
+        return f"node {self.sdo.node_id} on {self.link.name}"
+
+    def statusword(self) -> int:
+        """Read the statusword."""
+        return self.sdo.fetch(objects.STATUSWORD)
+
+    def state(self) -> State:
+        """Read the state; the image's power walk sees it too."""
+        statusword = self.statusword()
+        self.image.statusword = statusword
+        return self.image.power.observe(statusword)
+
+    def control(self, controlword: int) -> None:
+        """Write the controlword."""
+        self.sdo.store(objects.CONTROLWORD, controlword)
+
+    def pause(self, duration_s: float) -> None:
+        """Let time pass: receive what comes and send the master's heartbeat when it is due."""
+        end_s = self.link.now() + duration_s
+        while True:
+            now_s = self.link.now()
+            if now_s >= self._heartbeat_due_s:
+                self.link.send(self.image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
+                self._heartbeat_due_s = now_s + self.image.heartbeat_period_s
+            frame = self.link.recv(min(end_s, self._heartbeat_due_s))
+            if frame is not None:
+                self.monitor.dispatch(frame)
+            if self.link.now() >= end_s:
+                return
+
+    def wait_for(
+        self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False
+    ) -> int:
+        """Poll the statusword until ``done`` of it; `DriveError` on a fault, `TransitionError` in "
+        "time-out.
+        """
+        deadline_s = self.link.now() + timeout_s
+        while True:
+            statusword = self.statusword()
+            if done(statusword):
+                return statusword
+            if not allow_fault and decode(statusword) in _FAILED_STATES:
+                raise self.fault(f"while waiting for {what}")
+            if self.link.now() >= deadline_s:
+                raise TransitionError(
+                    f"{self.name}: {what} did not come about within {timeout_s:g} s; the drive is in "
+                    f"'{decode(statusword).value}' (statusword {statusword:04X}h); check its enable input, "
+                    "supply and error display"
+                )
+            self.pause(POLL_S)
+
+    def fault(self, when: str) -> DriveError:
+        """The error to raise for a drive that is in fault: its error code and last emergency."""
+        code = self.sdo.fetch(objects.ERROR_CODE) if self.sdo.has(objects.ERROR_CODE.index) else None
+        last = self.monitor.watch(self.sdo.node_id).last_error
+        details = [f"error code {code:04X}h" if code is not None else "", str(last) if last else ""]
+        told = ", ".join(filter(None, details)) or "no error code is known"
+        return DriveError(
+            f"{self.name}: fault {when} ({told}); remove the cause (the drive's manual explains the code), "
+            "then reset the fault"
+        )
+
+    def walk(self, target: State) -> None:
+        """Walk to a state, one controlword at a time, each confirmed by the statusword."""
+        state = self.state()
+        self.image.power.go(target)
+        if state is State.NOT_READY_TO_SWITCH_ON:
+            self._await_state(State.SWITCH_ON_DISABLED)
+            state = State.SWITCH_ON_DISABLED
+        path = list(states_on_the_way(state, target))
+        for here, there in pairwise(path):
+            self.control(controlword_for(here, target))
+            self._await_state(there)
+        self.state()
+
+    def _await_state(self, state: State) -> None:
+        self.wait_for(f"state '{state.value}'", lambda word: decode(word) is state, STEP_TIMEOUT_S)
+
+    def set_mode(self, mode: Mode) -> None:
+        """Set the mode of operation and wait until 6061h shows it."""
+        self.sdo.store(objects.MODE, mode)
+        deadline_s = self.link.now() + STEP_TIMEOUT_S
+        while (shown := self.sdo.fetch(objects.MODE_DISPLAY)) != mode:
+            if self.link.now() >= deadline_s:
+                raise DriveError(
+                    f"{self.sdo.describe(0x6061, 0)}: shows {shown} after mode {mode.value} ({mode.name}) "
+                    "was "
+                    f"set; the drive does not take the mode now"
+                )
+            self.pause(POLL_S)
+
+    def preload_target(self) -> int:
+        """Make the target the actual position, so that enabling moves nothing; the motor counts."""
+        actual = self.sdo.fetch(objects.POSITION_ACTUAL)
+        self.sdo.store(objects.TARGET_POSITION, wrap_int32(actual))
+        found = self.sdo.fetch(objects.TARGET_POSITION)
+        if found != actual:
+            raise DriveError(
+                f"{self.sdo.describe(0x607A, 0)}: was written {actual}, the actual position, but reads back "
+                f"{found}; the drive was not enabled, because it would move"
+            )
+        return actual
+
+    def wait_for_standstill(self, timeout_s: float = BRAKE_TIMEOUT_S) -> bool:
+        """Wait until the position stays within two counts; whether it did."""
+        deadline_s = self.link.now() + timeout_s
+        last = self.sdo.fetch(objects.POSITION_ACTUAL)
+        while self.link.now() < deadline_s:
+            self.pause(_STILL_POLL_S)
+            position = self.sdo.fetch(objects.POSITION_ACTUAL)
+            if abs(wrap_int32(position - last)) <= _STILL_COUNTS:
+                return True
+            last = position
+        return False
+
+    def quick_stop(self) -> State:
+        """Quick stop, and wait until the drive has taken it; the state in which it then is."""
+        self.image.power.quick_stop()
+        self.control(0x0002)
+        stopped = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, *_FAILED_STATES)
+        word = self.wait_for(
+            "a quick stop", lambda word: decode(word) in stopped, STEP_TIMEOUT_S, allow_fault=True
+        )
+        return self.image.power.observe(word)

@@ -1,0 +1,302 @@
+"""A CiA-402 drive from the commissioning side: boot it, enable it, move it, and never leave it enabled.
+
+    with open_bus(axis.bus) as bus, Drive(bus, axis) as drive:
+        drive.boot()
+        drive.enable(Mode.PP)
+        drive.move_to(90.0)
+
+For the control cycle, `enable(Mode.CSP)` prepares everything and hands over to ``image.power``: the cycle
+then walks the states by PDO, while SYNC and set-points are already running.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
+
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.drive import modes, objects
+from hdbridge.drive.bootup import BootReport, BootUp
+from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
+from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
+from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient, load_eds
+from hdbridge.drive.states import Command, State, decode, row_for
+from hdbridge.errors import DriveError, HdbridgeError, TransitionError
+
+if TYPE_CHECKING:
+    import can
+    from canopen.objectdictionary import ObjectDictionary
+
+    from hdbridge.axis import AxisConfig
+
+_CLOSING_TIMEOUT_S: Final = 0.2
+_OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
+
+
+class Positions(NamedTuple):
+    """Where the axis is, by both encoders."""
+
+    motor_counts: int
+    load_counts: int
+    motor_deg: float
+    load_deg: float
+
+
+class Drive:
+    """One drive on one bus. A context manager: on every way out the drive is stopped and disabled.
+
+    The bus stays the caller's and open. ``od`` replaces the EDS of the axis file (for a test, or a DCF).
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        axis: AxisConfig,
+        clock: Clock | None = None,
+        od: ObjectDictionary | None = None,
+        sdo_timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        self.axis = axis
+        self.link = Link(bus, clock if clock is not None else MonotonicClock())
+        self.monitor = NetworkMonitor(axis.drive.node_id)
+        self.image = ProcessImage(axis)
+        if od is None:
+            od = load_eds(axis.eds_path, axis.drive.node_id)
+        self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
+        self._clients = {axis.drive.node_id: self.sdo}
+        encoder = axis.load_encoder.source.node
+        if encoder is not None:
+            self.monitor.watch(encoder)
+            self._clients[encoder] = SdoClient(self.link, self.monitor, encoder, None, sdo_timeout_s)
+        self._commander = Commander(self.link, self.monitor, self.sdo, self.image)
+        self._mode: Mode | None = None
+        self._touched = False
+        self.report: BootReport | None = None
+        """What the last boot-up found and did."""
+
+    def boot(self, *, reset: bool = True) -> BootReport:
+        """Boot the drive up to OPERATIONAL, power off: see docs/master.md for each step.
+
+        ``reset`` resets the node's communication first, so that it starts from known settings. Raises
+        `DriveError` when it is absent or refuses, `IdentityError` when it is another drive or scales
+        differently, `BusError`.
+        """
+        self._touched = True
+        self.report = None
+        self._mode = None
+        self.report = BootUp(self.link, self.monitor, self.axis, self._clients).run(reset=reset)
+        return self.report
+
+    def enable(self, mode: Mode = Mode.CSP) -> None:
+        """Make ready for power in ``mode``: target = actual position, mode set and seen in 6061h, then power.
+
+        In PP and HM the states are walked here, by SDO. In CSP they are not: a drive in CSP wants SYNC and
+        set-points while it is enabled, so ``image.power`` is aimed and the cycle walks. Raises `DriveError`
+        for a fault (`fault_reset` first), for a position outside the limits, `TransitionError`.
+        """
+        modes_of_drive = self._booted().modes
+        if mode not in modes_of_drive:
+            raise DriveError(
+                f"{self._commander.name}: has no mode {mode.name} (6502h); it has "
+                + ", ".join(each.name for each in modes_of_drive)
+            )
+        state = self._commander.state()
+        if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            raise self._commander.fault("before it was enabled")
+        if state is not State.SWITCH_ON_DISABLED:
+            raise TransitionError(
+                f"{self._commander.name}: is in '{state.value}', but a drive is enabled from "
+                "'switch on disabled'; disable it first"
+            )
+        positions = self.read_positions()
+        if mode is not Mode.HM:
+            # Homing is the way back from there, so it is not refused.
+            self._check_within_limits(positions)
+        self._commander.set_mode(mode)
+        self._mode = mode
+        motor_counts = self._commander.preload_target()
+        self.image.halt = False
+        self.image.seed(motor_counts, positions.load_counts, self._commander.statusword())
+        if mode is Mode.CSP:
+            self.image.power.go(State.OPERATION_ENABLED)
+        else:
+            self._commander.walk(State.OPERATION_ENABLED)
+
+    def disable(self) -> None:
+        """Brake, then switch power off, by SDO. Allowed in every state but a running fault reaction."""
+        state = self._commander.state()
+        if state is State.OPERATION_ENABLED:
+            self._commander.walk(State.SWITCHED_ON)
+        if state is State.QUICK_STOP_ACTIVE:
+            self._commander.wait_for_standstill()
+        if self._commander.state() not in _OFF:
+            self._commander.walk(State.SWITCH_ON_DISABLED)
+        self._mode = None
+
+    def fault_reset(self) -> None:
+        """Reset a fault: a rising edge on bit 7. `TransitionError` when there is none, `DriveError` when "
+        "it stays.
+        """
+        commander = self._commander
+        row_for(commander.state(), Command.FAULT_RESET)
+        commander.control(0x0000)
+        commander.control(Command.FAULT_RESET.word)
+        try:
+            commander.wait_for(
+                "the end of the fault",
+                lambda word: decode(word) not in (State.FAULT, State.FAULT_REACTION_ACTIVE),
+                STEP_TIMEOUT_S,
+                allow_fault=True,
+            )
+        except TransitionError:
+            raise commander.fault("that a reset does not clear") from None
+        finally:
+            commander.control(0x0000)
+        commander.state()
+
+    def quick_stop(self) -> State:
+        """Stop at once. What follows is 605Ah's choice; the state in which the drive then is."""
+        return self._commander.quick_stop()
+
+    def halt(self) -> bool:
+        """Halt without leaving 'operation enabled' (605Dh says how); whether the axis came to rest."""
+        return modes.halt(self._commander)
+
+    def move_to(
+        self,
+        load_deg: float,
+        velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+        timeout_s: float | None = None,
+    ) -> Positions:
+        """Move to a load angle in PP, enabling the drive for it where it is not: see `modes.move_to`."""
+        self._need(Mode.PP)
+        modes.move_to(self._commander, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        return self.read_positions()
+
+    def home(
+        self,
+        method: int,
+        switch_velocity_deg_s: float,
+        zero_velocity_deg_s: float,
+        acceleration_deg_s2: float | None = None,
+        offset_deg: float = 0.0,
+        timeout_s: float = 60.0,
+    ) -> Positions:
+        """Home by a method of 6098h, enabling the drive for it where it is not: see `modes.home`."""
+        self._need(Mode.HM)
+        modes.home(
+            self._commander,
+            method,
+            switch_velocity_deg_s,
+            zero_velocity_deg_s,
+            acceleration_deg_s2,
+            offset_deg,
+            timeout_s,
+        )
+        return self.read_positions()
+
+    def read_positions(self) -> Positions:
+        """Both encoders by SDO, as they read now."""
+        source = self.axis.load_encoder.source
+        client = self._clients[source.node if source.node is not None else self.axis.drive.node_id]
+        motor = self.sdo.fetch(objects.POSITION_ACTUAL)
+        load = client.read(source.index, source.subindex, IntegerType.named(source.type))
+        return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
+
+    def close(self) -> list[str]:
+        """Stop and disable the drive, take it out of OPERATIONAL; what did not work, in words.
+
+        Tries everything, raises nothing of its own: it runs when the bus is broken, too.
+        """
+        if not self._touched:
+            return []
+        self._touched = False
+        self._mode = None
+        problems = []
+        try:
+            self._power_off()
+        except HdbridgeError as error:
+            problems.append(str(error))
+            self._power_off_blindly()
+        with suppress(HdbridgeError):
+            for node_id in self._clients:
+                self.link.send(objects.COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, node_id)))
+        return problems
+
+    def __enter__(self) -> Self:
+        """The drive itself; nothing is sent yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """`close`; a failure to disable the drive is raised, or added to the error that is on its way."""
+        problems = self.close()
+        if not problems:
+            return
+        warning = (
+            f"{self._commander.name}: it is not certain that power is off ({'; '.join(problems)}); "
+            "switch the drive off by its enable input or STO"
+        )
+        if error is None:
+            raise DriveError(warning)
+        error.add_note(warning)
+
+    def _power_off(self) -> None:
+        quick = SdoClient(
+            self.link, self.monitor, self.axis.drive.node_id, self.sdo.od, _CLOSING_TIMEOUT_S, attempts=2
+        )
+        commander = Commander(self.link, self.monitor, quick, self.image)
+        state = commander.state()
+        if state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN):
+            if commander.quick_stop() is State.QUICK_STOP_ACTIVE:
+                commander.wait_for_standstill()
+            state = commander.state()
+        if state not in _OFF:
+            commander.control(0x0000)
+            commander.wait_for(
+                "'switch on disabled'", lambda word: decode(word) in _OFF, STEP_TIMEOUT_S, allow_fault=True
+            )
+        if quick.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
+            # The master leaves on purpose; its silence from now on is no fault.
+            quick.store(objects.HEARTBEAT_CONSUMER, 0)
+
+    def _power_off_blindly(self) -> None:
+        """The same without an answer: as frames that a drive which only listens can still obey."""
+        request = objects.COB_SDO_REQUEST + self.axis.drive.node_id
+        with suppress(HdbridgeError):
+            for word in (Command.QUICK_STOP.word, Command.DISABLE_VOLTAGE.word):
+                self.link.send(request, bytes((0x2B, 0x40, 0x60, 0x00, word, 0, 0, 0)))
+                self.link.clock.sleep_until(self.link.now() + _CLOSING_TIMEOUT_S)
+
+    def _booted(self) -> BootReport:
+        if self.report is None:
+            raise TransitionError(f"{self._commander.name}: has not been booted; call boot() first")
+        return self.report
+
+    def _need(self, mode: Mode) -> None:
+        if self._mode is mode and self._commander.state() is State.OPERATION_ENABLED:
+            return
+        self._booted()
+        if self._commander.state() is State.OPERATION_ENABLED:
+            self.disable()
+        self.enable(mode)
+
+    def _check_within_limits(self, positions: Positions) -> None:
+        least, greatest = self.image.limits_counts
+        if not least <= positions.motor_counts <= greatest:
+            at_deg = positions.motor_deg / self.axis.gear.ratio
+            raise DriveError(
+                f"{self._commander.name}: the axis stands at {at_deg:g} deg by the motor encoder, outside "
+                f"{self.axis.limits.position_min_deg:g} .. {self.axis.limits.position_max_deg:g} deg "
+                "(limits in "
+                f"{self.axis.path}); home it, or turn it back by hand"
+            )
+
+
+__all__ = ["BootReport", "Drive", "Positions", "ProcessImage"]
