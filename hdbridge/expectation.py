@@ -107,13 +107,11 @@ def _range_words(metadata: Sequence[Any]) -> str:
     if "ge" in limits and "le" in limits:
         return f" from {_number(limits['ge'])} to {_number(limits['le'])}"
     parts = [words.format(_number(limits[name])) for name, words in _LIMITS.items() if name in limits]
-    return " " + ", ".join(parts) if parts else ""
+    empty = ", not empty" if any(getattr(each, "min_length", 0) for each in metadata) else ""
+    return (" " + ", ".join(parts) if parts else "") + empty
 
 
-_LIMITS = {
-    "gt": "above {}", "ge": "of at least {}", "lt": "below {}", "le": "at most {}",
-    "min_length": "with at least {}", "max_length": "with at most {}",
-}  # fmt: skip
+_LIMITS = {"gt": "above {}", "ge": "of at least {}", "lt": "below {}", "le": "at most {}"}
 
 
 def _number(value: Any) -> str:

@@ -125,6 +125,10 @@ class Document:
         unknown = {each["loc"][:-1]: each["loc"][-1] for each in errors if each["type"] == "extra_forbidden"}
         rows = []
         for error in errors:
+            if error["type"] == "too_short" and any(
+                each["loc"][: len(error["loc"])] == error["loc"] != each["loc"] for each in errors
+            ):  # it counts only items without a fault of their own
+                continue
             place, message, key = self._complaint(model, at, error)
             if error["type"] == "missing" and place in unknown:
                 close = nearest(str(unknown[place]), [str(error["loc"][-1])])
@@ -376,8 +380,15 @@ def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
 
 
+def _plain(dumper: _Dumper, data: Any) -> yaml.Node:
+    """Numbers and arrays of numpy, and enums, as what they hold."""
+    value = data.tolist() if hasattr(data, "tolist") else getattr(data, "value", data)
+    return dumper.represent_undefined(data) if type(value) is type(data) else dumper.represent_data(value)
+
+
 _BREAKS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 _Dumper.add_representer(str, _text)
+_Dumper.add_multi_representer(object, _plain)
 
 
 def dump_yaml(data: Any) -> str:

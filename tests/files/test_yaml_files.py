@@ -12,6 +12,7 @@ import time
 from enum import Enum
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -178,6 +179,13 @@ def test_a_dump_is_block_style_in_the_order_given():
             y: '1e5'
         vendor: 0x4844
         """)
+
+
+def test_numpy_numbers_and_enums_are_dumped_as_what_they_hold():
+    data = {"a": np.float64(0.1), "b": np.int64(3), "c": np.array([1.0, 2.0]), "d": (1, 2), "e": Colour.RED}
+    assert document_from_text(dump_yaml(data), "t.yaml").data == {
+        "a": 0.1, "b": 3, "c": [1.0, 2.0], "d": [1, 2], "e": "red",
+    }  # fmt: skip
 
 
 def test_signed_zero_and_infinities_survive():

@@ -1,0 +1,267 @@
+"""A record: what one axis did, sample by sample, as named columns with their units.
+
+A record comes from hdbridge's own bench or from somebody else's CSV file; both look alike. Sampling may be
+uneven. Angles are multi-turn degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from hdbridge.csvfile import Column, line_of_row, read_columns, write_columns
+from hdbridge.effects import FloatArray, Motion
+from hdbridge.errors import InputError
+from hdbridge.units import ARCSEC_PER_DEG
+
+REQUIRED: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "time_s": "time; it never runs backwards, its zero and its steps are free",
+        "motor_position_deg": "measured motor angle, multi-turn",
+        "load_position_deg": "measured load angle, multi-turn",
+    }
+)
+OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "motor_target_deg": "commanded motor angle, multi-turn",
+        "load_torque_nm": "torque at the load",
+        "motor_torque_nm": "torque of the motor",
+        "temperature_c": "temperature of the gear",
+    }
+)
+MINIMUM_SAMPLES: Final = 2
+
+WRONG_RATIO: Final = 0.003
+"""A ratio this far off, relatively, is another gear's; the closest pair of common ones is 0.6 % apart."""
+WRONG_RATIO_ARCSEC: Final = 900.0
+"""... if it also shows as more than this over the travel: several times what any gear's own error can be."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Columns of equal length by name; see `REQUIRED` and `OPTIONAL`. Other columns are kept and ignored."""
+
+    columns: Mapping[str, Column]
+    source: str = ""
+    """Where it comes from, for messages."""
+    starts: tuple[int, ...] = field(default=(0,))
+    """The rows where one of its records begins: between two of them nothing is known of the axis."""
+
+    def __post_init__(self) -> None:
+        missing = [name for name in REQUIRED if name not in self.columns]
+        if missing:
+            raise ValueError(f"a record needs the columns {', '.join(missing)}")
+        columns = {name: _frozen(column) for name, column in self.columns.items()}
+        shapes = {column.shape for column in columns.values()}
+        if len(shapes) != 1 or len(shapes.pop()) != 1:
+            raise ValueError("the columns of a record are one-dimensional and of one length")
+        object.__setattr__(self, "columns", MappingProxyType(columns))
+
+    @classmethod
+    def read_csv(cls, path: Path | str, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
+        """Read a CSV file, plain or gzip.
+
+        InputError, with file and line: a required column is missing, a value of a known column is no finite
+        number, a row is ragged, time runs backwards, there are too few samples, it is not UTF-8 or not gzip.
+        """
+        path = Path(path)
+        columns = read_columns(path, list(REQUIRED), OPTIONAL)
+        time_s = columns["time_s"]
+        if len(time_s) < minimum_samples:
+            raise InputError(
+                f"{path}: {len(time_s)} samples are too few; expected at least {minimum_samples}"
+            )
+        backwards = np.flatnonzero(np.diff(time_s) < 0.0)
+        if len(backwards):
+            row = int(backwards[0]) + 1
+            raise InputError(
+                f"{path}:{line_of_row(path, row)}: time_s: {time_s[row]:g} after {time_s[row - 1]:g}; "
+                "expected time that does not run backwards"
+            )
+        return cls(columns, str(path))
+
+    def write_csv(self, path: Path | str) -> None:
+        """Write the record atomically, gzip where the name ends in ``.gz``.
+
+        Every number reads back to the last bit, and the same record gives the same bytes.
+        """
+        write_columns(Path(path), self.columns)
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.time_s)
+
+    def __eq__(self, other: object) -> bool:
+        """The same columns with the same values, to the last bit."""
+        if not isinstance(other, Record):
+            return NotImplemented
+        return self.columns.keys() == other.columns.keys() and all(
+            _same(column, other.columns[name]) for name, column in self.columns.items()
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Time in seconds, shape (n,)."""
+        return self.columns["time_s"]
+
+    @property
+    def motor_position_deg(self) -> FloatArray:
+        """Measured motor angle in degrees, multi-turn, shape (n,)."""
+        return self.columns["motor_position_deg"]
+
+    @property
+    def load_position_deg(self) -> FloatArray:
+        """Measured load angle in degrees, multi-turn, shape (n,)."""
+        return self.columns["load_position_deg"]
+
+    @property
+    def motor_target_deg(self) -> FloatArray | None:
+        """Commanded motor angle in degrees, multi-turn."""
+        return self.columns.get("motor_target_deg")
+
+    @property
+    def load_torque_nm(self) -> FloatArray | None:
+        """Torque at the load."""
+        return self.columns.get("load_torque_nm")
+
+    @property
+    def motor_torque_nm(self) -> FloatArray | None:
+        """Torque of the motor."""
+        return self.columns.get("motor_torque_nm")
+
+    @property
+    def temperature_c(self) -> FloatArray | None:
+        """Temperature of the gear."""
+        return self.columns.get("temperature_c")
+
+    def transmission_error_arcsec(self, ratio: float) -> FloatArray:
+        """theta_L - theta_M / N in arcsec at the load, shape (n,), from the measured angles.
+
+        Its mean holds the difference of the two encoders' zeros.
+        """
+        error: FloatArray = (self.load_position_deg - self.motor_position_deg / ratio) * ARCSEC_PER_DEG
+        return error
+
+    def motion(self) -> Motion:
+        """What the axis did, for a model; by the commanded motor angle if there is one, else the measured."""
+        target = self.motor_target_deg
+        return Motion(
+            motor_deg=self.motor_position_deg if target is None else target,
+            time_s=self.time_s,
+            load_torque_nm=self.load_torque_nm,
+            motor_torque_nm=self.motor_torque_nm,
+            temperature_c=self.temperature_c,
+        )
+
+    def load_turns_per_motor_turn(self) -> float | None:
+        """The slope of the load angle over the motor angle, by least squares; None when the motor stood."""
+        motor = self.motor_position_deg - np.mean(self.motor_position_deg)
+        square = float(motor @ motor)
+        return float(motor @ self.load_position_deg) / square if square else None
+
+    def check_ratio(self, ratio: float) -> None:
+        """Refuse (InputError) a ratio that the record's own angles contradict.
+
+        A small deviation is not refused but left to diagnosis, and so is any when the axis moved too little
+        to tell it from the gear's own error.
+        """
+        slope = self.load_turns_per_motor_turn() if len(self) else None
+        if slope is None:
+            return
+        travel_deg = float(np.ptp(self.motor_position_deg)) / ratio
+        off = abs(slope * ratio - 1.0)
+        if off <= WRONG_RATIO or off * travel_deg * ARCSEC_PER_DEG <= WRONG_RATIO_ARCSEC:
+            return
+        if abs(slope) * ratio < 0.01:
+            found, cure = "the load stands still while the motor turns", "look at the load encoder's column"
+        elif slope < 0.0:
+            found = f"the motor makes {-1 / slope:.5g} turns per turn of the load, against it"
+            cure = "turn the direction of one encoder round"
+        else:
+            found = f"the motor makes {1 / slope:.5g} turns per turn of the load"
+            cure = "correct the ratio, or the counts per turn of an encoder"
+        name = f"{self.source}: " if self.source else ""
+        over = f"measured over {travel_deg:.3g} deg of the load"
+        raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
+
+    def rows(self, first: int, end: int) -> Self:
+        """The samples from row ``first`` up to, not including, ``end``."""
+        columns = {name: column[first:end] for name, column in self.columns.items()}
+        inside = (start - first for start in self.starts if first < start < end)
+        return type(self)(columns, self.source, (0, *inside))
+
+    def between(self, start_s: float, end_s: float) -> Self:
+        """The samples of a span of time, both ends included."""
+        first = int(np.searchsorted(self.time_s, start_s, side="left"))
+        end = int(np.searchsorted(self.time_s, end_s, side="right"))
+        return self.rows(first, end)
+
+    def parts(self) -> tuple[Self, ...]:
+        """The records that it was put together from."""
+        ends = (*self.starts[1:], len(self))
+        return tuple(self.rows(start, end) for start, end in zip(self.starts, ends, strict=True))
+
+
+def concatenate(records: Sequence[Record]) -> Record:
+    """Several records as one, in the order given, with one absolute zero.
+
+    A record whose time begins anew is moved in time to follow the one before. Columns that not every one has
+    are left out.
+    """
+    if not records:
+        raise ValueError("nothing to concatenate")
+    names = [name for name in records[0].columns if all(name in each.columns for each in records)]
+    shifts = time_shifts_s(records)
+    columns: dict[str, Any] = {
+        name: np.concatenate([each.columns[name] for each in records]) for name in names
+    }
+    columns["time_s"] = np.concatenate(
+        [each.time_s + shift if shift else each.time_s for each, shift in zip(records, shifts, strict=True)]
+    )
+    before = np.cumsum([0, *(len(each) for each in records[:-1])]).tolist()
+    starts = tuple(
+        rows + start for rows, each in zip(before, records, strict=True) for start in each.starts if len(each)
+    )
+    return Record(
+        columns, ", ".join(dict.fromkeys(each.source for each in records if each.source)), starts or (0,)
+    )
+
+
+def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
+    """What to add to each record's time so that they follow each other; zero where they already do."""
+    shifts: list[float] = []
+    end_s = -np.inf
+    for record in records:
+        shift_s = 0.0
+        if len(record):
+            if record.time_s[0] < end_s:
+                steps = np.diff(record.time_s)
+                shift_s = end_s - float(record.time_s[0]) + (float(np.median(steps)) if len(steps) else 0.0)
+            end_s = float(record.time_s[-1]) + shift_s
+        shifts.append(shift_s)
+    return tuple(shifts)
+
+
+def _frozen(column: Any) -> Column:
+    """A read-only view: of float64, or of text."""
+    array = np.asarray(column)
+    if array.dtype.kind != "U":
+        array = array.astype(np.float64, copy=False)
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _same(one: Column, other: Column) -> bool:
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    if one.dtype.kind == "f":  # the bits of a NaN mean nothing and are not kept in a file
+        one, other = (np.where(np.isnan(each), np.nan, each) for each in (one, other))
+    return one.tobytes() == other.tobytes()

@@ -1,0 +1,193 @@
+"""A recording: a record, what moved how in it, and where it comes from; one folder, or somebody's CSV files.
+
+The folder holds ``record.csv.gz`` and ``recording.yaml``. The latter is written last and names the former's
+checksum: a folder without it is not a recording, and raw data that were touched are noticed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hdbridge.axis import Identity
+from hdbridge.errors import InputError
+from hdbridge.record import Record, concatenate, time_shifts_s
+from hdbridge.yamlfile import Hex, dump_yaml, read_yaml, write_atomically, wrong
+
+RECORD_NAME = "record.csv.gz"
+ABOUT_NAME = "recording.yaml"
+_HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Segment(_Part):
+    """One leg of what the axis did."""
+
+    kind: str = Field(
+        min_length=1, description="what the leg was for: precondition, standstill, sweep, sine, step, ..."
+    )
+    start_s: float = Field(description="time of its first sample")
+    end_s: float = Field(description="time of its last sample")
+    notes: dict[str, Any] = Field(default_factory=dict, description="more about it, as one likes")
+
+    @model_validator(mode="after")
+    def _forwards(self) -> Self:
+        if self.end_s < self.start_s:
+            raise wrong(f"found {self.end_s:g}; expected no less than start_s, {self.start_s:g}", "end_s")
+        return self
+
+
+class RecordedFile(_Part):
+    """A file of the recording."""
+
+    name: str = Field(pattern=r"^[^/\\]+$", description="its name in this folder")
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum of its bytes")
+    samples: int = Field(ge=0, description="rows")
+
+
+class RecordingFile(_Part):
+    """The content of ``recording.yaml``."""
+
+    schema_: Literal["hdbridge.recording/1"] = Field(
+        alias="schema", description="kind and version of this file"
+    )
+    axis: str | None = Field(None, description="name of the axis")
+    ratio: float | None = Field(None, gt=0, le=1000, description="N: motor turns per load turn")
+    drive: Identity | None = Field(None, description="identity that the drive answered")
+    date: str | None = Field(None, description="when it was made, ISO 8601")
+    versions: dict[str, str] = Field(default_factory=dict, description="software that made it")
+    notes: dict[str, Any] = Field(default_factory=dict, description="more about it: seed, scheme, model, ...")
+    files: tuple[RecordedFile, ...] = Field(
+        min_length=1, description="the CSV files, in the order of their time"
+    )
+    segments: tuple[Segment, ...] = Field((), description="what moved how, in the order of time")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A record with what is known about it; of a bare CSV file that is only the record."""
+
+    record: Record
+    segments: tuple[Segment, ...] = ()
+    axis: str | None = None
+    ratio: float | None = None
+    drive: Identity | None = None
+    date: str | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, *paths: Path | str) -> Self:
+        """Recording folders and CSV files, as one recording in the order given.
+
+        InputError for whatever is wrong with one of them, and for files that have changed since they were
+        recorded.
+        """
+        parts = [cls._load_one(Path(path)) for path in paths]
+        return parts[0] if len(parts) == 1 else cls._joined(parts)
+
+    @classmethod
+    def _load_one(cls, path: Path) -> Self:
+        if not path.is_dir():
+            return cls(Record.read_csv(path))
+        if not (path / ABOUT_NAME).exists():
+            raise InputError(
+                f"{path}: no {ABOUT_NAME} in this folder; expected a recording, or name its CSV files"
+            )
+        document = read_yaml(path / ABOUT_NAME)
+        about = document.validate(RecordingFile)
+        records = []
+        for number, each in enumerate(about.files):
+            file = path / each.name
+            if file.is_file() and _sha256(file) != each.sha256:
+                raise document.error(
+                    ("files", number, "sha256"),
+                    f"{file} has changed since it was recorded; restore it, or read it alone as a CSV file",
+                )
+            records.append(Record.read_csv(file, minimum_samples=0))
+        return cls(
+            records[0] if len(records) == 1 else concatenate(records),
+            about.segments,
+            about.axis,
+            about.ratio,
+            about.drive,
+            about.date,
+            about.versions,
+            about.notes,
+        )
+
+    @classmethod
+    def _joined(cls, parts: Sequence[Self]) -> Self:
+        """One recording; what its parts do not agree about is left open."""
+        records = [each.record for each in parts]
+        shifts = time_shifts_s(records)
+        segments = [
+            segment.model_copy(update={"start_s": segment.start_s + shift, "end_s": segment.end_s + shift})
+            for each, shift in zip(parts, shifts, strict=True)
+            for segment in each.segments
+        ]
+        common: dict[str, Any] = {}
+        for name in ("axis", "ratio", "drive", "date", "versions", "notes"):
+            first, *others = (getattr(each, name) for each in parts)
+            if all(each == first for each in others):
+                common[name] = first
+        return cls(concatenate(records), tuple(segments), **common)
+
+    def save(self, folder: Path | str) -> None:
+        """Write the folder; refused (InputError) where there is a recording already: raw data stay."""
+        folder = Path(folder)
+        if (folder / ABOUT_NAME).exists():
+            raise InputError(f"{folder}: there is a recording already; expected a new folder")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as problem:
+            raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
+        self.record.write_csv(folder / RECORD_NAME)
+        write_atomically(folder / ABOUT_NAME, _HEADER + dump_yaml(self._about(_sha256(folder / RECORD_NAME))))
+
+    def _about(self, sha256: str) -> dict[str, Any]:
+        drive = self.drive.model_dump(exclude_none=True) if self.drive else {}
+        about: dict[str, Any] = {
+            "schema": "hdbridge.recording/1",
+            "axis": self.axis,
+            "ratio": self.ratio,
+            "drive": {name: Hex(value) for name, value in drive.items()},
+            "date": self.date,
+            "versions": self.versions,
+            "notes": self.notes,
+            "files": [{"name": RECORD_NAME, "sha256": sha256, "samples": len(self.record)}],
+            "segments": [
+                each.model_dump(exclude={"notes"}) | ({"notes": each.notes} if each.notes else {})
+                for each in self.segments
+            ],
+        }
+        return {name: value for name, value in about.items() if value not in (None, {}, [])}
+
+    def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:
+        """The segments of these kinds (of all, when none is given), each with its samples."""
+        for segment in self.segments:
+            if not kinds or segment.kind in kinds:
+                yield segment, self.record.between(segment.start_s, segment.end_s)
+
+
+def versions_here() -> dict[str, str]:
+    """The software that makes a recording or a model in this process."""
+    packages = ("hdbridge", "numpy", "scipy", "python-can", "canopen")
+    return {each: importlib.metadata.version(each) for each in packages} | {
+        "python": platform.python_version()
+    }
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
