@@ -194,6 +194,12 @@ class BootUp:
                     "scaling to "
                     "plain encoder counts, or correct the file"
                 )
+        if gear not in (1, Fraction(self._axis.gear.ratio)):
+            raise IdentityError(
+                f"{self._name(objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
+                "gear.ratio in "
+                f"{self._axis.path} is {self._axis.gear.ratio:g}; correct the one that is wrong"
+            )
         if feed is None and gear != 1:
             raise IdentityError(
                 f"{self._name(objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "
@@ -208,7 +214,23 @@ class BootUp:
                     "itself; "
                     f"set it to 0 and use motor_encoder.direction in {self._axis.path}"
                 )
+        self._check_load_resolution()
         return self._compare_rated_torque()
+
+    def _check_load_resolution(self) -> None:
+        """60E6h and 60EBh say how an encoder at 60E4h counts, per turn of the load or of the motor."""
+        source, counts = self._axis.load_encoder.source, self._axis.load_encoder.counts_per_turn
+        if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
+            return
+        found = self._ratio(*objects.additional_resolution(source.subindex))
+        if found is not None and found not in (counts, Fraction(counts) / Fraction(self._axis.gear.ratio)):
+            raise IdentityError(
+                f"node {self._sdo.node_id}, 60E6h:{source.subindex:02X} / 60EBh:{source.subindex:02X} "
+                "(additional "
+                f"encoder resolution): the drive counts {float(found):g} per turn, but "
+                f"load_encoder.counts_per_turn in {self._axis.path} is {counts}; correct the one that is "
+                "wrong"
+            )
 
     def _compare_rated_torque(self) -> list[str]:
         if not self._sdo.has(objects.RATED_TORQUE.index):

@@ -67,20 +67,15 @@ def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
     """Least and greatest target of the drive, motor counts, in this order whatever the direction.
 
     The limits of the axis file hold for the place that is aimed at. The compensation may add its own
-    maximum on top of that, so the drive's limits are wider by it.
+    maximum on top of that, so the drive's limits are wider by it. An `AxisConfig` makes sure that both fit
+    the 32 bits of a target.
     """
     margin_deg = axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
     ends = [
         axis.motor_encoder.counts(load_deg * axis.gear.ratio)
         for load_deg in (axis.limits.position_min_deg - margin_deg, axis.limits.position_max_deg + margin_deg)
     ]
-    least, greatest = math.ceil(min(ends)), math.floor(max(ends))
-    if least < IntegerType.INT32.minimum or greatest > IntegerType.INT32.maximum:
-        raise InputError(
-            f"limits.position_min_deg .. position_max_deg is {least} .. {greatest} motor counts, more than "
-            "the 32 bits of object 607Ah hold; narrow the limits or lower motor_encoder.counts_per_turn"
-        )
-    return least, greatest
+    return math.ceil(min(ends)), math.floor(max(ends))
 
 
 class ProcessImage:

@@ -186,6 +186,18 @@ CYCLE_MANTISSA: Final = Address(0x60C2, 1, _U8, "interpolation time period value
 CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
 SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
 
+ADDITIONAL_POSITIONS: Final = 0x60E4
+"""Array of additional encoders; its sub-index says which."""
+
+
+def additional_resolution(sub: int) -> tuple[Address, Address]:
+    """Increments and revolutions of the additional encoder ``sub`` (60E6h, 60EBh)."""
+    return (
+        Address(0x60E6, sub, _U32, "additional encoder increments"),
+        Address(0x60EB, sub, _U32, "additional encoder revolutions"),
+    )
+
+
 STANDARD: Final[dict[tuple[int, int], Address]] = {
     (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
 }

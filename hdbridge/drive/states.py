@@ -141,13 +141,19 @@ def row_for(state: State, command: Command) -> Transition:
 
 
 def _first_row(state: State, target: State) -> Transition | None:
-    """First row of the shortest way, breadth first, without the rows that are never implied."""
+    """First row of the shortest way, breadth first.
+
+    Without the rows that are never implied, and never *through* 'operation enabled': nobody is to be put
+    under power in order to get somewhere else.
+    """
     ways: deque[tuple[State, Transition | None]] = deque([(state, None)])
     seen = {state}
     while ways:
         here, first = ways.popleft()
         if here is target:
             return first
+        if here is State.OPERATION_ENABLED and first is not None:
+            continue
         for row in TRANSITIONS:
             if row.source is here and row.number not in NEVER_IMPLIED and row.target not in seen:
                 seen.add(row.target)

@@ -1,0 +1,183 @@
+"""The link: what it drops, what it raises, and that it never waits for ever."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections import deque
+
+import can
+import pytest
+
+from hdbridge.axis import BusConfig
+from hdbridge.clock import MonotonicClock
+from hdbridge.drive import Link, TransmitBufferFull, open_bus
+from hdbridge.errors import BusError
+
+
+def message(can_id: int = 0x181, data: bytes = b"\x01", **flags: bool) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
+
+
+class FakeBus(can.BusABC):
+    """Gives what is queued, or raises it."""
+
+    def __init__(self, *inbox: can.Message | Exception | None, on_send: Exception | None = None) -> None:
+        super().__init__(channel="x")
+        self.channel_info = "socketcan channel 'can0'"
+        self.inbox = deque(inbox)
+        self.on_send = on_send
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.on_send is not None:
+            raise self.on_send
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        item = self.inbox.popleft() if self.inbox else None
+        if isinstance(item, Exception):
+            raise item
+        return item, False
+
+
+@pytest.fixture
+def closing() -> deque[can.BusABC]:
+    buses: deque[can.BusABC] = deque()
+    yield buses  # type: ignore[misc]
+    for bus in buses:
+        bus.shutdown()
+
+
+def link_to(closing: deque[can.BusABC], bus: FakeBus) -> Link:
+    closing.append(bus)
+    return Link(bus, MonotonicClock())
+
+
+def test_frames_pass_both_ways() -> None:
+    with (
+        can.Bus(interface="virtual", channel="link", ignore_config=True) as near,
+        can.Bus(interface="virtual", channel="link", ignore_config=True) as far,
+    ):
+        link = Link(near, MonotonicClock())
+        link.send(0x201, b"\x0f\x00\x01")
+        received = far.recv(1)
+        assert received is not None
+        assert (received.arbitration_id, bytes(received.data), received.is_extended_id) == (
+            0x201,
+            b"\x0f\x00\x01",
+            False,
+        )
+        far.send(message(0x181, b"\x37"))
+        frame = link.recv(link.now() + 1)
+        assert frame is not None
+        assert frame[:2] == (0x181, b"\x37")
+        assert link.recv(link.now()) is None
+
+
+def test_what_canopen_does_not_use_is_dropped_and_counted(closing: deque[can.BusABC]) -> None:
+    link = link_to(
+        closing,
+        FakeBus(
+            message(is_remote_frame=True),
+            message(0x181, is_extended_id=True),
+            message(is_error_frame=True),
+            message(is_fd=True),
+            message(0x181, b"good"),
+            message(0x182, b"too"),
+        ),
+    )
+    assert [frame.data for frame in link.drain()] == [b"good", b"too"]
+    dropped = link.dropped
+    assert (dropped.remote, dropped.extended, dropped.error, dropped.fd, dropped.total) == (1, 1, 1, 1, 4)
+
+
+@pytest.mark.parametrize("code", [errno.ENETDOWN, errno.ENODEV])
+def test_an_interface_that_went_down_stays_down(closing: deque[can.BusABC], code: int) -> None:
+    gone = can.CanOperationError("Failed to receive: down", code)
+    link = link_to(closing, FakeBus(gone, None, message()))
+    with pytest.raises(BusError, match=r"can0.*cannot receive"):
+        link.recv(0.0)
+    # SocketCAN says it once and is silent from then on.
+    for call in (lambda: link.recv(0.0), lambda: link.send(1, b"")):
+        with pytest.raises(BusError, match="can0"):
+            call()
+    assert link.down is not None
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS),
+        can.CanOperationError("Transmit buffer full"),
+        OSError(errno.ENOBUFS, "No buffer space available"),
+    ],
+)
+def test_a_full_queue_is_told_apart_and_does_not_last(closing: deque[can.BusABC], error: Exception) -> None:
+    bus = FakeBus(on_send=error)
+    link = link_to(closing, bus)
+    with pytest.raises(TransmitBufferFull, match="dropped"):
+        link.send(0x201, b"")
+    bus.on_send = None
+    link.send(0x201, b"")
+    assert link.down is None
+
+
+def test_bus_off_is_the_end_of_the_link(closing: deque[can.BusABC]) -> None:
+    link = link_to(closing, FakeBus(message(0x40, is_error_frame=True), message()))
+    with pytest.raises(BusError, match="bus-off"):
+        link.recv(0.0)
+    with pytest.raises(BusError, match="bus-off"):
+        link.send(1, b"")
+
+
+def test_an_error_frame_that_only_warns_is_counted(closing: deque[can.BusABC]) -> None:
+    link = link_to(closing, FakeBus(message(0x04, is_error_frame=True), message(0x181)))
+    frame = link.recv(0.0)
+    assert frame is not None
+    assert frame.can_id == 0x181
+    assert link.dropped.error == 1
+
+
+def test_a_wall_clock_that_is_set_back_does_not_hold_the_wait(
+    closing: deque[can.BusABC], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walls = iter(range(10_000, 0, -100))
+    monkeypatch.setattr("can.bus.time", lambda: float(next(walls)))
+    link = link_to(closing, FakeBus())
+    assert link.recv(time.monotonic() + 0.001) is None
+
+
+def test_a_link_to_a_closed_bus_says_so() -> None:
+    bus = can.Bus(interface="virtual", channel="closed", ignore_config=True)
+    link = Link(bus, MonotonicClock())
+    bus.shutdown()
+    with pytest.raises(BusError, match="closed"):
+        link.send(1, b"")
+    assert link.down is not None
+
+
+def test_opening_an_unknown_interface() -> None:
+    with (
+        pytest.raises(BusError, match=r"no interface 'nonsense'.*socketcan") as caught,
+        open_bus(BusConfig(interface="nonsense", channel="x")),
+    ):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_opening_an_absent_channel() -> None:
+    with (
+        pytest.raises(BusError, match="socketcan:absent0: cannot open it") as caught,
+        open_bus(BusConfig(interface="socketcan", channel="absent0")),
+    ):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_an_opened_bus_is_closed_again() -> None:
+    with open_bus(
+        BusConfig(interface="virtual", channel="open", options={"receive_own_messages": True})
+    ) as bus:
+        bus.send(message())
+        assert bus.recv(0) is not None
+    with pytest.raises(can.CanOperationError):
+        bus.send(message())

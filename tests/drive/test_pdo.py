@@ -1,0 +1,109 @@
+"""The PDO codec: what goes in comes out, and what does not fit never gets as far as a frame."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.drive.objects import STANDARD, IntegerType, Mode
+from hdbridge.drive.pdo import PdoCodec, PdoEntry, PdoLengthError
+from hdbridge.errors import InputError
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> tuple[PdoCodec, list[int]]:
+    types: list[IntegerType] = []
+    for kind in draw(st.lists(st.sampled_from(IntegerType), min_size=1, max_size=8)):
+        if sum(each.bits for each in types) + kind.bits <= 64:
+            types.append(kind)
+    codec = PdoCodec(PdoEntry(0x2000 + place, place, kind) for place, kind in enumerate(types))
+    return codec, [draw(st.integers(kind.minimum, kind.maximum)) for kind in types]
+
+
+@given(layouts())
+def test_packing_and_unpacking_are_inverse(layout: tuple[PdoCodec, list[int]]) -> None:
+    codec, values = layout
+    data = codec.pack(values)
+    assert len(data) == codec.length == sum(entry.type.bits for entry in codec.entries) // 8
+    assert codec.unpack(data) == tuple(values)
+
+
+@given(layouts())
+def test_values_lie_little_endian_one_after_the_other(layout: tuple[PdoCodec, list[int]]) -> None:
+    codec, values = layout
+    expected = b"".join(
+        value.to_bytes(entry.type.bits // 8, "little", signed=entry.type.signed)
+        for entry, value in zip(codec.entries, values, strict=True)
+    )
+    assert codec.pack(values) == expected
+
+
+@given(layouts(), st.binary(max_size=64))
+def test_data_of_another_length_is_rejected(layout: tuple[PdoCodec, list[int]], data: bytes) -> None:
+    codec, _ = layout
+    if len(data) == codec.length:
+        codec.unpack(data)
+    else:
+        with pytest.raises(PdoLengthError, match=f"has {codec.length} bytes"):
+            codec.unpack(data)
+
+
+@pytest.mark.parametrize("kind", IntegerType)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1.0, None, "1"])
+def test_what_is_no_integer_is_not_packed(kind: IntegerType, bad: object) -> None:
+    with pytest.raises(InputError, match="nothing was sent"):
+        PdoCodec([PdoEntry(0x607A, 0, kind)]).pack([bad])  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("kind", IntegerType)
+def test_the_range_of_each_type_ends_where_it_should(kind: IntegerType) -> None:
+    codec = PdoCodec([PdoEntry(0x607A, 0, kind)])
+    for value in (kind.minimum, kind.maximum):
+        assert codec.unpack(codec.pack([value])) == (value,)
+    for value in (kind.minimum - 1, kind.maximum + 1):
+        with pytest.raises(InputError, match=r"607Ah:00"):
+            codec.pack([value])
+
+
+def test_type_ranges_are_those_of_struct() -> None:
+    for kind, code in ((IntegerType.INT32, "<i"), (IntegerType.UINT16, "<H"), (IntegerType.INT8, "<b")):
+        struct.pack(code, kind.minimum)
+        struct.pack(code, kind.maximum)
+        with pytest.raises(struct.error):
+            struct.pack(code, kind.maximum + 1)
+
+
+def test_a_pdo_has_at_most_eight_bytes_and_no_object_twice() -> None:
+    entry = PdoEntry(0x6064, 0, IntegerType.INT32)
+    with pytest.raises(InputError, match="1 to 8 bytes"):
+        PdoCodec([PdoEntry(0x6064, sub, IntegerType.INT32) for sub in range(3)])
+    with pytest.raises(InputError, match="nothing needs 0"):
+        PdoCodec([])
+    with pytest.raises(InputError, match="maps an object once"):
+        PdoCodec([entry, entry])
+    with pytest.raises(InputError, match="as many values"):
+        PdoCodec([entry]).pack([1, 2])
+
+
+def test_sub_indices_of_one_object_stay_apart() -> None:
+    codec = PdoCodec([PdoEntry(0x60E4, 1, IntegerType.INT32), PdoEntry(0x60E4, 2, IntegerType.INT32)])
+    values = codec.unpack(codec.pack([11, 22]))
+    assert values[codec.positions[0x60E4, 1]] == 11
+    assert values[codec.positions[0x60E4, 2]] == 22
+    assert [entry.mapping for entry in codec.entries] == [0x60E40120, 0x60E40220]
+
+
+def test_type_names() -> None:
+    assert IntegerType.named("uint24").bits == 24
+    with pytest.raises(InputError, match="float32"):
+        IntegerType.named("float32")
+
+
+def test_no_two_known_objects_share_an_address() -> None:
+    assert STANDARD[0x6041, 0].name == "statusword"
+    assert str(STANDARD[0x607D, 2]) == "607Dh:02 software position limit max"
+    assert [mode.supported_bit for mode in Mode] == [0x01, 0x20, 0x80]

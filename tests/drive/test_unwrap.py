@@ -1,0 +1,55 @@
+"""Unwrapping a counter: a wrap has no effect, whatever the path and the width."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.drive.unwrap import Unwrap, wrap_int32
+
+HALF = 2**31
+
+
+@given(start=st.integers(-HALF, HALF - 1), moves=st.lists(st.integers(-HALF, HALF - 1), max_size=30))
+def test_any_path_of_moves_below_half_the_range_is_followed(start: int, moves: list[int]) -> None:
+    unwrap = Unwrap()
+    position = unwrap.update(start)
+    assert position == start
+    for move in moves:
+        position += move
+        assert unwrap.peek(wrap_int32(position)) == position
+        assert unwrap.update(wrap_int32(position)) == position
+    assert unwrap.value == position
+
+
+@given(
+    modulus=st.integers(2, 2**33),
+    start=st.integers(0, 2**33),
+    steps=st.lists(st.floats(-0.499, 0.499), max_size=20),
+)
+def test_a_counter_may_begin_anew_anywhere(modulus: int, start: int, steps: list[float]) -> None:
+    unwrap = Unwrap(modulus)
+    position = start % modulus
+    unwrap.update(position)
+    for step in steps:
+        position += int(step * modulus)
+        assert unwrap.update(position % modulus) == position
+
+
+@given(st.integers())
+def test_wrapping_stays_in_int32_and_is_modular(value: int) -> None:
+    assert -HALF <= wrap_int32(value) < HALF
+    assert (wrap_int32(value) - value) % 2**32 == 0
+
+
+def test_reset_starts_from_where_it_is_told() -> None:
+    unwrap = Unwrap()
+    unwrap.update(5)
+    unwrap.reset()
+    assert unwrap.value is None
+    assert unwrap.peek(7) == 7
+    unwrap.reset(2**40)
+    assert unwrap.update(3) == 2**40 + 3
+    with pytest.raises(ValueError, match="at least 2"):
+        Unwrap(1)
