@@ -1,0 +1,152 @@
+"""Elastic hysteresis of the gear: how far its output is ahead, by the way the motor has come.
+
+Each law is rate-independent and advances from one motor angle to the next. The output is ahead in the direction
+of motion, so that a closed loop of the motor angle goes round with a positive area, integral of error by angle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+from hdbridge.sim.truth import BoucWen, MaxwellSlip, RollingFriction
+
+
+class Law(Protocol):
+    """A hysteresis law with its state."""
+
+    def advance(self, motor_deg: float) -> float:
+        """The error in arcsec once the motor has moved straight to this angle from the last one."""
+        ...
+
+
+def law_of(truth: RollingFriction | MaxwellSlip | BoucWen | None, motor_deg: float) -> Law | None:
+    """The law that a truth file names, at its start, the motor at an angle."""
+    if isinstance(truth, RollingFriction):
+        return RollingFrictionLaw(truth, motor_deg)
+    if isinstance(truth, MaxwellSlip):
+        return MaxwellSlipLaw(truth, motor_deg)
+    return None if truth is None else BoucWenLaw(truth, motor_deg)
+
+
+class RollingFrictionLaw:
+    """The article's law, continuous at reversals.
+
+    After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s is the
+    direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
+    ``x (1 - ln x)`` for n = 2. Only the last reversal counts: it has no return-point memory.
+    """
+
+    __slots__ = ("_branch_arcsec", "_branch_deg", "_direction", "_error", "_exponent", "_motor_deg", "_offset",
+                 "_saturated", "_width")  # fmt: skip
+
+    def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
+        self._offset = truth.offset_arcsec
+        self._width = truth.width_deg
+        self._exponent = truth.exponent
+        self._motor_deg = motor_deg
+        self._error = truth.start_arcsec
+        self._direction = 0.0
+        self._branch_deg = motor_deg
+        self._branch_arcsec = truth.start_arcsec
+        self._saturated = False
+
+    def advance(self, motor_deg: float) -> float:
+        """See `Law`."""
+        before_deg = self._motor_deg
+        if motor_deg == before_deg:
+            return self._error
+        direction = 1.0 if motor_deg > before_deg else -1.0
+        self._motor_deg = motor_deg
+        if direction != self._direction:
+            self._direction = direction
+            self._branch_deg = before_deg
+            self._branch_arcsec = self._error
+            self._saturated = False
+        elif self._saturated:
+            return self._error
+        travel = direction * (motor_deg - self._branch_deg) / self._width
+        size = self._offset
+        if travel < 1.0:
+            n = self._exponent
+            if n == 2.0:  # noqa: PLR2004  the limit of the other formula
+                crossed = travel * (1.0 - math.log(travel))
+            else:
+                crossed = (travel ** (n - 1.0) - (n - 1.0) * travel) / (2.0 - n)
+            size = direction * self._branch_arcsec + 2.0 * self._offset * crossed
+        if size >= self._offset:
+            size = self._offset
+            self._saturated = True
+        self._error = direction * size
+        return self._error
+
+
+class MaxwellSlipLaw:
+    """Parallel springs with sliders (Prandtl-Ishlinskii stop operators). Has return-point memory."""
+
+    __slots__ = ("_elements", "_error", "_motor_deg", "_states")
+
+    def __init__(self, truth: MaxwellSlip, motor_deg: float) -> None:
+        self._elements = tuple(
+            (each.limit_arcsec / each.yield_deg, each.limit_arcsec) for each in truth.elements
+        )
+        self._states = [0.0] * len(self._elements)
+        self._motor_deg = motor_deg
+        self._error = 0.0
+
+    def advance(self, motor_deg: float) -> float:
+        """See `Law`."""
+        travel = motor_deg - self._motor_deg
+        if travel == 0.0:
+            return self._error
+        self._motor_deg = motor_deg
+        states = self._states
+        total = 0.0
+        for position, (stiffness, limit) in enumerate(self._elements):
+            state = states[position] + stiffness * travel
+            if state > limit:
+                state = limit
+            elif state < -limit:
+                state = -limit
+            states[position] = state
+            total += state
+        self._error = total
+        return total
+
+
+class BoucWenLaw:
+    """``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``, beta + gamma = 1; the error is offset * z.
+
+    Integrated over the motor's travel x by the midpoint rule in pieces that are short against the yield travel.
+    """
+
+    PIECE = 0.05
+    __slots__ = ("_beta", "_exponent", "_gamma", "_motor_deg", "_offset", "_yield", "_z")
+
+    def __init__(self, truth: BoucWen, motor_deg: float) -> None:
+        self._offset = truth.offset_arcsec
+        self._yield = truth.yield_deg
+        self._exponent = truth.exponent
+        self._beta = truth.beta
+        self._gamma = 1.0 - truth.beta
+        self._motor_deg = motor_deg
+        self._z = 0.0
+
+    def advance(self, motor_deg: float) -> float:
+        """See `Law`."""
+        travel = (motor_deg - self._motor_deg) / self._yield
+        z = self._z
+        if travel != 0.0:
+            self._motor_deg = motor_deg
+            pieces = math.ceil(abs(travel) / self.PIECE)
+            step = travel / pieces
+            direction = 1.0 if travel > 0.0 else -1.0
+            for _ in range(pieces):
+                middle = z + 0.5 * step * self._slope(z, direction)
+                z += step * self._slope(middle, direction)
+            self._z = z
+        return self._offset * z
+
+    def _slope(self, z: float, direction: float) -> float:
+        turned = self._beta if z * direction > 0.0 else -self._beta
+        return float(1.0 - abs(z) ** self._exponent * (turned + self._gamma))

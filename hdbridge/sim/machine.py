@@ -1,0 +1,151 @@
+"""The simulated axis as a drive's firmware has it: loops, motor, gear, load and two encoders.
+
+Deterministic: the same truth and seed, driven alike, give the same numbers bit for bit. It knows no clock; each
+call advances it by whole substeps.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+from hdbridge.sim.plant import Plant
+from hdbridge.sim.servo import Servo
+from hdbridge.sim.truth import Truth
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+
+class Machine:
+    """A servo axis at rest at the angle zero, its power stage off."""
+
+    def __init__(self, truth: Truth, seed: int) -> None:
+        self.truth = truth
+        self.dt_s = truth.substep_s
+        """Length of a substep."""
+        self._plant = Plant(truth)
+        self._servo = Servo(truth)
+        self._powered = False
+        self._hold_counts: float | None = None
+        self._torque_nm = 0.0
+        self._copper_loss_w = truth.temperature.copper_loss_w / truth.motor.rated_torque_nm**2
+        motor, load = truth.motor.encoder, truth.load_.encoder
+        self._motor_counts_per_deg = motor.direction * motor.counts_per_turn / DEG_PER_TURN
+        self._load_counts_per_deg = load.direction * load.counts_per_turn / DEG_PER_TURN
+        self._noise_deg = load.noise_arcsec / ARCSEC_PER_DEG
+        self._noise = random.Random(f"load encoder {seed}")
+        self._noise_now_deg = 0.0
+        self._rated_limit_nm = self._servo.limit_nm
+
+    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+        """Closed loop: the demand moves evenly from start to end, in motor counts (may be fractional).
+
+        When the power stage was off before, the loops start from where the motor stands: a demand that rests
+        within a count of it does not move the axis.
+        """
+        if substeps < 1:
+            return
+        plant, servo = self._plant, self._servo
+        conditions = plant.now
+        if not self._powered:
+            self._powered = True
+            servo.engage(conditions.motor_deg, plant.motor_deg_s)
+            near = abs(self._motor_reading() - start_counts) <= 1.0
+            self._hold_counts = start_counts if near else None
+        zero = self.truth.motor.encoder.zero_counts
+        demand = (start_counts - zero) / self._motor_counts_per_deg
+        speed = (end_counts - start_counts) / self._motor_counts_per_deg / (substeps * self.dt_s)
+        if self._hold_counts is not None:
+            if start_counts == end_counts == self._hold_counts:
+                demand = servo.standing_deg
+            else:
+                self._hold_counts = None
+        dt = self.dt_s
+        torque_of, advance = servo.torque_nm, plant.advance
+        torque = squares = 0.0
+        for substep in range(substeps):
+            torque = torque_of(demand + substep * dt * speed, speed, conditions.motor_deg)
+            advance(torque, 0.0)
+            squares += torque * torque
+        self._torque_nm = torque
+        self._finish(substeps, squares * self._copper_loss_w * dt)
+
+    def coast(self, substeps: int, braked: bool) -> None:
+        """Power stage off: friction, or the brake, slows the motor and holds it."""
+        self._powered = False
+        self._torque_nm = 0.0
+        brake_nm = self.truth.motor.brake_nm if braked else 0.0
+        for _ in range(substeps):
+            self._plant.advance(0.0, brake_nm)
+        self._servo.engage(self._plant.now.motor_deg, self._plant.motor_deg_s)
+        self._finish(substeps, 0.0)
+
+    @property
+    def motor_counts(self) -> int:
+        """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
+        return math.floor(self._motor_reading() + 0.5)
+
+    @property
+    def load_counts(self) -> int:
+        """Load encoder: whole counts, multi-turn, never wrapped; with the noise of this instant."""
+        deg = self._plant.encoder_deg + self._noise_now_deg
+        return math.floor(deg * self._load_counts_per_deg + self.truth.load_.encoder.zero_counts + 0.5)
+
+    @property
+    def velocity_counts_s(self) -> float:
+        """The motor's speed as the drive measures it."""
+        return self._servo.measured_deg_s * self._motor_counts_per_deg
+
+    @property
+    def torque_permille(self) -> int:
+        """The motor's torque, in thousandths of the rated one, in the sense of the motor encoder."""
+        sense = self.truth.motor.encoder.direction
+        return round(1000.0 * sense * self._torque_nm / self.truth.motor.rated_torque_nm)
+
+    @property
+    def torque_limit_permille(self) -> float:
+        """Highest torque, in thousandths of the rated one; set it up to what the truth file allows."""
+        return 1000.0 * self._servo.limit_nm / self.truth.motor.rated_torque_nm
+
+    @torque_limit_permille.setter
+    def torque_limit_permille(self, permille: float) -> None:
+        wanted_nm = max(0.0, permille) / 1000.0 * self.truth.motor.rated_torque_nm
+        self._servo.limit_nm = min(wanted_nm, self._rated_limit_nm)
+
+    @property
+    def temperature_c(self) -> float:
+        """Temperature of motor and gear."""
+        return self._plant.now.temperature_c
+
+    @property
+    def true_motor_deg(self) -> float:
+        """The motor's angle itself, for tests."""
+        return self._plant.now.motor_deg
+
+    @property
+    def true_load_deg(self) -> float:
+        """The load's angle itself, for tests."""
+        return self._plant.now.load_deg
+
+    @property
+    def true_output_deg(self) -> float:
+        """The gear's output before its spring, for tests: where the load comes to rest."""
+        return self._plant.output_deg
+
+    def _motor_reading(self) -> float:
+        """The motor encoder before it is rounded."""
+        return self._plant.now.motor_deg * self._motor_counts_per_deg + self.truth.motor.encoder.zero_counts
+
+    def _finish(self, substeps: int, copper_j: float) -> None:
+        """What is slow against a control cycle: the temperature, and a new sample of the noise."""
+        if self._noise_deg:
+            self._noise_now_deg = self._noise.gauss(0.0, self._noise_deg)
+        heat = self.truth.temperature
+        plant = self._plant
+        elapsed_s = substeps * self.dt_s
+        if elapsed_s:
+            now = plant.now
+            warmed = (copper_j + plant.loss_j) / elapsed_s * heat.resistance_k_per_w
+            now.temperature_c += (
+                (heat.ambient_c + warmed - now.temperature_c) * elapsed_s / heat.time_constant_s
+            )
+            plant.loss_j = 0.0

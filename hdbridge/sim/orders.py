@@ -1,0 +1,30 @@
+"""Sums of orders, evaluated as a polynomial in exp(i angle): one complex exponential, then Horner's rule."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Iterable
+
+from hdbridge.sim.truth import TrueOrder
+
+
+class Orders:
+    """``sum of amplitude cos(order angle + phase)`` as a function of an angle."""
+
+    __slots__ = ("_coefficients",)
+
+    def __init__(self, orders: Iterable[TrueOrder]) -> None:
+        terms = {
+            each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders
+        }
+        # Highest order first, as Horner's rule takes them; the last one, order 0, is always zero.
+        self._coefficients = tuple(terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1))
+
+    def at(self, angle_rad: float) -> float:
+        """The sum in arcsec."""
+        turn = complex(math.cos(angle_rad), math.sin(angle_rad))
+        total = 0j
+        for coefficient in self._coefficients:
+            total = (total + coefficient) * turn
+        return total.real

@@ -1,0 +1,31 @@
+"""A damped mass on a spring whose base moves: the exact step for a base that moves evenly within the step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+
+class Step(NamedTuple):
+    """State transition of (distance from the base, its rate) over one step."""
+
+    distance_by_distance: float
+    distance_by_rate: float
+    rate_by_distance: float
+    rate_by_rate: float
+
+
+def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> Step:
+    """The matrix exponential of ``u'' = -w^2 u - 2 d w u'`` over a step, for any damping ratio."""
+    w, decay = frequency_rad_s, damping_ratio * frequency_rad_s
+    fade = math.exp(-decay * step_s)
+    inside = 1.0 - damping_ratio**2
+    if abs(inside) < 1e-9:  # noqa: PLR2004  critically damped, within rounding
+        c, s = 1.0, step_s
+    elif inside > 0.0:
+        damped = w * math.sqrt(inside)
+        c, s = math.cos(damped * step_s), math.sin(damped * step_s) / damped
+    else:
+        damped = w * math.sqrt(-inside)
+        c, s = math.cosh(damped * step_s), math.sinh(damped * step_s) / damped
+    return Step(fade * (c + decay * s), fade * s, -fade * w * w * s, fade * (c - decay * s))

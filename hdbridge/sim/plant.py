@@ -1,0 +1,113 @@
+"""The mechanics: motor and load, the gear's spring between them, friction, the coupling to the load encoder.
+
+The stiff linear parts (load on the gear's spring, encoder on its coupling) are stepped exactly for a base that
+moves evenly within a step. The motor is stepped implicitly in its friction: Coulomb friction is a set-valued
+force, so a motor whose torque does not exceed it stands still exactly, without creep or chatter.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.sim.gear import Conditions, Gear
+from hdbridge.sim.oscillator import exact_step
+from hdbridge.sim.truth import Truth
+
+RAD_PER_DEG = math.pi / 180.0
+
+
+class Plant:
+    """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
+
+    __slots__ = ("_arm", "_coulomb", "_coupling", "_damping", "_drag", "_dt", "_encoder_rate", "_flexspline",
+                 "_gear", "_inertia", "_load_drag", "_load_friction", "_ratio", "_stiffness", "encoder_deg",
+                 "loss_j", "motor_deg_s", "load_deg_s", "now", "output_deg")  # fmt: skip
+
+    def __init__(self, truth: Truth) -> None:
+        dt = truth.substep_s
+        gear, motor, load = truth.gear, truth.motor, truth.load_
+        self._dt = dt
+        self._ratio = gear.ratio
+        self._stiffness = gear.stiffness_nm_per_rad * RAD_PER_DEG
+        self._damping = gear.damping_nm_s_per_rad * RAD_PER_DEG
+        # Spring torque, averaged over a step, by the sum of the motor's speeds at its ends.
+        self._arm = (self._stiffness * dt / 4.0 + self._damping / 2.0) / gear.ratio
+        self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
+        self._drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
+        self._coulomb = motor.coulomb_nm
+
+        frequency = math.sqrt(gear.stiffness_nm_per_rad / load.inertia_kg_m2)
+        damping_ratio = gear.damping_nm_s_per_rad / (2.0 * load.inertia_kg_m2 * frequency)
+        self._flexspline = exact_step(frequency, damping_ratio, dt)
+        self._load_drag = math.exp(-load.viscous_nm_s_per_rad / load.inertia_kg_m2 * dt)
+        self._load_friction = load.coulomb_nm / load.inertia_kg_m2 / RAD_PER_DEG * dt
+
+        coupling = load.encoder.coupling
+        self._coupling = coupling and exact_step(math.tau * coupling.frequency_hz, coupling.damping_ratio, dt)
+
+        start_c = truth.temperature.start_c
+        self.now = Conditions(truth.temperature.ambient_c if start_c is None else start_c)
+        """The motor's and the load's angle, and what else the gear depends on."""
+        self._gear = Gear(truth)
+        self.output_deg = self._gear.output_deg(self.now)
+        self.now.load_deg = self.encoder_deg = self.output_deg
+        self.motor_deg_s = self.load_deg_s = self._encoder_rate = 0.0
+        self.loss_j = 0.0
+        """Friction work at the motor shaft since it was last set to zero."""
+
+    def advance(self, torque_nm: float, brake_nm: float) -> None:
+        """One substep under a motor torque; the brake adds to the Coulomb friction."""
+        now, dt = self.now, self._dt
+        speed, output, load = self.motor_deg_s, self.output_deg, now.load_deg
+        load_speed = self.load_deg_s
+        lag = output - load
+
+        # Motor. arm * (old speed + new speed) is the motor's own share in the spring's torque.
+        held = self._coulomb + brake_nm
+        arm = self._arm / self._ratio
+        spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
+        push = (self._inertia - arm) * speed + torque_nm - spring / self._ratio
+        if push > held:
+            new_speed = (push - held) / (self._inertia + arm + self._drag)
+        elif push < -held:
+            new_speed = (push + held) / (self._inertia + arm + self._drag)
+        else:
+            new_speed = 0.0
+        if new_speed or speed:
+            now.motor_deg += 0.5 * dt * (speed + new_speed)
+            turned = abs(new_speed)
+            self.loss_j += (held + self._drag * turned) * turned * RAD_PER_DEG * dt
+        self.motor_deg_s = new_speed
+
+        # Load, seen from the gear's output.
+        new_output = self._gear.output_deg(now)
+        rate = (new_output - output) / dt
+        a, b, c, d = self._flexspline
+        slip = load_speed - rate
+        new_load = new_output + b * slip - a * lag
+        new_load_speed = (rate + d * slip - c * lag) * self._load_drag
+        if self._load_friction:
+            new_load, new_load_speed = self._rub(load, new_load, new_load_speed)
+        now.torque_nm = self._stiffness * (new_output - new_load)
+        now.load_deg = new_load
+        self.load_deg_s = new_load_speed
+        self.output_deg = new_output
+
+        # Load encoder, seen from the load.
+        if self._coupling is None:
+            self.encoder_deg = new_load
+            return
+        a, b, c, d = self._coupling
+        rate = (new_load - load) / dt
+        ahead = self.encoder_deg - load
+        slip = self._encoder_rate - rate
+        self.encoder_deg = new_load + a * ahead + b * slip
+        self._encoder_rate = rate + c * ahead + d * slip
+
+    def _rub(self, before: float, load: float, speed: float) -> tuple[float, float]:
+        """Coulomb friction at the load: takes speed away, and holds a load that it can hold."""
+        loss = self._load_friction
+        if abs(speed) <= loss:
+            return before, 0.0
+        loss = math.copysign(loss, speed)
+        return load - 0.5 * loss * self._dt, speed - loss

@@ -1,0 +1,110 @@
+"""The drive's loops: a filter on the demand, then position and velocity cascade with feed-forward.
+
+Like real drives of this class it closes its loops on an interpolated encoder: a motor that has settled stands on
+the middle of the commanded count, not anywhere within it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.sim.truth import Truth
+
+RAD_PER_DEG = math.pi / 180.0
+
+
+class Servo:
+    """State of the loops. The demand and the motor's angle come in degrees of the motor."""
+
+    AT_REST_DEG_S = 0.05
+    """Below this demanded speed the direction of the friction feed-forward stays, and the integral may rest."""
+
+    __slots__ = ("_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction",
+                 "_integral", "_integral_rate", "_last_demand", "_measured", "_position_gain", "_reference",
+                 "_reference_speed", "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain",
+                 "_viscous", "limit_nm", "measured_deg_s")  # fmt: skip
+
+    def __init__(self, truth: Truth) -> None:
+        servo, encoder = truth.servo, truth.motor.encoder
+        dt = truth.substep_s
+        self._dt = dt
+        self._filter = 1000.0 / servo.command_filter_ms
+        self._decay = math.exp(-self._filter * dt)
+        self._position_gain = servo.position_gain_per_s
+        self._velocity_gain = servo.velocity_gain_nm_s_per_rad * RAD_PER_DEG
+        self._integral_rate = self._velocity_gain * dt / (servo.integral_time_ms / 1000.0)
+        self._velocity_feedforward = servo.velocity_feedforward
+        self._acceleration_gain = servo.inertia_feedforward_kg_m2 * RAD_PER_DEG / dt
+        self._viscous = servo.viscous_feedforward_nm_s_per_rad * RAD_PER_DEG
+        self._friction = servo.friction_feedforward_nm
+        self._steps_per_deg = encoder.counts_per_turn * encoder.interpolation / 360.0
+        self._step_deg = 1.0 / self._steps_per_deg
+        self._dead_band = (servo.integral_dead_band + 0.5) * self._step_deg
+        self.limit_nm = truth.motor.rated_torque_nm * servo.torque_limit_percent / 100.0
+        """Highest torque, either way."""
+        self.engage(0.0, 0.0)
+
+    def engage(self, motor_deg: float, motor_deg_s: float) -> None:
+        """Start from where the motor is: no torque, no error."""
+        self._measured = self._interpolated(motor_deg)
+        self._reference = self._last_demand = self._measured
+        self._reference_speed = self.measured_deg_s = motor_deg_s
+        self._integral = 0.0
+        self._direction = 0.0
+
+    @property
+    def standing_deg(self) -> float:
+        """Where the motor stood, as the loops see it, when they last looked."""
+        return self._measured
+
+    def torque_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
+        """The torque for one substep, in which the demand moves evenly from ``demand_deg`` on."""
+        dt = self._dt
+        measured = math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg
+        measured_speed = (measured - self._measured) / dt
+        self._measured = measured
+        self.measured_deg_s = measured_speed
+
+        # The reference: the demand behind two equal lags, stepped exactly. It never overshoots a demand that does
+        # not turn back, and it has a speed and an acceleration where a demand in whole counts has steps.
+        reference, speed = self._reference, self._reference_speed
+        w, decay = self._filter, self._decay
+        behind = reference - demand_deg + 2.0 * demand_deg_s / w
+        slower = speed - demand_deg_s
+        new_speed = demand_deg_s + decay * (slower - w * dt * (slower + w * behind))
+        self._reference = (
+            demand_deg + demand_deg_s * (dt - 2.0 / w) + decay * (behind + dt * (slower + w * behind))
+        )
+        self._reference_speed = new_speed
+
+        # The speeds compared are both averages over the substep that has passed.
+        error = reference - measured
+        wanted_speed = (reference - self._last_demand) / dt
+        self._last_demand = reference
+        speed_error = self._velocity_feedforward * wanted_speed + self._position_gain * error - measured_speed
+        rests = -self.AT_REST_DEG_S < new_speed < self.AT_REST_DEG_S
+        if not rests:
+            self._direction = 1.0 if new_speed > 0.0 else -1.0
+        integral = self._integral
+        if not rests or error > self._dead_band or error < -self._dead_band:
+            integral += self._integral_rate * speed_error
+        torque = (
+            self._velocity_gain * speed_error
+            + integral
+            + self._acceleration_gain * (new_speed - speed)
+            + self._viscous * new_speed
+            + self._friction * self._direction
+        )
+        limit = self.limit_nm
+        if torque > limit:
+            # At the limit the integral may only go back.
+            self._integral = min(integral, self._integral)
+            return limit
+        if torque < -limit:
+            self._integral = max(integral, self._integral)
+            return -limit
+        self._integral = integral
+        return torque
+
+    def _interpolated(self, motor_deg: float) -> float:
+        return math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg
