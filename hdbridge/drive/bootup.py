@@ -182,6 +182,12 @@ class BootUp:
         increments = self._ratio(objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
         feed = self._ratio(objects.FEED, objects.FEED_SHAFT)
         gear = self._ratio(objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
+        if gear not in (1, Fraction(self._axis.gear.ratio)):
+            raise IdentityError(
+                f"{self._name(objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
+                "gear.ratio in "
+                f"{self._axis.path} is {self._axis.gear.ratio:g}; correct the one that is wrong"
+            )
         for value, objects_used in (
             (increments, "608Fh:01 / 608Fh:02 (encoder resolution)"),
             (None if feed is None else feed / gear, "6092h (feed) over 6091h (gear ratio)"),
@@ -194,12 +200,6 @@ class BootUp:
                     "scaling to "
                     "plain encoder counts, or correct the file"
                 )
-        if gear not in (1, Fraction(self._axis.gear.ratio)):
-            raise IdentityError(
-                f"{self._name(objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
-                "gear.ratio in "
-                f"{self._axis.path} is {self._axis.gear.ratio:g}; correct the one that is wrong"
-            )
         if feed is None and gear != 1:
             raise IdentityError(
                 f"{self._name(objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "

@@ -173,9 +173,15 @@ class Drive:
         acceleration_deg_s2: float | None = None,
         timeout_s: float | None = None,
     ) -> Positions:
-        """Move to a load angle in PP, enabling the drive for it where it is not: see `modes.move_to`."""
+        """Move to a load angle in PP, enabling the drive for it where it is not; where the axis then is.
+
+        Speed and acceleration are at the load; the limits of the axis are their defaults. Raises `InputError`
+        before anything is sent when a value is not finite or outside the limits, `DriveError` when the drive
+        fails on the way, `TransitionError` when it takes too long (computed from the way unless given).
+        """
+        move = modes.ProfileMove.checked(self.image, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
         self._need(Mode.PP)
-        modes.move_to(self._commander, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
+        modes.run_move(self._commander, move)
         return self.read_positions()
 
     def home(
@@ -187,10 +193,12 @@ class Drive:
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
     ) -> Positions:
-        """Home by a method of 6098h, enabling the drive for it where it is not: see `modes.home`."""
-        self._need(Mode.HM)
-        modes.home(
-            self._commander,
+        """Home by a method of 6098h, enabling the drive for it where it is not; where the axis then is.
+
+        Speeds, acceleration and offset (607Ch) are at the load. Raises as `move_to` does.
+        """
+        homing = modes.Homing.checked(
+            self.axis,
             method,
             switch_velocity_deg_s,
             zero_velocity_deg_s,
@@ -198,6 +206,8 @@ class Drive:
             offset_deg,
             timeout_s,
         )
+        self._need(Mode.HM)
+        modes.run_homing(self._commander, homing)
         return self.read_positions()
 
     def read_positions(self) -> Positions:

@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
-from hdbridge.drive.image import HALT_BIT
+from hdbridge.drive.image import HALT_BIT, ProcessImage
 from hdbridge.drive.plan import motor_rate
 from hdbridge.drive.states import HOLD, State, decode
-from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import DriveError, HdbridgeError, InputError
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
 
 ENABLED: Final = HOLD[State.OPERATION_ENABLED]
 NEW_SET_POINT: Final = 0x0010
@@ -43,39 +46,103 @@ def _stopping_on_failure(commander: Commander) -> Iterator[None]:
         raise
 
 
-def move_to(
-    commander: Commander,
-    load_deg: float,
-    velocity_deg_s: float | None = None,
-    acceleration_deg_s2: float | None = None,
-    timeout_s: float | None = None,
-) -> int:
-    """Move to ``load_deg`` in PP; the drive is enabled in that mode. The motor counts where it ended.
+@dataclass(frozen=True, slots=True)
+class ProfileMove:
+    """A checked move: what PP is told, in motor counts, and how long it may take."""
 
-    Speeds and accelerations are at the load and at most the axis's limits, which are also their defaults.
-    Raises `InputError` before anything is sent when a value is not finite or outside the limits, `DriveError`
-    when the drive fails or the time-out (computed from the way unless given) passes.
-    """
-    axis, sdo, image = commander.axis, commander.sdo, commander.image
-    limits = axis.limits
-    if not limits.contains(load_deg):
-        raise InputError(
-            f"target of {load_deg!r} deg is outside limits.position_min_deg .. position_max_deg of "
-            f"{axis.path}, "
-            f"{limits.position_min_deg:g} .. {limits.position_max_deg:g} deg; nothing was sent"
+    load_deg: float
+    target_counts: int
+    velocity_deg_s: float
+    acceleration_deg_s2: float
+    timeout_s: float | None
+
+    @classmethod
+    def checked(
+        cls,
+        image: ProcessImage,
+        load_deg: float,
+        velocity_deg_s: float | None,
+        acceleration_deg_s2: float | None,
+        timeout_s: float | None,
+    ) -> ProfileMove:
+        """`InputError` when a value is not finite or outside the axis's limits, which are the defaults too.
+
+        Angles, speeds and accelerations are at the load. Without a time-out it is computed from the way.
+        """
+        axis = image.axis
+        limits = axis.limits
+        if not limits.contains(load_deg):
+            raise InputError(
+                f"target of {load_deg!r} deg is outside limits.position_min_deg .. position_max_deg of "
+                f"{axis.path}, {limits.position_min_deg:g} .. {limits.position_max_deg:g} deg; nothing was "
+                "sent"
+            )
+        return cls(
+            load_deg,
+            image.target_counts_for(load_deg * axis.gear.ratio),
+            _at_most(velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
+            _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
+            timeout_s,
         )
-    velocity = _at_most(velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s")
-    acceleration = _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2")
-    target = image.target_counts_for(load_deg * axis.gear.ratio)
-    start = sdo.fetch(objects.POSITION_ACTUAL)
-    if timeout_s is None:
-        way_deg = abs(axis.motor_encoder.degrees(target - start)) / axis.gear.ratio
-        timeout_s = _TIME_MARGIN * (way_deg / velocity + velocity / acceleration) + _TIME_EXTRA_S
+
+    def time_allowed_s(self, axis: AxisConfig, start_counts: int) -> float:
+        """The time-out: as given, else one and a half times the move and two seconds."""
+        if self.timeout_s is not None:
+            return self.timeout_s
+        way_deg = abs(axis.motor_encoder.degrees(self.target_counts - start_counts)) / axis.gear.ratio
+        move_s = way_deg / self.velocity_deg_s + self.velocity_deg_s / self.acceleration_deg_s2
+        return _TIME_MARGIN * move_s + _TIME_EXTRA_S
+
+
+@dataclass(frozen=True, slots=True)
+class Homing:
+    """A checked homing run: method (6098h), speeds, acceleration and offset at the load."""
+
+    method: int
+    switch_velocity_deg_s: float
+    zero_velocity_deg_s: float
+    acceleration_deg_s2: float
+    offset_deg: float
+    timeout_s: float
+
+    @classmethod
+    def checked(
+        cls,
+        axis: AxisConfig,
+        method: int,
+        switch_velocity_deg_s: float,
+        zero_velocity_deg_s: float,
+        acceleration_deg_s2: float | None,
+        offset_deg: float,
+        timeout_s: float,
+    ) -> Homing:
+        """`InputError` when a value is not finite or beyond the axis's limits."""
+        limits = axis.limits
+        if not math.isfinite(offset_deg):
+            raise InputError(f"a homing offset of {offset_deg!r} deg is not a finite angle; nothing was sent")
+        return cls(
+            method,
+            _at_most(switch_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
+            _at_most(zero_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
+            _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
+            offset_deg,
+            timeout_s,
+        )
+
+
+def run_move(commander: Commander, move: ProfileMove) -> None:
+    """Move in PP; the drive is enabled in that mode.
+
+    Raises `DriveError` when the drive fails on the way, `TransitionError` when it takes too long; the axis is
+    stopped then.
+    """
+    axis, sdo = commander.axis, commander.sdo
     with _stopping_on_failure(commander):
-        sdo.store(objects.PROFILE_VELOCITY, motor_rate(axis, velocity))
-        sdo.store(objects.PROFILE_ACCELERATION, motor_rate(axis, acceleration))
-        sdo.store(objects.PROFILE_DECELERATION, motor_rate(axis, acceleration))
-        sdo.store(objects.TARGET_POSITION, wrap_int32(target))
+        timeout_s = move.time_allowed_s(axis, sdo.fetch(objects.POSITION_ACTUAL))
+        sdo.store(objects.PROFILE_VELOCITY, motor_rate(axis, move.velocity_deg_s))
+        sdo.store(objects.PROFILE_ACCELERATION, motor_rate(axis, move.acceleration_deg_s2))
+        sdo.store(objects.PROFILE_DECELERATION, motor_rate(axis, move.acceleration_deg_s2))
+        sdo.store(objects.TARGET_POSITION, move.target_counts)
         commander.control(ENABLED)
         commander.control(ENABLED | NEW_SET_POINT | CHANGE_AT_ONCE)
         commander.wait_for(
@@ -86,71 +153,51 @@ def move_to(
             "room for the next set-point", lambda word: not word & ACKNOWLEDGED, STEP_TIMEOUT_S
         )
         word = commander.wait_for(
-            f"arrival at {load_deg:g} deg",
-            lambda word: (
-                bool(word & (TARGET_REACHED | FAILED)) or decode(word) is not State.OPERATION_ENABLED
-            ),
+            f"arrival at {move.load_deg:g} deg",
+            lambda word: bool(word & (TARGET_REACHED | FAILED)) or _dropped_out(word),
             timeout_s,
         )
-        if decode(word) is not State.OPERATION_ENABLED:
+        if _dropped_out(word):
             raise DriveError(
-                f"{commander.name}: left 'operation enabled' on the way to {load_deg:g} deg and is in "
+                f"{commander.name}: left 'operation enabled' on the way to {move.load_deg:g} deg and is in "
                 f"'{decode(word).value}'; look at its error display"
             )
         if word & FAILED:
             raise DriveError(
-                f"{commander.name}: following error on the way to {load_deg:g} deg; check that the axis "
-                "moves "
-                "freely, or lower the acceleration"
+                f"{commander.name}: following error on the way to {move.load_deg:g} deg; check that the axis "
+                "moves freely, or lower the acceleration"
             )
-    return sdo.fetch(objects.POSITION_ACTUAL)
 
 
-def home(
-    commander: Commander,
-    method: int,
-    switch_velocity_deg_s: float,
-    zero_velocity_deg_s: float,
-    acceleration_deg_s2: float | None = None,
-    offset_deg: float = 0.0,
-    timeout_s: float = 60.0,
-) -> int:
-    """Home by ``method`` (6098h) in HM; the drive is enabled in that mode. The motor counts afterwards.
+def run_homing(commander: Commander, homing: Homing) -> None:
+    """Home in HM; the drive is enabled in that mode.
 
-    Velocities and acceleration are at the load, ``offset_deg`` (607Ch) at the load too. Raises `InputError`
-    before anything is sent, `DriveError` when the drive reports a homing error or the time-out passes.
+    Raises `DriveError` when the drive reports a homing error, `TransitionError` when it takes too long; the
+    axis is stopped then.
     """
     axis, sdo = commander.axis, commander.sdo
-    limits = axis.limits
-    if not math.isfinite(offset_deg):
-        raise InputError(f"a homing offset of {offset_deg!r} deg is not a finite angle; nothing was sent")
-    to_switch = _at_most(switch_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s")
-    to_zero = _at_most(zero_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s")
-    acceleration = _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2")
+    offset = round(axis.motor_encoder.counts(homing.offset_deg * axis.gear.ratio))
     with _stopping_on_failure(commander):
-        sdo.store(objects.HOMING_METHOD, method)
-        sdo.store(objects.HOMING_SPEED_SWITCH, motor_rate(axis, to_switch))
-        sdo.store(objects.HOMING_SPEED_ZERO, motor_rate(axis, to_zero))
-        sdo.store(objects.HOMING_ACCELERATION, motor_rate(axis, acceleration))
-        sdo.store(objects.HOME_OFFSET, round(axis.motor_encoder.counts(offset_deg * axis.gear.ratio)))
+        sdo.store(objects.HOMING_METHOD, homing.method)
+        sdo.store(objects.HOMING_SPEED_SWITCH, motor_rate(axis, homing.switch_velocity_deg_s))
+        sdo.store(objects.HOMING_SPEED_ZERO, motor_rate(axis, homing.zero_velocity_deg_s))
+        sdo.store(objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
+        sdo.store(objects.HOME_OFFSET, offset)
         commander.control(ENABLED)
         commander.control(ENABLED | START_HOMING)
         done = ACKNOWLEDGED | TARGET_REACHED
         word = commander.wait_for(
-            f"the end of homing by method {method}",
-            lambda word: (
-                word & done == done or bool(word & FAILED) or decode(word) is not State.OPERATION_ENABLED
-            ),
-            timeout_s,
+            f"the end of homing by method {homing.method}",
+            lambda word: word & done == done or bool(word & FAILED) or _dropped_out(word),
+            homing.timeout_s,
         )
-        if word & FAILED or decode(word) is not State.OPERATION_ENABLED:
+        if word & FAILED or _dropped_out(word):
             raise DriveError(
-                f"{commander.name}: homing by method {method} failed (statusword {word:04X}h); check the "
-                "home "
-                "and limit switches and that the method suits them"
+                f"{commander.name}: homing by method {homing.method} failed (statusword {word:04X}h); "
+                "check the "
+                "home and limit switches and that the method suits them"
             )
         commander.control(ENABLED)
-    return sdo.fetch(objects.POSITION_ACTUAL)
 
 
 def halt(commander: Commander) -> bool:
@@ -158,6 +205,11 @@ def halt(commander: Commander) -> bool:
     commander.image.halt = True
     commander.control(ENABLED | HALT_BIT)
     return commander.wait_for_standstill()
+
+
+def _dropped_out(statusword: int) -> bool:
+    # A fault is not a mere drop-out: the waiting itself raises it, with its code.
+    return decode(statusword) not in (State.OPERATION_ENABLED, State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
 def _at_most(value: float | None, limit: float, name: str) -> float:

@@ -1,0 +1,206 @@
+"""Booting a drive: what is checked, in which order it is written, and every way it is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import can
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.drive import Drive, Mode, State
+from hdbridge.errors import BusError, DriveError, IdentityError, SdoError
+
+
+@pytest.fixture
+def drive(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> Drive:
+    return Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
+
+
+def test_a_drive_comes_up_configured_operational_and_disabled(drive: Drive, tiny: Any) -> None:
+    report = drive.boot()
+    assert report.state is State.SWITCH_ON_DISABLED
+    assert set(report.modes) == {Mode.PP, Mode.HM, Mode.CSP}
+    assert report.identity["vendor_id"] == 0x4844
+    assert report.names["device"]
+    assert report.notes == ()
+    assert tiny.nmt_state == 5
+    for (index, sub), row in {(row.index, row.sub): row for row in report.written}.items():
+        assert int(tiny.values[index, sub]) & row.compared == row.value & row.compared
+    assert tiny.values[0x1A01, 1] == 0x60E40120
+    assert tiny.values[0x1400, 1] == 0x201
+    for unused in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803):
+        assert tiny.values[unused, 1] & 0x8000_0000
+    assert drive.monitor.nodes[1].boot_ups == 1
+
+
+def test_nothing_is_written_before_the_drive_is_known(drive: Drive, tiny: Any) -> None:
+    tiny.values[0x1018, 2] = 0x403
+    with pytest.raises(
+        IdentityError, match=r"1018h:02 .*is 403h.*expects 402h in drive\.identity\.product_code"
+    ):
+        drive.boot()
+    assert tiny.sdo_order == []
+
+
+def test_without_a_reset_no_boot_up_message_is_awaited(drive: Drive, tiny: Any, bus: Any) -> None:
+    drive.boot(reset=False)
+    assert [bytes(message.data) for message in bus.sent if message.arbitration_id == 0] == [
+        b"\x80\x01",
+        b"\x01\x01",
+    ]
+
+
+def test_an_absent_drive_is_named_within_a_bounded_time(
+    drive: Drive, tiny: Any, clock: Any, axis: AxisConfig
+) -> None:
+    tiny.silent = True
+    with pytest.raises(DriveError, match=r"node 1 on virtual:test-.*no other node.*drive\.node_id") as caught:
+        drive.boot()
+    assert "\n" not in str(caught.value)
+    assert clock.now() < 3.0
+
+
+def test_an_absent_drive_and_who_is_there_instead(
+    drive: Drive, tiny: Any, bus: Any, peer_bus: can.BusABC
+) -> None:
+    tiny.silent = True
+
+    def other() -> None:
+        peer_bus.send(can.Message(arbitration_id=0x705, data=b"\x7f", is_extended_id=False))
+        bus.peers.remove(other)
+
+    bus.peers.append(other)
+    with pytest.raises(DriveError, match="heard: node 5"):
+        drive.boot()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ((0x1000, 0), 0x0002_0191, "device profile 401; expected 402"),
+        ((0x1018, 1), 1, r"drive\.identity\.vendor_id"),
+        ((0x1018, 3), 0x10001, r"drive\.identity\.revision"),
+        ((0x6502, 0), 0x21, "cyclic synchronous position"),
+        ((0x608F, 1), 4000, r"608Fh.*counts 4000 per motor turn.*counts_per_turn.* is 8000"),
+        ((0x608F, 2), 2, "counts 4000"),
+        ((0x608F, 1), 0, "is 0, over 1: not a ratio"),
+        ((0x6092, 1), 360_000, r"6092h.*counts 7200 per motor turn"),
+        ((0x6091, 1), 100, r"gear of 100, but gear\.ratio.* is 50"),
+        ((0x607E, 0), 0x80, r"reverses positions itself.*motor_encoder\.direction"),
+        ((0x60E6, 1), 1_000_000, r"load_encoder\.counts_per_turn.* is 2880000"),
+    ],
+)
+def test_another_drive_or_another_scale_is_refused(
+    drive: Drive, tiny: Any, key: tuple[int, int], value: int, text: str
+) -> None:
+    tiny.values[key] = value
+    with pytest.raises(IdentityError, match=text) as caught:
+        drive.boot()
+    assert "\n" not in str(caught.value)
+    assert tiny.sdo_order == []
+
+
+def test_a_different_rated_torque_is_only_noted(drive: Drive, tiny: Any) -> None:
+    tiny.values[0x6076, 0] = 640
+    (note,) = drive.boot().notes
+    assert "0.64 Nm" in note
+
+
+WRITTEN = [
+    ((0x60C2, 1), "drive.cycle_ms"),
+    ((0x60C2, 2), "drive.cycle_ms"),
+    ((0x605A, 0), "drive.quick_stop_option"),
+    ((0x605D, 0), "drive.halt_option"),
+    ((0x607D, 1), "limits.position_min_deg"),
+    ((0x607D, 2), "limits.position_max_deg"),
+    ((0x6080, 0), "limits.velocity_deg_s"),
+    ((0x6072, 0), "limits.torque_percent"),
+    ((0x6065, 0), "drive.following_error_deg"),
+    ((0x6066, 0), "drive.following_error_time_ms"),
+    ((0x1017, 0), "drive.heartbeat_ms"),
+    ((0x1016, 1), "drive.heartbeat_ms"),
+    ((0x1A01, 1), "load_encoder.source"),
+    ((0x1800, 1), ""),
+    ((0x6007, 0), ""),
+]
+
+
+@pytest.mark.parametrize(("key", "field"), WRITTEN)
+def test_a_value_that_does_not_stick_is_found(
+    drive: Drive, tiny: Any, key: tuple[int, int], field: str
+) -> None:
+    tiny.stuck.add(key)
+    tiny.values[key] = 77
+    with pytest.raises(DriveError, match=f"{key[0]:04X}h:{key[1]:02X} .*but reads back 77") as caught:
+        drive.boot()
+    assert field in str(caught.value)
+    assert tiny.nmt_state == 127
+
+
+@pytest.mark.parametrize(("key", "field"), WRITTEN)
+def test_a_refused_write_names_the_field(drive: Drive, tiny: Any, key: tuple[int, int], field: str) -> None:
+    def refuse(request: bytes) -> list[bytes]:
+        if request[0] >> 5 == 2:
+            return [b"\x43" + request[1:4] + bytes(4)]
+        return [b"\x80" + request[1:4] + (0x06090030).to_bytes(4, "little")]
+
+    tiny.scripts[key] = refuse
+    with pytest.raises(SdoError, match=f"{key[0]:04X}h:{key[1]:02X} .*write refused.*06090030h") as caught:
+        drive.boot()
+    assert field in str(caught.value)
+
+
+def test_a_load_encoder_that_cannot_be_mapped(drive: Drive, tiny: Any) -> None:
+    tiny.scripts[0x1A01, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
+    with pytest.raises(SdoError, match=r"cannot be mapped.*another object in load_encoder\.source"):
+        drive.boot()
+
+
+def test_a_node_that_does_not_start(drive: Drive, tiny: Any) -> None:
+    original = tiny._nmt
+    tiny._nmt = lambda command: None if command == 1 else original(command)
+    with pytest.raises(DriveError, match=r"did not become OPERATIONAL \(it says 7Fh"):
+        drive.boot()
+
+
+def test_a_drive_left_under_power_is_switched_off_first(drive: Drive, tiny: Any) -> None:
+    tiny.state, tiny.controlword = 0x27, 0x0F
+    assert drive.boot().state is State.SWITCH_ON_DISABLED
+    assert tiny.sdo_order[0] == (0x6040, 0, 0)
+
+
+def test_a_drive_that_stays_under_power_is_refused(drive: Drive, tiny: Any) -> None:
+    tiny.state = 0x27
+    tiny._control = lambda word: None
+    with pytest.raises(DriveError, match="stays in 'operation enabled'"):
+        drive.boot()
+
+
+def test_a_drive_in_fault_boots_and_says_so(drive: Drive, tiny: Any) -> None:
+    tiny.fail()
+    assert drive.boot().state is State.FAULT
+
+
+def test_the_bit_that_forbids_rtr_is_left_to_the_drive(drive: Drive, tiny: Any) -> None:
+    tiny.values[0x1800, 1] = 0x4000_0181
+    drive.boot()
+    assert tiny.values[0x1800, 1] == 0x4000_0181
+
+
+def test_a_broken_bus_is_a_bus_error(drive: Drive, bus: Any) -> None:
+    bus.refuse = can.CanOperationError("Failed to transmit: Network is down", 100)
+    with pytest.raises(BusError, match="virtual:test-"):
+        drive.boot()
+
+
+def test_a_vendor_object_as_load_encoder(
+    bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]
+) -> None:
+    axis = build_axis(load_encoder__source={"index": 0x2100, "subindex": 0, "type": "int16"})
+    tiny.values[0x2100, 0] = -3
+    drive = Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
+    drive.boot()
+    assert tiny.values[0x1A01, 1] == 0x21000010
+    assert drive.read_positions().load_counts == -3
