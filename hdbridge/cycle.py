@@ -22,6 +22,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from hdbridge.clock import Clock
+from hdbridge.drive.fastlink import fast_link
 from hdbridge.drive.image import HALT_BIT, ProcessImage
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull
 from hdbridge.drive.monitor import NetworkMonitor
@@ -33,7 +34,7 @@ from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import BusError, InputError, SafetyStop
 from hdbridge.latency import Histogram
 
-WINDOW: Final = 0.6
+WINDOW: Final = 0.8
 """Share of the period after SYNC in which the TPDOs must arrive; the rest is for the RPDO to get through."""
 LATE: Final = 0.5
 """Share of the period by which a cycle may begin late before it is given up."""
@@ -108,7 +109,7 @@ class Cycle:
         """Whole periods without a SYNC."""
         self.stopping: list[Feedback] = []
         """Feedback of the cycles of the last quick stop, which `tick` drove by itself."""
-        self._link = link
+        self._link = fast_link(link)
         self._image = image
         self._plausibility = plausibility if plausibility is not None else Plausibility.of(image.axis)
         self._nodes = {can_id & _NODE_MASK for can_id in image.tpdo_ids}

@@ -77,7 +77,10 @@ run_uml() {
     : >"$work/stdout" >"$work/stderr"
     # A kernel's command line cannot hold a path with spaces.
     cp "$here/uml/init.sh" "$work/init.sh"
-    setsid linux.uml "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw \
+    # What the test bed measures is its own lateness, so it goes before the machine's other work where it may.
+    local first=()
+    nice -n -15 true 2>/dev/null && first=(nice -n -15)
+    setsid "${first[@]}" linux.uml "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw \
         "init=$work/init.sh" "SOCKETCAN_WORK=$work" "uml_dir=$work/" umid=uml \
         con=null con0=null,fd:1 ssl=null quiet \
         >"$work/boot.log" 2>&1 </dev/null &

@@ -1,0 +1,136 @@
+"""The link of the control cycle: the same frames and the same errors as `Link`, for less CPU time.
+
+Half of what a cycle would cost is python-can's way of copying and building messages. Two shortcuts avoid it
+and change nothing else: on SocketCAN the frames go straight through the bus's own socket; elsewhere the
+messages sent are copied by their constructor rather than by a general deep copy (which python-can's virtual
+bus makes for each receiver).
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+from typing import Any, Final
+
+import can
+from can.interfaces.socketcan import SocketcanBus
+
+from hdbridge.drive.link import Frame, Link, TransmitBufferFull
+from hdbridge.errors import BusError
+
+_FRAME: Final = struct.Struct("=IB3x8s")
+"""``struct can_frame`` of linux/can.h."""
+_FLAGS: Final = 0xE000_0000
+_EXTENDED: Final = 0x8000_0000
+_REMOTE: Final = 0x4000_0000
+_ERROR: Final = 0x2000_0000
+_IDENTIFIER: Final = 0x1FFF_FFFF
+_LARGEST: Final = 72
+"""Bytes of the largest frame that the socket may give (CAN FD)."""
+_DONTWAIT: Final = socket.MSG_DONTWAIT
+
+
+def fast_link(link: Link) -> Link:
+    """A link on the same bus and clock for use in the cycle; it shares the count of dropped frames."""
+    if type(link) is not Link:
+        return link
+    fast = _SocketLink(link) if type(link.bus) is SocketcanBus else _MessageLink(link.bus, link.clock)
+    fast.dropped = link.dropped
+    return fast
+
+
+class _DataFrame(can.Message):
+    """A message whose deep copy is cheap: it holds nothing but its data that could be shared."""
+
+    __slots__ = ()
+
+    def __deepcopy__(self, memo: object) -> can.Message:
+        return can.Message(
+            timestamp=self.timestamp,
+            arbitration_id=self.arbitration_id,
+            is_extended_id=False,
+            channel=self.channel,
+            data=bytes(self.data),
+        )
+
+
+class _MessageLink(Link):
+    """Sends messages that are cheap to copy."""
+
+    __slots__ = ()
+
+    def send(self, can_id: int, data: bytes) -> None:
+        if self._down is not None:
+            raise BusError(self._down)
+        try:
+            self._send(_DataFrame(arbitration_id=can_id, is_extended_id=False, data=data))
+        except (can.CanError, OSError) as error:
+            raise self._failure("send", error) from error
+
+
+class _SocketLink(Link):
+    """Frames through the socket of a python-can SocketCAN bus."""
+
+    __slots__ = ("_give", "_sockets", "_take")
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link.bus, link.clock)
+        sock: socket.socket = link.bus.socket  # type: ignore[attr-defined]
+        self._give = sock.send
+        self._take = sock.recv
+        self._sockets = [sock]
+
+    def send(self, can_id: int, data: bytes) -> None:
+        if self._down is not None:
+            raise BusError(self._down)
+        try:
+            self._give(_FRAME.pack(can_id, len(data), data), _DONTWAIT)
+        except BlockingIOError as error:
+            raise TransmitBufferFull(
+                f"{self.name}: the socket's send buffer is full, the frame was dropped; "
+                "check that another node acknowledges and that the bus is not overloaded"
+            ) from error
+        except OSError as error:
+            raise self._failure("send", error) from error
+
+    def recv(self, deadline_s: float) -> Frame | None:
+        if self._down is not None:
+            raise BusError(self._down)
+        while True:
+            try:
+                # Mostly there is one already, and then this is the only call into the kernel.
+                raw = self._take(_LARGEST, _DONTWAIT)
+            except BlockingIOError:
+                timeout_s = deadline_s - self.now()
+                if timeout_s <= 0.0:
+                    return None
+                self._wait(timeout_s)
+                continue
+            except OSError as error:
+                raise self._failure("receive", error) from error
+            if len(raw) != _FRAME.size:
+                self.dropped.fd += 1
+                continue
+            can_id, length, data = _FRAME.unpack(raw)
+            if can_id & _FLAGS:
+                self._drop(_refused(can_id))
+                continue
+            return Frame(can_id, data[:length], self.now())
+
+    def _wait(self, timeout_s: float) -> None:
+        try:
+            select.select(self._sockets, (), (), timeout_s)
+        except (OSError, ValueError) as error:
+            # ValueError: the socket has been closed under us.
+            raise self._failure("receive", OSError(*error.args)) from error
+
+
+def _refused(can_id: int) -> Any:
+    """A frame that CANopen does not use, as a message, for the base class to count."""
+    return can.Message(
+        arbitration_id=can_id & _IDENTIFIER,
+        is_extended_id=bool(can_id & _EXTENDED),
+        is_remote_frame=bool(can_id & _REMOTE),
+        is_error_frame=bool(can_id & _ERROR),
+    )

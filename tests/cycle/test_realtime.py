@@ -1,0 +1,46 @@
+"""Preparing for real time gives everything back."""
+
+from __future__ import annotations
+
+import gc
+import os
+
+import pytest
+
+from hdbridge.realtime import prepare_realtime
+
+
+def state() -> tuple[int, int, bool, int]:
+    return (
+        os.sched_getscheduler(0),
+        os.sched_getparam(0).sched_priority,
+        gc.isenabled(),
+        gc.get_freeze_count(),
+    )
+
+
+def test_it_reports_what_it_got_and_puts_everything_back() -> None:
+    before = state()
+    with prepare_realtime(priority=1) as realtime:
+        assert not gc.isenabled()
+        assert gc.get_freeze_count() > 0
+        assert (os.sched_getscheduler(0) == os.SCHED_FIFO) == (realtime.scheduling is None)
+        assert "garbage collection off" in str(realtime)
+    assert state() == before
+
+
+def test_it_puts_everything_back_after_an_error() -> None:
+    before = state()
+    with pytest.raises(RuntimeError), prepare_realtime(priority=1):
+        raise RuntimeError
+    assert state() == before
+
+
+def test_what_is_not_permitted_is_reported_and_not_insisted_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(pid: int, policy: int, parameter: os.sched_param) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with prepare_realtime() as realtime:
+        assert realtime.scheduling == "Operation not permitted"
+        assert "no real-time priority" in str(realtime)

@@ -1,0 +1,353 @@
+"""What one control cycle costs in CPU time, beside a bare exchange of the same frames and beside canopen.
+
+    python tools/bench/cycle.py [--interface virtual|socketcan] [--channel vcan0] [--json FILE]
+
+One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
+
+  bare         python-can alone: SYNC, two TPDOs, RPDO (and the master's heartbeat as often as it is due),
+               built and taken apart with struct; nothing is checked
+  cycle        `hdbridge.cycle.Cycle` with the whole fault table, target held
+  compensated  the same with the compensation of the article's model in every cycle
+  canopen      the same loop on canopen's PDO objects (no compensation, nothing is checked)
+
+and prints medians over the blocks, and their ratios to the bare exchange.
+
+On the virtual bus the answering node lives in the same thread; what it costs is measured in the same blocks
+and subtracted from each alike, and nobody sleeps. On SocketCAN it is a process of its own, and every variant
+sleeps to the same 4 ms deadlines.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import statistics
+import struct
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+from can.interfaces.virtual import VirtualBus
+
+from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.compensation import Compensation, CompensationLimits
+from hdbridge.cycle import Cycle, Feedback
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Supervision
+from hdbridge.errors import SafetyStop
+from hdbridge.model import TransmissionModel
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+STATUS_ENABLED = 0x1237
+ENABLE = 0x0F
+TPDO1, TPDO2, RPDO1 = struct.Struct("<Hih"), struct.Struct("<ii"), struct.Struct("<Hi")
+GOAL = 1.25
+
+
+class NeverSleeping:
+    """The real clock without the waiting: every deadline is taken for reached."""
+
+    now = staticmethod(time.monotonic)
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Return at once."""
+
+
+def answers(node_id: int) -> tuple[can.Message, can.Message]:
+    """The two TPDOs of an enabled drive that stands at zero."""
+    return (
+        can.Message(
+            arbitration_id=0x180 + node_id, is_extended_id=False, data=TPDO1.pack(STATUS_ENABLED, 0, 0)
+        ),
+        can.Message(arbitration_id=0x280 + node_id, is_extended_id=False, data=TPDO2.pack(0, 0)),
+    )
+
+
+class AnsweringBus(VirtualBus):
+    """The master's end of a virtual bus with a second node on it that answers SYNC at once."""
+
+    def __init__(self, node_id: int) -> None:
+        super().__init__(channel=self)
+        self.listener = VirtualBus(channel=self)
+        self.replies = answers(node_id)
+        self.heartbeat = can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
+        self.count = 0
+
+    def answer(self) -> None:
+        self.count += 1
+        if self.count % 12 == 0:
+            self.queue.put(self.heartbeat)
+        for reply in self.replies:
+            self.queue.put(reply)
+        self.listener.queue.queue.clear()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        super().send(msg, timeout)
+        if msg.arbitration_id == 0x80:
+            self.answer()
+
+    def shutdown(self) -> None:
+        self.listener.shutdown()
+        super().shutdown()
+
+
+def respond(channel: str, node_id: int, ready: Any) -> None:
+    """Process of its own: answers SYNC on SocketCAN until it is terminated; heartbeats as the drive's."""
+    replies = answers(node_id)
+    heartbeat = can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
+    filters = [{"can_id": 0x80, "can_mask": 0x7FF, "extended": False}]
+    with can.Bus(interface="socketcan", channel=channel, can_filters=filters, ignore_config=True) as bus:
+        ready.set()
+        count = 0
+        while True:
+            if bus.recv(1.0) is not None:
+                for reply in replies:
+                    bus.send(reply)
+                count += 1
+                if count % 12 == 0:
+                    bus.send(heartbeat)
+
+
+class Variants:
+    """The loops under test: each call is one cycle."""
+
+    def __init__(self, bus: can.BusABC, axis: AxisConfig, model: TransmissionModel, sleeping: bool) -> None:
+        self.bus, self.axis = bus, axis
+        self.clock: Clock = MonotonicClock() if sleeping else NeverSleeping()
+        self.period_s = axis.drive.cycle_s
+        self.heartbeat_s = axis.drive.heartbeat_ms / 2e3
+        self.heartbeat_due_s = 0.0
+        self.deadline_s = 0.0
+        self.compensation = Compensation(model, CompensationLimits(), self.period_s)
+        self.compensation.engage()
+        self.image = ProcessImage(axis)
+        self.cycle = Cycle(Link(bus, self.clock), self.clock, self.image, Supervision(), self.period_s)
+        self.network, self.node = self._canopen(axis.drive.node_id)
+
+    def start(self) -> None:
+        """Before a block: the deadlines begin anew."""
+        while self.bus.recv(0.0) is not None:
+            pass
+        self.deadline_s = self.clock.now()
+        # The answering process may need a moment until it is warm.
+        for _ in range(20):
+            self.cycle.restart()
+            self.cycle.supervision.reset()
+            with suppress(SafetyStop):
+                if self.cycle.tick().fresh:
+                    break
+        self.image.power.go(State.OPERATION_ENABLED)
+
+    def _wait(self) -> bool:
+        """Sleep to the next deadline; whether the master's heartbeat is due."""
+        self.deadline_s += self.period_s
+        self.clock.sleep_until(self.deadline_s)
+        now = self.clock.now()
+        if now < self.heartbeat_due_s:
+            return False
+        self.heartbeat_due_s = now + self.heartbeat_s
+        return True
+
+    def bare(self) -> None:
+        due = self._wait()
+        bus, node_id = self.bus, 1
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        seen = 0
+        while seen < 2:
+            message = bus.recv(0.1)
+            assert message is not None
+            if message.arbitration_id == 0x180 + node_id:
+                TPDO1.unpack(message.data)
+                seen += 1
+            elif message.arbitration_id == 0x280 + node_id:
+                TPDO2.unpack(message.data)
+                seen += 1
+        data = RPDO1.pack(ENABLE, 0)
+        bus.send(can.Message(arbitration_id=0x200 + node_id, is_extended_id=False, data=data))
+        if due:
+            bus.send(can.Message(arbitration_id=0x77F, is_extended_id=False, data=b"\x05"))
+
+    def plain(self) -> None:
+        self.cycle.tick(0)
+
+    def compensated(self) -> None:
+        self.cycle.tick(self._command)
+
+    def _command(self, feedback: Feedback) -> int:
+        # A slow sine of 2 deg at the load: in steady motion with a reversal now and then.
+        load_deg = 2.0 * math.sin(feedback.time_s)
+        return self.image.target_counts_for(self.compensation.command(load_deg))
+
+    @staticmethod
+    def _canopen(node_id: int) -> tuple[canopen.Network, canopen.RemoteNode]:
+        dictionary = canopen.ObjectDictionary()
+        kinds = canopen.objectdictionary.datatypes
+        for index, name, kind in (
+            (0x6041, "status", kinds.UNSIGNED16),
+            (0x6064, "actual", kinds.INTEGER32),
+            (0x6077, "torque", kinds.INTEGER16),
+            (0x60E4, "load", kinds.INTEGER32),
+            (0x6062, "demand", kinds.INTEGER32),
+            (0x6040, "control", kinds.UNSIGNED16),
+            (0x607A, "target", kinds.INTEGER32),
+        ):
+            variable = canopen.objectdictionary.ODVariable(name, index)
+            variable.data_type = kind
+            variable.pdo_mappable = True
+            dictionary.add_object(variable)
+        for base, of in ((0x1400, "rpdo"), (0x1600, "rpdo map"), (0x1800, "tpdo"), (0x1A00, "tpdo map")):
+            for number in range(2):
+                record = canopen.objectdictionary.ODRecord(f"{of} {number + 1}", base + number)
+                for sub in range(9):
+                    member = canopen.objectdictionary.ODVariable(f"{sub}", base + number, sub)
+                    member.data_type = kinds.UNSIGNED32
+                    record.add_member(member)
+                dictionary.add_object(record)
+        network = canopen.Network()
+        node = network.add_node(node_id, dictionary)
+        for pdo, cob_id, names in (
+            (node.tpdo[1], 0x180 + node_id, ("status", "actual", "torque")),
+            (node.tpdo[2], 0x280 + node_id, ("load", "demand")),
+            (node.rpdo[1], 0x200 + node_id, ("control", "target")),
+        ):
+            pdo.clear()
+            for name in names:
+                pdo.add_variable(name)
+            pdo.cob_id, pdo.enabled = cob_id, True
+            pdo.subscribe()
+        return network, node
+
+    def with_canopen(self) -> None:
+        due = self._wait()
+        network, node, bus = self.network, self.node, self.bus
+        network.bus = bus
+        network.sync.transmit()
+        seen = 0
+        while seen < 2:
+            message = bus.recv(0.1)
+            assert message is not None
+            network.notify(message.arbitration_id, message.data, message.timestamp)
+            seen += message.arbitration_id in (0x180 + node.id, 0x280 + node.id)
+        for pdo, names in (
+            (node.tpdo[1], ("status", "actual", "torque")),
+            (node.tpdo[2], ("load", "demand")),
+        ):
+            for name in names:
+                pdo[name].raw  # noqa: B018 - reading is what is measured
+        node.rpdo[1]["control"].raw = ENABLE
+        node.rpdo[1]["target"].raw = 0
+        node.rpdo[1].transmit()
+        if due:
+            network.send_message(0x77F, b"\x05")
+
+
+def block_us(work: Callable[[], object], cycles: int) -> float:
+    """CPU time of this thread per call, us."""
+    begin = time.thread_time()
+    for _ in range(cycles):
+        work()
+    return 1e6 * (time.thread_time() - begin) / cycles
+
+
+def run(
+    variants: Variants, blocks: int, cycles: int, responder: Callable[[], object] | None
+) -> dict[str, float]:
+    """Median CPU time per cycle of each variant, us, without what the answering node costs."""
+    loops: dict[str, Callable[[], object]] = {
+        "bare": variants.bare,
+        "cycle": variants.plain,
+        "compensated": variants.compensated,
+        "canopen": variants.with_canopen,
+    }
+    times: dict[str, list[float]] = {name: [] for name in loops}
+    costs: list[float] = []
+    for _ in range(blocks):
+        for name, loop in loops.items():
+            variants.start()
+            for _ in range(20):
+                loop()
+            times[name].append(block_us(loop, cycles))
+        if responder is not None:
+            costs.append(block_us(responder, cycles))
+    cost = statistics.median(costs) if costs else 0.0
+    result = {name: statistics.median(values) - cost for name, values in times.items()}
+    result["responder"] = cost
+    return result
+
+
+def report(result: dict[str, float], where: str) -> str:
+    bare = result["bare"]
+    lines = [f"CPU time of one cycle on {where}, medians:", ""]
+    names = {
+        "bare": "bare python-can exchange",
+        "cycle": "hdbridge cycle",
+        "compensated": "hdbridge cycle, compensated",
+        "canopen": "canopen's PDO objects",
+    }
+    for name, label in names.items():
+        lines.append(f"  {label:<30} {result[name]:>8.1f} us   {result[name] / bare:>6.2f} x")
+    ratio = result["compensated"] / bare
+    verdict = "reached" if ratio <= GOAL else "missed"
+    lines += ["", f"  goal: compensated at most {GOAL} x bare: {verdict} ({ratio:.2f} x)"]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--interface", choices=("virtual", "socketcan"), default="virtual")
+    parser.add_argument("--channel", default="vcan0", help="of socketcan")
+    parser.add_argument("--profile", type=Path, default=PROFILE)
+    parser.add_argument("--blocks", type=int, default=None, help="blocks per variant (15; SocketCAN: 5)")
+    parser.add_argument("--cycles", type=int, default=None, help="cycles per block (2000; SocketCAN: 250)")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    axis = AxisConfig.load(options.profile)
+    model = TransmissionModel.load(options.profile / "model.yaml")
+
+    if options.interface == "virtual":
+        bus = AnsweringBus(axis.drive.node_id)
+        with bus:
+            variants = Variants(bus, axis, model, sleeping=False)
+            result = run(variants, options.blocks or 15, options.cycles or 2000, bus.answer)
+            bus.queue.queue.clear()
+        where = "the virtual bus"
+    else:
+        ready = multiprocessing.Event()
+        process = multiprocessing.Process(
+            target=respond, args=(options.channel, axis.drive.node_id, ready), daemon=True
+        )
+        process.start()
+        try:
+            if not ready.wait(20.0):
+                print("the answering process did not start", file=sys.stderr)
+                return 3
+            with can.Bus(interface="socketcan", channel=options.channel, ignore_config=True) as bus:
+                variants = Variants(bus, axis, model, sleeping=True)
+                result = run(variants, options.blocks or 5, options.cycles or 250, None)
+        finally:
+            process.terminate()
+            process.join()
+        where = f"SocketCAN ({options.channel})"
+
+    print(report(result, where))
+    if options.json is not None:
+        options.json.write_text(json.dumps({"where": where, "unit": "us", **result}, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
