@@ -7,10 +7,11 @@ to find out what is wrong with it, or to keep a column of text.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
-import re
+import math
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -40,25 +41,25 @@ def read_columns(path: Path, required: Sequence[str], numeric: Collection[str]) 
     Other columns are kept: as numbers where they are (an empty cell is NaN), else as text. InputError names
     the file, the line (the header is line 1) and the column.
     """
-    text = _text(path)
-    reader = csv.reader(io.StringIO(text, newline=""))
+    content = _content(path)
+    reader = csv.reader(_lines(content))
     names, header_lines = _header(path, reader)
     _check_header(path, header_lines, names, required)
     finite = {*required, *numeric}
-    columns = _fast(text, header_lines, names)
+    columns = _fast(content, header_lines, names)
     if columns is None:
         columns = _slow(path, reader, names, finite)
     for name in names:
         if name in finite:
-            _check_finite(path, text, header_lines, name, columns[name])
+            _check_finite(path, content, header_lines, name, columns[name])
     return columns
 
 
 def line_of_row(path: Path, row: int) -> int:
     """The line of the file (the header is line 1) on which a row of data (the first is row 0) stands."""
-    text = _text(path)
-    _, header_lines = _header(path, csv.reader(io.StringIO(text, newline="")))
-    return _line_of_row(text, header_lines, row)
+    content = _content(path)
+    _, header_lines = _header(path, csv.reader(_lines(content)))
+    return _line_of_row(content, header_lines, row)
 
 
 def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
@@ -89,7 +90,8 @@ def _cell(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if quoted else text
 
 
-def _text(path: Path) -> str:
+def _content(path: Path) -> bytes:
+    """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -106,11 +108,21 @@ def _text(path: Path) -> str:
         raise InputError(f"{path}: not gzip data; expected a compressed file, or a name without .gz")
     if len(content) > MAXIMUM_BYTES:
         raise InputError(f"{path}: more than {MAXIMUM_BYTES >> 30} GiB; split the record")
+    content = content.removeprefix(codecs.BOM_UTF8)
     try:
-        return content.decode("utf-8-sig")
+        content.decode()
     except UnicodeDecodeError as problem:
         line = content.count(b"\n", 0, problem.start) + 1
         raise InputError(f"{path}:{line}: not UTF-8 text; expected CSV in UTF-8") from None
+    return content
+
+
+def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
+    """The lines of the file, ends and all, but for the first few."""
+    lines = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8", newline="")
+    for _ in range(skipped):
+        lines.readline()
+    return lines
 
 
 def _header(path: Path, reader: Any) -> tuple[list[str], int]:
@@ -141,17 +153,14 @@ def _check_header(path: Path, line: int, names: Sequence[str], required: Sequenc
             raise InputError(f"{where}: column '{name}' stands twice")
 
 
-def _fast(text: str, header_lines: int, names: Sequence[str]) -> dict[str, Column] | None:
+def _fast(content: bytes, header_lines: int, names: Sequence[str]) -> dict[str, Column] | None:
     """All columns by numpy's parser; None where it finds something that is not a number, or a ragged row."""
-    source = io.StringIO(text)
-    for _ in range(header_lines):
-        source.readline()
-    body = source.tell()
-    if not source.readline().strip():
+    if not _lines(content, header_lines).readline().strip():
         return None
-    source.seek(body)
     try:
-        table = np.loadtxt(source, delimiter=",", comments=None, quotechar='"', ndmin=2)
+        table = np.loadtxt(
+            _lines(content, header_lines), delimiter=",", comments=None, quotechar='"', ndmin=2
+        )
     except ValueError:
         return None
     if table.shape[1] != len(names):
@@ -161,18 +170,28 @@ def _fast(text: str, header_lines: int, names: Sequence[str]) -> dict[str, Colum
 
 def _slow(path: Path, reader: Any, names: Sequence[str], finite: Collection[str]) -> dict[str, Column]:
     """All columns, row by row; InputError at the first row that is wrong."""
-    numeric = [(place, name) for place, name in enumerate(names) if name in finite]
     rows: list[list[str]] = []
+    lines: list[int] = []
     for row in _rows(path, reader):
-        where = f"{path}:{reader.line_num}"
         if len(row) != len(names):
-            raise InputError(f"{where}: {len(row)} values; expected {len(names)}, one for each column")
-        for place, name in numeric:
-            if not _is_number(row[place]):
-                what = f"'{row[place].strip()}' is not a number" if row[place].strip() else "no value"
-                raise InputError(f"{where}: {name}: {what}; expected a number")
+            raise InputError(
+                f"{path}:{reader.line_num}: {len(row)} values; expected {len(names)}, one for each column"
+            )
         rows.append(row)
-    return {name: _column([row[place] for row in rows]) for place, name in enumerate(names)}
+        lines.append(reader.line_num)
+    cells = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
+    columns = {name: _column(cells[name], blanks=name not in finite) for name in names}
+    wrong = [
+        (_first_wrong(cells[name]), name)
+        for name in names
+        if name in finite and columns[name].dtype.kind != "f"
+    ]
+    if wrong:
+        row_number, name = min(wrong)
+        cell = cells[name][row_number].strip()
+        what = f"'{cell}' is not a number" if cell else "no value"
+        raise InputError(f"{path}:{lines[row_number]}: {name}: {what}; expected a number")
+    return columns
 
 
 def _rows(path: Path, reader: Any) -> Iterator[list[str]]:
@@ -185,32 +204,35 @@ def _rows(path: Path, reader: Any) -> Iterator[list[str]]:
         raise InputError(f"{path}:{reader.line_num}: not CSV: {problem}") from None
 
 
-def _column(cells: list[str]) -> Column:
-    if all(_is_number(cell) or not cell.strip() for cell in cells):
-        return np.array([float(cell) if cell.strip() else np.nan for cell in cells], dtype=np.float64)
-    return np.array(cells, dtype=np.str_)
-
-
-_NUMBER = re.compile(r"\s*[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE | re.ASCII)
+def _column(cells: Sequence[str], *, blanks: bool) -> Column:
+    """Numbers, if all cells are (blank ones are NaN, if that is allowed), else text."""
+    try:
+        numbers = [float(cell) if cell or not blanks else math.nan for cell in cells]
+    except ValueError:
+        return np.array(cells, dtype=np.str_)
+    if any("_" in cell for cell in cells):  # Python's float takes 1_000; CSV has no such numbers
+        return np.array(cells, dtype=np.str_)
+    return np.array(numbers, dtype=np.float64)
 
 
 def _is_number(cell: str) -> bool:
-    return _NUMBER.fullmatch(cell) is not None
+    return _column([cell], blanks=False).dtype.kind == "f"
 
 
-def _check_finite(path: Path, text: str, header_lines: int, name: str, column: FloatArray) -> None:
+def _first_wrong(cells: Sequence[str]) -> int:
+    return next(row for row, cell in enumerate(cells) if not _is_number(cell))
+
+
+def _check_finite(path: Path, content: bytes, header_lines: int, name: str, column: FloatArray) -> None:
     wrong = np.flatnonzero(~np.isfinite(column))
     if len(wrong):
-        line = _line_of_row(text, header_lines, int(wrong[0]))
+        line = _line_of_row(content, header_lines, int(wrong[0]))
         raise InputError(f"{path}:{line}: {name}: {column[wrong[0]]}; expected a finite number")
 
 
-def _line_of_row(text: str, header_lines: int, row: int) -> int:
-    source = io.StringIO(text)
-    for _ in range(header_lines):
-        source.readline()
-    for line, content in enumerate(source, header_lines + 1):
-        row -= bool(content.strip())
+def _line_of_row(content: bytes, header_lines: int, row: int) -> int:
+    for line, text in enumerate(_lines(content, header_lines), header_lines + 1):
+        row -= bool(text.strip())
         if row < 0:
             return line
     return header_lines
