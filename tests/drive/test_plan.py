@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.drive import load_eds, plan
+from hdbridge.drive import plan
 from hdbridge.errors import InputError
 
 
@@ -122,4 +122,3 @@ def test_a_value_that_its_object_cannot_hold(build_axis: Callable[..., AxisConfi
 def test_the_bundled_eds_is_read_without_a_word(tiny: Any, caplog: pytest.LogCaptureFixture) -> None:
     assert 0x60E4 in tiny.od
     assert caplog.records == []
-    assert load_eds is not None
