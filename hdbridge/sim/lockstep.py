@@ -1,0 +1,176 @@
+"""A bench without real time: master and simulated drives in one thread, on one virtual clock.
+
+The master talks through ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting is what lets
+the drives run: a frame it sends is answered before ``send`` returns, and time passes only while it waits,
+from one event of a drive to the next. So nothing sleeps, nothing races, and the same run gives the same
+frames. The frames themselves are real: python-can messages over python-can ``virtual`` buses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, Protocol
+from uuid import uuid4
+
+import can
+
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.motion import Machine as AnyMachine
+from hdbridge.sim.nameplate import Nameplate
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+
+LONGEST_WAIT_S: Final = 3600.0
+"""Virtual time after which a ``recv`` without a time-out gives up."""
+
+
+class Node(Protocol):
+    """A bus participant that runs when it is polled."""
+
+    def poll(self, now_s: float) -> None:
+        """Take in what has come, and do what is due until ``now_s``."""
+        ...
+
+    def next_event_s(self) -> float:
+        """When it must be polled at the latest."""
+        ...
+
+
+class VirtualClock:
+    """A ``hdbridge.clock.Clock`` that moves when somebody waits on it, and lets the nodes run on the way."""
+
+    def __init__(self, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+        self.nodes: list[Node] = []
+
+    def now(self) -> float:
+        """Virtual seconds."""
+        return self._now_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Advance to ``deadline_s``, through every event of a node that comes before it."""
+        while self.step(deadline_s):
+            pass
+
+    def step(self, deadline_s: float) -> bool:
+        """Advance to the next event of a node or to ``deadline_s``, and let the nodes run.
+
+        False, and nothing happened but the clock's advance, when no event comes before the deadline.
+        """
+        event_s = min([node.next_event_s() for node in self.nodes], default=deadline_s)
+        if event_s > deadline_s:
+            self._now_s = max(self._now_s, deadline_s)
+            return False
+        self._now_s = max(self._now_s, event_s)
+        for node in self.nodes:
+            node.poll(self._now_s)
+        return True
+
+
+class LockstepBus(can.BusABC):
+    """The master's end of a virtual channel whose other participants run in ``clock.nodes``.
+
+    ``recv`` is overridden as a whole, because that of the base class measures its time-out by the wall clock.
+    """
+
+    def __init__(self, channel: str, clock: VirtualClock, **kwargs: Any) -> None:
+        self._inner = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+        self._clock = clock
+        super().__init__(channel=channel, **kwargs)
+        self.channel_info = f"lockstep on virtual channel {channel}"
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send, and let every node take it in and answer."""
+        self._inner.send(msg, timeout)
+        now_s = self._clock.now()
+        for node in self._clock.nodes:
+            node.poll(now_s)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; while there is none, time passes up to ``timeout`` virtual seconds.
+
+        Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame where no time-out is given.
+        """
+        deadline_s = self._clock.now() + (LONGEST_WAIT_S if timeout is None else timeout)
+        while True:
+            message = self._take()
+            if message is not None:
+                return message
+            if not self._clock.step(deadline_s):
+                break
+        for node in self._clock.nodes:  # somebody else on the channel may have sent to them
+            node.poll(deadline_s)
+        message = self._take()
+        if message is None and timeout is None:
+            raise can.CanOperationError(f"no frame in {LONGEST_WAIT_S:g} s of virtual time")
+        return message
+
+    def _take(self) -> can.Message | None:
+        while (message := self._inner.recv(0)) is not None:
+            if self._filters is None or self._matches_filters(message):
+                message.timestamp = self._clock.now()
+                return message
+        return None
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return self.recv(timeout), True
+
+    def shutdown(self) -> None:
+        """Leave the channel."""
+        super().shutdown()
+        self._inner.shutdown()
+
+
+@contextmanager
+def lockstep_bench(
+    machine: AnyMachine,
+    eds_path: Path,
+    node_id: int = 1,
+    channel: str | None = None,
+    nameplate: Nameplate | None = None,
+    others: Sequence[Node] = (),
+) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
+    """A simulated drive that moves ``machine``, and the master's bus and clock to it.
+
+    ``channel`` names the python-can virtual channel (by default one of its own), so that a test may listen
+    or interfere there. ``others`` are further nodes to be polled.
+    """
+    channel = channel or f"hdbridge-{uuid4()}"
+    clock = VirtualClock()
+    with (
+        can.Bus(interface="virtual", channel=channel, ignore_config=True) as node_bus,
+        LockstepBus(channel, clock) as bus,
+    ):
+        node = SimulatedDrive(node_bus, machine, eds_path, node_id, clock, nameplate)
+        clock.nodes += [node, *others]
+        yield bus, clock, node
+
+
+@contextmanager
+def simulated_bench(
+    truth: Truth | Path | str,
+    eds_path: Path,
+    node_id: int = 1,
+    seed: int = 0,
+    channel: str | None = None,
+) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
+    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames."""
+    known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
+    with lockstep_bench(Machine(known, seed), eds_path, node_id, channel, nameplate_of(known)) as bench:
+        yield bench
+
+
+def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
+    """What a drive that controls this axis says of itself."""
+    ratio = Fraction(truth.gear.ratio).limit_denominator(10_000)
+    return Nameplate(
+        serial=serial,
+        motor_counts_per_turn=truth.motor.encoder.counts_per_turn,
+        load_counts_per_turn=truth.load_.encoder.counts_per_turn,
+        gear_motor_turns=ratio.numerator,
+        gear_load_turns=ratio.denominator,
+        rated_torque_mnm=round(1000.0 * truth.motor.rated_torque_nm),
+    )

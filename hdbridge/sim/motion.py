@@ -1,0 +1,144 @@
+"""Where the simulated drive's axis is and is told to be, in the plant's counts and in the user's.
+
+The plant counts without bound and knows no home; the user has int32 positions with polarity and home offset.
+Everything that moves is computed in the plant's counts; int32 appears only where objects are read or written.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Protocol
+
+from hdbridge.sim.dictionary import Dictionary
+
+_HALF: Final = 1 << 31
+_MASK: Final = (1 << 32) - 1
+
+
+def wrap_int32(value: int) -> int:
+    """``value`` modulo 2**32, in the range of an int32."""
+    return ((value + _HALF) & _MASK) - _HALF
+
+
+class Machine(Protocol):
+    """The plant as the firmware sees it: servo loops that follow a demand, and encoders."""
+
+    dt_s: float
+    torque_limit_permille: float
+
+    @property
+    def motor_counts(self) -> int: ...
+    @property
+    def load_counts(self) -> int: ...
+    @property
+    def velocity_counts_s(self) -> float: ...
+    @property
+    def torque_permille(self) -> int: ...
+    @property
+    def temperature_c(self) -> float: ...
+    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+        """Servo on: the demand moves linearly from start to end during ``substeps``."""
+        ...
+
+    def coast(self, substeps: int, braked: bool) -> None:
+        """Power stage off, holding brake open or closed."""
+        ...
+
+
+class Motion:
+    """Demand and actual position of the axis, shared by the firmware and its operating modes.
+
+    ``demand_counts`` and ``velocity_counts_s`` are of the demand, in the plant's coordinates;
+    ``motor_counts`` and ``load_counts`` are the encoders as last sampled. ``limited`` becomes true when a
+    limit cut a target.
+    """
+
+    def __init__(self, dictionary: Dictionary, machine: Machine) -> None:
+        self.dictionary = dictionary
+        self.machine = machine
+        self.home_counts = 0
+        self.limited = False
+        self.demand_counts = float(machine.motor_counts)
+        self.velocity_counts_s = 0.0
+        self.motor_counts = machine.motor_counts
+        self.load_counts = machine.load_counts
+        self.load_velocity_counts_s = 0.0
+        self.load_jump_counts = 0
+        self._owed_s = 0.0
+        self._polarity = dictionary[0x607E, 0]
+        self._min = dictionary[0x607D, 1]
+        self._max = dictionary[0x607D, 2]
+        self._motor_resolution = dictionary[0x608F, 1]
+        self._max_speed = dictionary[0x6080, 0]
+        self._target = dictionary[0x607A, 0]
+
+    @property
+    def sign(self) -> int:
+        """-1 where object 607Eh reverses positions, else 1."""
+        return -1 if self._polarity.number() & 0x80 else 1
+
+    def user(self, counts: float) -> int:
+        """The user's (unbounded) position of a plant position."""
+        return self.sign * round(counts) + self.home_counts
+
+    def goal(self, target: int) -> float:
+        """The plant position of a user's int32 target: the one nearest to the demand, within the limits.
+
+        An axis that already is beyond a software limit may stay where it is and come back; it is not
+        dragged inside.
+        """
+        here = self.user(self.demand_counts)
+        distance = wrap_int32(target - here)
+        low, high = self._min.number(), self._max.number()
+        if low < high and (low > -_HALF or high < _HALF - 1):
+            here32 = wrap_int32(here)
+            reach = here32 + distance
+            allowed = min(max(reach, min(low, here32)), max(high, here32))
+            if allowed != reach:
+                self.limited = True
+                distance = allowed - here32
+        return self.sign * (here + distance - self.home_counts)
+
+    def max_speed_counts_s(self) -> float:
+        """Object 6080h in counts/s."""
+        return self._max_speed.number() * self._motor_resolution.number() / 60.0
+
+    def preload_target(self) -> None:
+        """Make the demand the target, so that a mode that begins does not move."""
+        self._target.value = wrap_int32(self.user(self.demand_counts))
+
+    def take_actual_as_demand(self) -> None:
+        """Demand rest where the axis is."""
+        self.demand_counts = float(self.motor_counts)
+        self.velocity_counts_s = 0.0
+
+    def follow(self, demand_counts: float, velocity_counts_s: float, period_s: float) -> None:
+        """Move the demand, and the plant after it, for one period."""
+        substeps = self._substeps(period_s)
+        if substeps:
+            self.machine.follow(self.demand_counts, demand_counts, substeps)
+        self.demand_counts = demand_counts
+        self.velocity_counts_s = velocity_counts_s
+        self._sample(period_s)
+
+    def coast(self, period_s: float) -> None:
+        """Let the plant go for one period; the holding brake closes at rest."""
+        substeps = self._substeps(period_s)
+        at_rest = abs(self.machine.velocity_counts_s) * period_s < 1.0
+        if substeps:
+            self.machine.coast(substeps, at_rest)
+        self._sample(period_s)
+        self.take_actual_as_demand()
+
+    def _substeps(self, period_s: float) -> int:
+        """Whole substeps of the plant in this period; what is left over is kept for the next."""
+        dt_s = self.machine.dt_s
+        self._owed_s += period_s
+        substeps = int(self._owed_s / dt_s + 1e-6)
+        self._owed_s -= substeps * dt_s
+        return substeps
+
+    def _sample(self, period_s: float) -> None:
+        machine = self.machine
+        self.motor_counts = machine.motor_counts
+        before, self.load_counts = self.load_counts, machine.load_counts + self.load_jump_counts
+        self.load_velocity_counts_s = (self.load_counts - before) / period_s

@@ -1,0 +1,35 @@
+"""What distinguishes one simulated drive from the next: serial number, encoders, gear, rated torque."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.sim.dictionary import Dictionary
+
+
+@dataclass(frozen=True)
+class Nameplate:
+    """Values of the read-only objects 1018h:04, 6076h, 608Fh, 6091h, 6092h, 60E6h and 60E9h."""
+
+    serial: int = 1
+    motor_counts_per_turn: int = 8000
+    load_counts_per_turn: int = 2_880_000
+    gear_motor_turns: int = 50
+    gear_load_turns: int = 1
+    rated_torque_mnm: int = 320
+
+    def engrave(self, dictionary: Dictionary) -> None:
+        """Make these the values, and the defaults to which a reset returns."""
+        feed = self.motor_counts_per_turn * self.gear_motor_turns
+        for key, value in {
+            (0x1018, 4): self.serial,
+            (0x6076, 0): self.rated_torque_mnm,
+            (0x608F, 1): self.motor_counts_per_turn,
+            (0x6091, 1): self.gear_motor_turns,
+            (0x6091, 2): self.gear_load_turns,
+            (0x6092, 1): feed,
+            (0x6092, 2): self.gear_load_turns,
+            (0x60E6, 1): self.load_counts_per_turn,
+            (0x60E9, 1): self.load_counts_per_turn,
+        }.items():
+            dictionary[key].default = dictionary[key].value = value

@@ -1,0 +1,343 @@
+"""The simulated drive as a CANopen node: NMT, heartbeats, SYNC, PDOs, SDO and EMCY around the firmware.
+
+Upon SYNC the node first sends its synchronous TPDOs with the values of that moment, then applies the
+synchronous RPDOs that came since the last one, then runs its axis for exactly one period of object 60C2h.
+When SYNC stays away for one and a half periods, and before the first, the axis runs on the clock instead: a
+drive without a master stops by itself. Single-threaded: everything happens inside ``poll``.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+import can
+
+from hdbridge.clock import Clock
+from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.sim.emergency import Emergency, ErrorCode
+from hdbridge.sim.faults import Faults, Outgoing
+from hdbridge.sim.firmware import Firmware
+from hdbridge.sim.motion import Machine
+from hdbridge.sim.nameplate import Nameplate
+from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
+from hdbridge.sim.sdo_server import SdoServer
+
+PDO_COUNT: Final = 4
+LONGEST_CATCH_UP_S: Final = 1.0
+"""A node that was not polled for longer than this does not make up for it."""
+
+_NEVER: Final = float("inf")
+_HEARTBEAT: Final = 0x700
+
+
+class Nmt(IntEnum):
+    """NMT states as a heartbeat tells them."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+class NmtCommand(IntEnum):
+    """NMT commands."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+_AFTER_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
+"""Object 1029h:01: the NMT state after a communication error; 1 changes nothing."""
+
+
+class SimulatedDrive:
+    """A CiA-402 drive on ``bus``, moving ``machine``.
+
+    ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
+    the time of start; ``nameplate`` tells one drive from the next.
+    ``poll`` must be called when frames may have come and at ``next_event_s``.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        machine: Machine,
+        eds_path: Path,
+        node_id: int,
+        clock: Clock,
+        nameplate: Nameplate | None = None,
+    ) -> None:
+        self.bus = bus
+        self.node_id = node_id
+        self.faults = Faults()
+        self.dictionary = Dictionary(Path(eds_path), node_id)
+        (nameplate or Nameplate()).engrave(self.dictionary)
+        self.dictionary.restore()
+        self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
+        self.firmware = Firmware(self.dictionary, machine, self.emergency)
+        self._sdo = SdoServer(self.dictionary)
+        numbers = range(1, PDO_COUNT + 1)
+        self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
+        self._rpdos = [ReceivePdo(self.dictionary, number, self._route) for number in numbers]
+        self._guard()
+        self._now_s = clock.now()
+        self._begin()
+
+    def _guard(self) -> None:
+        entry = self.dictionary
+        entry[0x1005, 0].guard = _check_sync_id
+        entry[0x1005, 0].follower = lambda _: self._route()
+        entry[0x1016, 1].guard = _check_consumer
+        entry[0x1016, 1].follower = lambda _: self._watch_heartbeat()
+        entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
+        for sub in (1, 2):
+            entry[0x60C2, sub].follower = lambda _: self._take_period()
+
+    def _begin(self) -> None:
+        """Start from the dictionary as it stands, with a boot-up message."""
+        self.nmt = Nmt.INITIALISING
+        self._boot_up_pending = True
+        self._sdo.reset()
+        self._take_period()
+        self._run_due_s = self._now_s + self._period_s
+        for pdo in (*self._tpdos, *self._rpdos):
+            pdo.compile()
+        self._route()
+        self._watch_heartbeat()
+        self._start_heartbeat()
+        self._due_s = self._now_s
+
+    def _take_period(self) -> None:
+        value = self.dictionary.value
+        self._period_s = value(0x60C2, 1) / 10.0 ** -value(0x60C2, 2)
+
+    def _watch_heartbeat(self) -> None:
+        """Object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
+        word = self.dictionary.value(0x1016, 1)
+        self._watched_s = (word & 0xFFFF) * 1e-3
+        self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
+        self._watch_due_s = _NEVER
+
+    def _start_heartbeat(self) -> None:
+        self._heartbeat_s = self.dictionary.value(0x1017) * 1e-3
+        self._heartbeat_due_s = self._now_s + self._heartbeat_s if self._heartbeat_s else _NEVER
+        self._due_s = self._now_s
+
+    def _route(self) -> None:
+        """Note which frames and which SYNCs concern which PDO."""
+        running = self.nmt is Nmt.OPERATIONAL
+        tpdos = [pdo for pdo in self._tpdos if running and pdo.valid]
+        rpdos = [pdo for pdo in self._rpdos if running and pdo.valid]
+        self._sync_tpdos = [pdo for pdo in tpdos if pdo.is_synchronous]
+        self._event_tpdos = [pdo for pdo in tpdos if not pdo.is_synchronous]
+        self._sync_rpdos = [pdo for pdo in rpdos if pdo.is_synchronous]
+        self._rpdo_by_id = {pdo.can_id: pdo for pdo in rpdos}
+        self._sync_id = self.dictionary.value(0x1005) & 0x7FF
+        self._rpdo_due_s = _NEVER
+        self._due_s = self._now_s
+
+    # ---------------------------------------------------------------- the outside
+
+    def poll(self, now_s: float) -> None:
+        """Take in all frames that have come, answer them, and do what is due until ``now_s``."""
+        self._now_s = now_s
+        receive = self.bus.recv
+        while (message := receive(0)) is not None:
+            self.handle(message, now_s)
+        if self.faults.concerns_poll:
+            self._make_faults()
+        if now_s >= self._due_s:
+            self._do_what_is_due(now_s)
+        if self._event_tpdos:
+            self._send_events(now_s)
+
+    def next_event_s(self) -> float:
+        """When ``poll`` must be called at the latest, on the clock's scale."""
+        return self._due_s
+
+    def handle(self, message: can.Message, now_s: float) -> None:
+        """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
+        self._now_s = now_s
+        if message.is_extended_id or message.is_remote_frame or message.is_error_frame or self.faults.silent:
+            return
+        can_id = message.arbitration_id
+        if can_id == self._sync_id:
+            if self.nmt is not Nmt.STOPPED:
+                self._on_sync(now_s)
+        elif (pdo := self._rpdo_by_id.get(can_id)) is not None:
+            self._on_rpdo(pdo, bytes(message.data), now_s)
+        elif can_id == 0x000:
+            self._on_nmt(message.data)
+        elif can_id == 0x600 + self.node_id:
+            if self.nmt is not Nmt.STOPPED and (answer := self._sdo.respond(bytes(message.data))):
+                self._send(0x580 + self.node_id, answer)
+        elif can_id == self._watched_id:
+            self._on_watched_heartbeat(now_s)
+
+    # ---------------------------------------------------------------- frames
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if not self.faults.silent:
+            self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
+        if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
+            self._send(can_id, data)
+
+    def _on_sync(self, now_s: float) -> None:
+        tpdos: list[Outgoing] = []
+        for tpdo in self._sync_tpdos:
+            data = tpdo.on_sync()
+            if data is not None:
+                tpdos.append((tpdo.can_id, data))
+        if self.faults.concerns_tpdos:
+            tpdos = self.faults.spoil(tpdos)
+        for can_id, data in tpdos:
+            self._send(can_id, data)
+        for rpdo in self._sync_rpdos:
+            if rpdo.pending is not None:
+                data, rpdo.pending = rpdo.pending, None
+                rpdo.apply(data)
+        self._advance()
+        self._run_due_s = now_s + 1.5 * self._period_s
+        self._due_s = self._next_due_s()
+
+    def _on_rpdo(self, pdo: ReceivePdo, data: bytes, now_s: float) -> None:
+        if len(data) < pdo.length:
+            self.emergency.occur(ErrorCode.PDO_TOO_SHORT)
+            return
+        if pdo.event_timer_s:
+            pdo.deadline_s = now_s + pdo.event_timer_s
+            self._rpdo_due_s = min(each.deadline_s for each in self._rpdo_by_id.values())
+            self._due_s = self._next_due_s()
+        if len(data) > pdo.length:
+            self.emergency.occur(ErrorCode.PDO_TOO_LONG)
+        elif self.emergency.any_active:
+            for code in (ErrorCode.PDO_TOO_SHORT, ErrorCode.PDO_TOO_LONG):
+                self.emergency.clear(code)
+        if pdo.is_synchronous:
+            pdo.pending = data
+        else:
+            pdo.apply(data)
+
+    def _on_nmt(self, data: bytearray) -> None:
+        if len(data) < 2 or data[1] not in (0, self.node_id):
+            return
+        command = data[0]
+        if command == NmtCommand.START:
+            self._enter(Nmt.OPERATIONAL)
+        elif command == NmtCommand.STOP:
+            self._leave_operational(Nmt.STOPPED)
+        elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
+            self._leave_operational(Nmt.PRE_OPERATIONAL)
+        elif command == NmtCommand.RESET_NODE:
+            self._reset_node()
+        elif command == NmtCommand.RESET_COMMUNICATION:
+            self.firmware.connection_lost(ErrorCode.COMMUNICATION)
+            self.dictionary.restore(0x1000, 0x1FFF)
+            self._begin()
+
+    def _enter(self, state: Nmt) -> None:
+        if self.nmt is state:
+            return
+        self.nmt = state
+        for pdo in (*self._tpdos, *self._rpdos):
+            pdo.restart()
+        self._route()
+
+    def _leave_operational(self, state: Nmt) -> None:
+        """Stop the PDOs; an axis that lives on them has lost its master (6007h)."""
+        lost = state is Nmt.STOPPED or (self.nmt is Nmt.OPERATIONAL and self.firmware.follows_the_bus)
+        if lost:
+            self.firmware.connection_lost(ErrorCode.COMMUNICATION)
+        self._enter(state)
+
+    def _reset_node(self) -> None:
+        self.dictionary.restore()
+        self.emergency.reset()
+        self.firmware.reset()
+        self._begin()
+
+    def _on_watched_heartbeat(self, now_s: float) -> None:
+        self._watch_due_s = now_s + self._watched_s
+        self.emergency.clear(ErrorCode.HEARTBEAT)
+        self._due_s = self._next_due_s()
+
+    def _make_faults(self) -> None:
+        for code, additional in self.faults.take_errors():
+            self.firmware.fault(code, additional)
+        if self.faults.take_boot_up():
+            self._reset_node()
+
+    # ---------------------------------------------------------------- time
+
+    def _advance(self) -> None:
+        self.firmware.motion.load_jump_counts = self.faults.load_jump_counts
+        self.firmware.advance(self._period_s)
+
+    def _next_due_s(self) -> float:
+        due_s = min(self._run_due_s, self._heartbeat_due_s, self._watch_due_s, self._rpdo_due_s)
+        for tpdo in self._event_tpdos:
+            due_s = min(due_s, tpdo.due_s(self._now_s))
+        return due_s
+
+    def _do_what_is_due(self, now_s: float) -> None:
+        if self._boot_up_pending:
+            self._boot_up_pending = False
+            self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
+            self._enter(Nmt.PRE_OPERATIONAL)
+        self._run_due_s = max(self._run_due_s, now_s - LONGEST_CATCH_UP_S)
+        while self._run_due_s <= now_s:
+            self._run_due_s += self._period_s
+            self._advance()
+        if self._watch_due_s <= now_s:
+            self._lose_heartbeat()
+        if self._rpdo_due_s <= now_s:
+            self._miss_rpdo(now_s)
+        if self._heartbeat_due_s <= now_s:
+            if not self.faults.mute_heartbeat:
+                self._send(_HEARTBEAT + self.node_id, bytes([self.nmt]))
+            late = now_s - self._heartbeat_due_s
+            skipped = int(late / self._heartbeat_s)
+            self._heartbeat_due_s += (1 + skipped) * self._heartbeat_s
+        self._due_s = self._next_due_s()
+
+    def _send_events(self, now_s: float) -> None:
+        for tpdo in self._event_tpdos:
+            data = tpdo.on_event(now_s)
+            if data is not None:
+                self._send(tpdo.can_id, data)
+        self._due_s = self._next_due_s()
+
+    def _lose_heartbeat(self) -> None:
+        self._watch_due_s = _NEVER
+        self.emergency.occur(ErrorCode.HEARTBEAT)
+        self.firmware.connection_lost(ErrorCode.HEARTBEAT)
+        state = _AFTER_ERROR.get(self.dictionary.value(0x1029, 1))
+        if state is not None and self.nmt is Nmt.OPERATIONAL:
+            self._enter(state)
+
+    def _miss_rpdo(self, now_s: float) -> None:
+        """An RPDO is overdue: that matters to an axis that follows the bus. The next one arms it again."""
+        for pdo in self._rpdo_by_id.values():
+            if pdo.deadline_s <= now_s:
+                pdo.deadline_s = _NEVER
+        self._rpdo_due_s = min((pdo.deadline_s for pdo in self._rpdo_by_id.values()), default=_NEVER)
+        if self.firmware.follows_the_bus:
+            self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
+            self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
+
+
+def _check_sync_id(value: int) -> None:
+    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make it a producer, which it is not
+        raise SdoAbortError(Abort.RANGE)
+
+
+def _check_consumer(value: int) -> None:
+    if value >> 23:
+        raise SdoAbortError(Abort.RANGE)
