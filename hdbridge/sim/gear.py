@@ -1,13 +1,13 @@
 """The gear's output: motor angle / ratio, and all that the gear adds to it.
 
-What is added is a sum of pieces, each one physical cause. A further cause is a further class here (or in a file
-of its own) and a line in `pieces_of`; it reads what it depends on from the `Conditions`.
+What is added is a sum of pieces, each one physical cause. A further cause is a further class here (or in a
+file of its own) and a line in `pieces_of`; it reads what it depends on from the `Conditions`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders
@@ -31,6 +31,9 @@ class Conditions:
 class Piece(Protocol):
     """One cause of transmission error, with its state."""
 
+    BY_MOTOR_ONLY: ClassVar[bool]
+    """Whether it cannot change while the motor stands."""
+
     def arcsec(self, now: Conditions) -> float:
         """Its part of the output's error, once the axis has come to these conditions."""
         ...
@@ -39,6 +42,7 @@ class Piece(Protocol):
 class MotorOrders:
     """Tooth error by the motor's angle, and by the angle between wave generator and flexspline."""
 
+    BY_MOTOR_ONLY: ClassVar[bool] = True
     __slots__ = ("_orders", "_rad_per_deg")
 
     def __init__(self, orders: tuple[TrueOrder, ...], turns: float) -> None:
@@ -53,6 +57,7 @@ class MotorOrders:
 class LoadOrders:
     """Tooth error by the load's angle."""
 
+    BY_MOTOR_ONLY: ClassVar[bool] = False
     __slots__ = ("_orders",)
 
     def __init__(self, orders: tuple[TrueOrder, ...]) -> None:
@@ -66,6 +71,7 @@ class LoadOrders:
 class ElasticHysteresis:
     """The elastic part, by the way the motor has come."""
 
+    BY_MOTOR_ONLY: ClassVar[bool] = True
     __slots__ = ("_advance",)
 
     def __init__(self, law: Law) -> None:
@@ -79,6 +85,7 @@ class ElasticHysteresis:
 class ZeroDrift:
     """A shift that goes with the temperature."""
 
+    BY_MOTOR_ONLY: ClassVar[bool] = False
     __slots__ = ("_ambient_c", "_arcsec_per_k")
 
     def __init__(self, ambient_c: float, arcsec_per_k: float) -> None:
@@ -111,11 +118,14 @@ def pieces_of(truth: Truth) -> list[Piece]:
 class Gear:
     """The output of the gear before its spring, in degrees of the load."""
 
-    __slots__ = ("_pieces", "_ratio")
+    __slots__ = ("_pieces", "_ratio", "by_motor_only")
 
     def __init__(self, truth: Truth) -> None:
+        pieces = pieces_of(truth)
         self._ratio = truth.gear.ratio
-        self._pieces = tuple(piece.arcsec for piece in pieces_of(truth))
+        self._pieces = tuple(piece.arcsec for piece in pieces)
+        self.by_motor_only = all(piece.BY_MOTOR_ONLY for piece in pieces)
+        """Whether the output cannot change while the motor stands."""
 
     def output_deg(self, now: Conditions) -> float:
         """Where the output would turn an unloaded shaft."""

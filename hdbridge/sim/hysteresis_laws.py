@@ -1,7 +1,7 @@
 """Elastic hysteresis of the gear: how far its output is ahead, by the way the motor has come.
 
-Each law is rate-independent and advances from one motor angle to the next. The output is ahead in the direction
-of motion, so that a closed loop of the motor angle goes round with a positive area, integral of error by angle.
+Each law is rate-independent and advances from one motor angle to the next. The output is ahead in the
+direction of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ def law_of(truth: RollingFriction | MaxwellSlip | BoucWen | None, motor_deg: flo
 class RollingFrictionLaw:
     """The article's law, continuous at reversals.
 
-    After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s is the
-    direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
+    After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s
+    is the direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
     ``x (1 - ln x)`` for n = 2. Only the last reversal counts: it has no return-point memory.
     """
 
-    __slots__ = ("_branch_arcsec", "_branch_deg", "_direction", "_error", "_exponent", "_motor_deg", "_offset",
-                 "_saturated", "_width")  # fmt: skip
+    __slots__ = (
+        "_branch_arcsec", "_branch_deg", "_direction", "_error", "_exponent", "_motor_deg", "_offset",
+        "_saturated", "_width",
+    )  # fmt: skip
 
     def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -69,7 +71,7 @@ class RollingFrictionLaw:
         size = self._offset
         if travel < 1.0:
             n = self._exponent
-            if n == 2.0:  # noqa: PLR2004  the limit of the other formula
+            if n == 2.0:
                 crossed = travel * (1.0 - math.log(travel))
             else:
                 crossed = (travel ** (n - 1.0) - (n - 1.0) * travel) / (2.0 - n)
@@ -117,7 +119,7 @@ class MaxwellSlipLaw:
 class BoucWenLaw:
     """``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``, beta + gamma = 1; the error is offset * z.
 
-    Integrated over the motor's travel x by the midpoint rule in pieces that are short against the yield travel.
+    Integrated over the motor's travel x by the midpoint rule in pieces short against the yield travel.
     """
 
     PIECE = 0.05

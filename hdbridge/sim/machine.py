@@ -1,7 +1,7 @@
 """The simulated axis as a drive's firmware has it: loops, motor, gear, load and two encoders.
 
-Deterministic: the same truth and seed, driven alike, give the same numbers bit for bit. It knows no clock; each
-call advances it by whole substeps.
+Deterministic: the same truth and seed, driven alike, give the same numbers bit for bit. It knows no clock;
+each call advances it by whole substeps.
 """
 
 from __future__ import annotations

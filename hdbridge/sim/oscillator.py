@@ -20,7 +20,7 @@ def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> S
     w, decay = frequency_rad_s, damping_ratio * frequency_rad_s
     fade = math.exp(-decay * step_s)
     inside = 1.0 - damping_ratio**2
-    if abs(inside) < 1e-9:  # noqa: PLR2004  critically damped, within rounding
+    if abs(inside) < 1e-9:  # critically damped, within rounding
         c, s = 1.0, step_s
     elif inside > 0.0:
         damped = w * math.sqrt(inside)

@@ -1,8 +1,11 @@
 """The mechanics: motor and load, the gear's spring between them, friction, the coupling to the load encoder.
 
-The stiff linear parts (load on the gear's spring, encoder on its coupling) are stepped exactly for a base that
-moves evenly within a step. The motor is stepped implicitly in its friction: Coulomb friction is a set-valued
-force, so a motor whose torque does not exceed it stands still exactly, without creep or chatter.
+The stiff linear parts (load on the gear's spring, encoder on its coupling) are stepped exactly for a base
+that moves evenly within a step. The motor is stepped implicitly in its friction: Coulomb friction is a
+set-valued force, so a motor whose torque does not exceed it stands still exactly, without creep or chatter.
+
+The gear's reaction on the motor is the spring's torque divided by the ratio; that the tooth error makes the
+momentary ratio differ from it by a hundredth or two is left out there, not in the angles.
 """
 
 from __future__ import annotations
@@ -19,9 +22,28 @@ RAD_PER_DEG = math.pi / 180.0
 class Plant:
     """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
 
-    __slots__ = ("_arm", "_coulomb", "_coupling", "_damping", "_drag", "_dt", "_encoder_rate", "_flexspline",
-                 "_gear", "_inertia", "_load_drag", "_load_friction", "_ratio", "_stiffness", "encoder_deg",
-                 "loss_j", "motor_deg_s", "load_deg_s", "now", "output_deg")  # fmt: skip
+    __slots__ = (
+        "_arm",
+        "_coulomb",
+        "_coupling",
+        "_damping",
+        "_drag",
+        "_dt",
+        "_encoder_rate",
+        "_flexspline",
+        "_gear",
+        "_inertia",
+        "_load_drag",
+        "_load_friction",
+        "_ratio",
+        "_stiffness",
+        "encoder_deg",
+        "load_deg_s",
+        "loss_j",
+        "motor_deg_s",
+        "now",
+        "output_deg",
+    )  # fmt: skip
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s
@@ -43,7 +65,9 @@ class Plant:
         self._load_friction = load.coulomb_nm / load.inertia_kg_m2 / RAD_PER_DEG * dt
 
         coupling = load.encoder.coupling
-        self._coupling = coupling and exact_step(math.tau * coupling.frequency_hz, coupling.damping_ratio, dt)
+        self._coupling = (
+            exact_step(math.tau * coupling.frequency_hz, coupling.damping_ratio, dt) if coupling else None
+        )
 
         start_c = truth.temperature.start_c
         self.now = Conditions(truth.temperature.ambient_c if start_c is None else start_c)
@@ -73,15 +97,19 @@ class Plant:
             new_speed = (push + held) / (self._inertia + arm + self._drag)
         else:
             new_speed = 0.0
-        if new_speed or speed:
+        moved = new_speed != 0.0 or speed != 0.0
+        if moved:
             now.motor_deg += 0.5 * dt * (speed + new_speed)
             turned = abs(new_speed)
             self.loss_j += (held + self._drag * turned) * turned * RAD_PER_DEG * dt
         self.motor_deg_s = new_speed
 
         # Load, seen from the gear's output.
-        new_output = self._gear.output_deg(now)
-        rate = (new_output - output) / dt
+        if moved or not self._gear.by_motor_only:
+            self.output_deg = new_output = self._gear.output_deg(now)
+            rate = (new_output - output) / dt
+        else:
+            new_output, rate = output, 0.0
         a, b, c, d = self._flexspline
         slip = load_speed - rate
         new_load = new_output + b * slip - a * lag
@@ -91,7 +119,6 @@ class Plant:
         now.torque_nm = self._stiffness * (new_output - new_load)
         now.load_deg = new_load
         self.load_deg_s = new_load_speed
-        self.output_deg = new_output
 
         # Load encoder, seen from the load.
         if self._coupling is None:

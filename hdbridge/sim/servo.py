@@ -1,7 +1,7 @@
 """The drive's loops: a filter on the demand, then position and velocity cascade with feed-forward.
 
-Like real drives of this class it closes its loops on an interpolated encoder: a motor that has settled stands on
-the middle of the commanded count, not anywhere within it.
+Like real drives of this class it closes its loops on an interpolated encoder: a motor that has settled
+stands on the middle of the commanded count, not anywhere within it.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ class Servo:
     """State of the loops. The demand and the motor's angle come in degrees of the motor."""
 
     AT_REST_DEG_S = 0.05
-    """Below this demanded speed the direction of the friction feed-forward stays, and the integral may rest."""
+    """Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
 
-    __slots__ = ("_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction",
-                 "_integral", "_integral_rate", "_last_demand", "_measured", "_position_gain", "_reference",
-                 "_reference_speed", "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain",
-                 "_viscous", "limit_nm", "measured_deg_s")  # fmt: skip
+    __slots__ = (
+        "_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction", "_integral",
+        "_integral_rate", "_last_reference", "_measured", "_position_gain", "_reference", "_reference_speed",
+        "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
+        "measured_deg_s",
+    )  # fmt: skip
 
     def __init__(self, truth: Truth) -> None:
         servo, encoder = truth.servo, truth.motor.encoder
@@ -47,7 +49,7 @@ class Servo:
     def engage(self, motor_deg: float, motor_deg_s: float) -> None:
         """Start from where the motor is: no torque, no error."""
         self._measured = self._interpolated(motor_deg)
-        self._reference = self._last_demand = self._measured
+        self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
         self._integral = 0.0
         self._direction = 0.0
@@ -65,8 +67,8 @@ class Servo:
         self._measured = measured
         self.measured_deg_s = measured_speed
 
-        # The reference: the demand behind two equal lags, stepped exactly. It never overshoots a demand that does
-        # not turn back, and it has a speed and an acceleration where a demand in whole counts has steps.
+        # The reference: the demand behind two equal lags, stepped exactly. It never overshoots a demand that
+        # does not turn back, and it has a speed and an acceleration where a demand in whole counts has steps.
         reference, speed = self._reference, self._reference_speed
         w, decay = self._filter, self._decay
         behind = reference - demand_deg + 2.0 * demand_deg_s / w
@@ -79,8 +81,8 @@ class Servo:
 
         # The speeds compared are both averages over the substep that has passed.
         error = reference - measured
-        wanted_speed = (reference - self._last_demand) / dt
-        self._last_demand = reference
+        wanted_speed = (reference - self._last_reference) / dt
+        self._last_reference = reference
         speed_error = self._velocity_feedforward * wanted_speed + self._position_gain * error - measured_speed
         rests = -self.AT_REST_DEG_S < new_speed < self.AT_REST_DEG_S
         if not rests:
