@@ -1,0 +1,226 @@
+"""The bench: runs procedures on a drive, real or simulated, and keeps what was measured.
+
+The same code and the same procedures run on both. What differs is the bus and the clock, which come in with
+the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Self, TypeVar
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.compensation import Compensation, CompensationLimits
+from hdbridge.cycle import Cycle, Feedback
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.objects import Mode
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Supervision
+from hdbridge.errors import TransitionError
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
+from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.record import Record
+
+Outcome = TypeVar("Outcome")
+ENABLE_TIMEOUT_S = 2.0
+STOP_TIMEOUT_S = 2.0
+_STANDING = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One move of a procedure as it was run."""
+
+    kind: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Run(Generic[Outcome]):
+    """What a procedure gave."""
+
+    outcome: Outcome
+    record: Record
+    legs: tuple[Leg, ...]
+
+
+def axis_view(axis: AxisConfig) -> AxisView:
+    """What a procedure may know of its axis."""
+    limits = axis.limits
+    return AxisView(
+        axis.gear.ratio,
+        MotionLimits(
+            limits.position_min_deg,
+            limits.position_max_deg,
+            limits.velocity_deg_s,
+            limits.acceleration_deg_s2,
+            limits.jerk_deg_s3,
+        ),
+    )
+
+
+def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
+    """The model's inverse with the caps of the axis file, at the axis's cycle."""
+    caps = axis.compensation
+    limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
+    return Compensation(model, limits, axis.drive.cycle_s)
+
+
+class Bench:
+    """A drive in cyclic position mode, with or without compensation.
+
+    As a context manager it enables the drive on entry and, on every way out, brings it to rest and disables
+    it. The compensation is engaged from the start of the first procedure, ramped in.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        compensation: Compensation | None = None,
+        *,
+        interrupted: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """``interrupted`` is asked in each cycle; a yes stops the axis (KeyboardInterrupt)."""
+        axis = drive.axis
+        self.view = axis_view(axis)
+        self.supervision = Supervision()
+        self.cycle = Cycle(
+            drive.link,
+            drive.link.clock,
+            drive.image,
+            self.supervision,
+            axis.drive.cycle_s,
+            monitor=drive.monitor,
+        )
+        self._drive = drive
+        self._image = drive.image
+        self._compensation = compensation or compensation_for(axis, TransmissionModel(axis.gear.ratio))
+        self._interrupted = interrupted
+        self._torque_nm = axis.drive.rated_torque_nm / 1000.0
+        self._place = 0.0
+        self._chunks: list[np.ndarray[tuple[int, int], np.dtype[np.float64]]] = []
+        self._legs: list[Leg] = []
+
+    def __enter__(self) -> Self:
+        """Enable the drive by PDO, standing still."""
+        self._drive.enable(Mode.CSP)
+        power = self._image.power
+        self.cycle.restart()
+        for _ in range(math.ceil(ENABLE_TIMEOUT_S / self.cycle.period_s)):
+            feedback = self.cycle.tick()
+            if power.state is State.OPERATION_ENABLED:
+                break
+        else:
+            raise TransitionError(
+                f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
+                f"'{power.state.value}'; look at its enable input, its supply and its fault history"
+            )
+        motor_deg = self._image.motor_deg(feedback.motor_counts)
+        self._compensation.reset(motor_deg)
+        self._place = motor_deg / self.view.ratio
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Bring the axis to rest; what cannot be done here, the drive's own exit sees to."""
+        if self.supervision.stop is None and self._image.power.state is State.OPERATION_ENABLED:
+            self._stop()
+
+    def run(
+        self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None
+    ) -> Run[Outcome]:
+        """Run one procedure to its end; ``progress`` receives the share done, about ten times a second.
+
+        Refused with InputError, before anything moves, where the procedure would leave the axis's limits.
+        Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
+        record up to then is `record`.
+        """
+        rehearsal = rehearse(procedure, self.view, self._place)
+        self._chunks.clear()
+        self._legs.clear()
+        self._compensation.engage()
+        done_s = 0.0
+        steps = procedure.moves(self.view)
+        reply: Sequence[Sample] = ()
+        try:
+            move = next(steps)
+            while True:
+                path = move.path(self._place, self.view.limits)
+                reply = self._leg(move, path)
+                done_s += path.duration_s
+                progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
+                move = steps.send(reply)
+        except StopIteration as end:
+            return Run(end.value, self.record(), tuple(self._legs))
+
+    def record(self) -> Record:
+        """What the present procedure has measured so far."""
+        rows = np.concatenate(self._chunks) if self._chunks else np.empty((0, len(Sample._fields)))
+        columns = dict(zip(Sample._fields, rows.T, strict=True))
+        columns.pop("load_target_deg")
+        return Record(columns)
+
+    @property
+    def legs(self) -> tuple[Leg, ...]:
+        """The moves that the present procedure has run so far."""
+        return tuple(self._legs)
+
+    def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
+        """One move, cycle by cycle, from where the load target stands."""
+        samples: list[Sample] = []
+        tick, image, interrupted = self.cycle.tick, self._image, self._interrupted
+        command, hold, counts_for = (
+            self._compensation.command,
+            self._compensation.hold,
+            image.target_counts_for,
+        )
+        motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._torque_nm
+        period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
+        target_deg = self._place
+        # Counted in cycles that were run, not in clock time: a period that was skipped must not make the
+        # target jump ahead.
+        elapsed_s = 0.0
+
+        def answer(feedback: Feedback) -> int:
+            return counts_for(command(target_deg) if feedback.fresh else hold(target_deg))
+
+        try:
+            while True:
+                target_deg = at(elapsed_s)
+                feedback = tick(answer)
+                samples.append(
+                    Sample(
+                        feedback.time_s,
+                        target_deg,
+                        motor_deg(feedback.demand_counts),
+                        motor_deg(feedback.motor_counts),
+                        load_deg(feedback.load_counts),
+                        feedback.torque_permille * torque_nm,
+                    )
+                )
+                self._place = target_deg
+                if interrupted():
+                    self._stop()
+                    raise KeyboardInterrupt
+                if elapsed_s >= duration_s and move.ended(samples):
+                    return samples
+                elapsed_s += period_s
+        finally:
+            if samples:
+                self._chunks.append(np.array(samples, dtype=np.float64))
+                self._legs.append(Leg(move.kind, samples[0].time_s, samples[-1].time_s))
+
+    def _stop(self) -> None:
+        """Quick stop and wait for the drive to stand, as well as the bus allows."""
+        power = self._image.power
+        power.quick_stop()
+        for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
+            before = self._image.motor_counts
+            self.cycle.tick()
+            if power.state in _STANDING and abs(self._image.motor_counts - before) <= 1:
+                return

@@ -1,0 +1,42 @@
+"""``hdbridge check``: are the files of an axis right?"""
+
+from __future__ import annotations
+
+import typer
+
+from hdbridge.axis import AxisConfig
+from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, write_json
+from hdbridge.compensation import Inverse
+from hdbridge.model import TransmissionModel
+from hdbridge.stepping import quantisation_floor_arcsec
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("check")(check)
+
+
+def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
+    """Read an axis file, its EDS and its model; say what they mean, or what is wrong and where."""
+    files = Profile.find(profile)
+    axis = AxisConfig.load(files.axis)
+    floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+    facts = {
+        "axis": axis.name,
+        "bus": f"{axis.bus.interface}:{axis.bus.channel}, node {axis.drive.node_id}",
+        "cycle": f"{axis.drive.cycle_ms:g} ms",
+        "ratio": f"{axis.gear.ratio:g}",
+        "one motor count": f"{floor / 3 * 12**0.5:.3g} arcsec at the load",
+        "quantisation floor": f"{floor:.3g} arcsec (3 sigma)",
+        "travel": f"{axis.limits.position_min_deg:g} to {axis.limits.position_max_deg:g} deg",
+    }
+    path = model or (files.model if files.model.exists() else None)
+    if path is not None:
+        loaded = TransmissionModel.load(path)
+        loaded.check_ratio(axis)
+        Inverse(loaded)
+        facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
+    for name, value in facts.items():
+        console.print(f"{name:>20}  {value}")
+    write_json(json_file, {"schema": "hdbridge.check/1", **facts})
+    console.print("all right")

@@ -1,0 +1,46 @@
+"""``hdbridge latency``: which cycle time does this machine carry?"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.options import JsonOption, console, notes, write_json
+from hdbridge.clock import MonotonicClock
+from hdbridge.latency import CANDIDATES_S, Measurement, measure
+from hdbridge.realtime import prepare_realtime
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("latency")(latency)
+
+
+def latency(
+    duration_s: Annotated[
+        float, typer.Option("--duration", min=0.1, max=86_400, help="Seconds for each cycle time.")
+    ] = 10.0,
+    cycle_ms: Annotated[
+        list[float] | None,
+        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may stand several times."),
+    ] = None,
+    realtime: Annotated[
+        bool, typer.Option(help="Ask for real-time priority and locked memory, as the control loop does.")
+    ] = True,
+    json_file: JsonOption = None,
+) -> None:
+    """Measure how late this machine wakes up; print the histogram and the cycle time that it carries.
+
+    Run it on the machine that will drive the axis, with its usual load, for minutes rather than seconds.
+    """
+    periods = tuple(each / 1000.0 for each in cycle_ms) if cycle_ms else CANDIDATES_S
+
+    def tell(done: Measurement) -> None:
+        notes.print(f"measured {1e3 * done.period_s:g} ms")
+
+    with prepare_realtime() if realtime else nullcontext("ordinary priority") as conditions:
+        report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=tell)
+    console.print(report.table())
+    write_json(json_file, report.as_dict())

@@ -1,0 +1,124 @@
+"""What several commands share: options, profiles, progress, results for machines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import can
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from hdbridge.atomic import write_atomically
+from hdbridge.axis import AxisConfig
+from hdbridge.bundled import bundled_profile
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.drive.link import open_bus
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import simulated_bench
+
+console = Console(highlight=False)
+"""Tables for people: standard output."""
+notes = Console(stderr=True, highlight=False)
+"""Progress and remarks: standard error, so that they do not get into a pipe."""
+
+ProfileArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROFILE",
+        help="A folder with axis.yaml (and model.yaml), an axis file, or a bundled profile: `article`.",
+    ),
+]
+ModelOption = Annotated[
+    Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file; else the profile's own.")
+]
+SimulateOption = Annotated[
+    bool,
+    typer.Option("--simulate", help="Use a simulated drive in this process, faster than real time."),
+]
+TruthOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--truth", metavar="TRUTH.yaml", help="What the simulated axis is like; else the profile's."
+    ),
+]
+SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")]
+InterfaceOption = Annotated[
+    str | None, typer.Option("--interface", help="python-can interface, instead of the axis file's.")
+]
+ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
+JsonOption = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")
+]
+HtmlOption = Annotated[
+    Path | None, typer.Option("--html", metavar="FILE", help="Write a page that opens without a network.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """The files of one axis."""
+
+    axis: Path
+    model: Path
+    truth: Path
+
+    @classmethod
+    def find(cls, text: str) -> Profile:
+        """From a folder, an axis file, or the name of a bundled profile."""
+        path = Path(text)
+        if not path.exists() and path.name == text:
+            path = bundled_profile(text)
+        folder, axis = (path, path / "axis.yaml") if path.is_dir() else (path.parent, path)
+        return cls(axis, folder / "model.yaml", folder / "truth.yaml")
+
+
+def load_axis(profile: Profile, interface: str | None, channel: str | None) -> AxisConfig:
+    """The axis file, with the bus replaced where options say so."""
+    axis = AxisConfig.load(profile.axis)
+    changes = {
+        name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
+    }
+    return axis.on_bus(**changes) if changes else axis
+
+
+@contextmanager
+def connected(
+    axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int
+) -> Iterator[tuple[can.BusABC, Clock]]:
+    """The axis's bus and the clock that goes with it: a simulated drive's, or the real ones."""
+    if not simulate:
+        if truth is not None:
+            raise InputError("--truth says what a simulated axis is like: give --simulate with it")
+        with open_bus(axis.bus) as bus:
+            yield bus, MonotonicClock()
+        return
+    with simulated_bench(truth or profile.truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
+        yield bus, clock
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """A bar with the time left, on standard error; plain lines where that is no terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=notes) as progress:
+        yield progress
+
+
+def write_json(path: Path | None, result: dict[str, Any]) -> None:
+    """The result for machines, where asked for."""
+    if path is not None:
+        write_atomically(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+        notes.print(f"wrote {path}")

@@ -1,0 +1,156 @@
+"""``hdbridge step``: the stepping test, with and without compensation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import Run
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import (
+    ChannelOption,
+    HtmlOption,
+    InterfaceOption,
+    JsonOption,
+    ModelOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    connected,
+    console,
+    load_axis,
+    notes,
+    progress_bar,
+    write_json,
+)
+from hdbridge.comparison import Comparison, compare_schemes
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.stepping import Scheme
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("step")(step)
+
+
+def step(
+    profile: ProfileArgument,
+    model: ModelOption = None,
+    scheme: Annotated[
+        list[Scheme] | None,
+        typer.Option(
+            "--scheme", help="Only this scheme; may stand several times. All that the model has, else."
+        ),
+    ] = None,
+    count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
+    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, degrees of the motor.")] = 43.56,
+    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start.")] = 0.0,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    json_file: JsonOption = None,
+    html_file: HtmlOption = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+    ] = None,
+) -> None:
+    """Step the axis both ways under each compensation scheme; print what the load encoder measured.
+
+    The article's four schemes, and the whole model where it has more than their two parts.
+    """
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel)
+    comparison = run_comparison(
+        axis,
+        files,
+        TransmissionModel.load(model or files.model),
+        Stepping(count=count, step_deg=step_deg, start_deg=start_deg),
+        scheme,
+        simulate=simulate,
+        truth=truth,
+        seed=seed,
+        record=record,
+    )
+    print_table(axis, comparison)
+    write_json(json_file, comparison.as_dict())
+    if html_file is not None:
+        write_page(html_file, axis, comparison)
+
+
+def run_comparison(
+    axis: AxisConfig,
+    files: Profile,
+    model: TransmissionModel,
+    stepping: Stepping,
+    schemes: list[Scheme] | None,
+    *,
+    simulate: bool,
+    truth: Path | None,
+    seed: int,
+    record: Path | None = None,
+) -> Comparison:
+    """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there."""
+    offered = Scheme.offered_by(model)
+    wanted = tuple(schemes) if schemes else offered
+    if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
+        raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
+
+    def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
+        if record is not None:
+            record.mkdir(parents=True, exist_ok=True)
+            run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+
+    with (
+        deferred_interrupt() as interrupted,
+        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
+        with progress_bar() as bar:
+            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0) for each in wanted}
+            return compare_schemes(
+                drive,
+                model,
+                wanted,
+                stepping,
+                progress=lambda scheme, share: bar.update(bars[scheme], completed=share),
+                interrupted=interrupted,
+                finished=keep,
+            )
+
+
+def print_table(axis: AxisConfig, comparison: Comparison) -> None:
+    """The result for a person."""
+    table = Table(title=f"Load error at rest, arcsec: axis '{axis.name}'", title_justify="left")
+    table.add_column("compensation")
+    for direction in ("CW", "CCW", "pooled"):
+        table.add_column(f"{direction} 3σ", justify="right")
+        table.add_column("mean", justify="right")
+    for scheme, result in comparison.results.items():
+        cells = [
+            f"{value:.2f}"
+            for part in (result.cw, result.ccw, result.pooled)
+            for value in (part.three_sigma_arcsec, part.mean_arcsec)
+        ]
+        table.add_row(scheme.value, *cells)
+    console.print(table)
+    console.print(
+        f"quantisation floor (3 sigma of one motor count): {comparison.quantisation_floor_arcsec:.2f}"
+    )
+
+
+def write_page(path: Path, axis: AxisConfig, comparison: Comparison) -> None:
+    """The result as a self-contained page."""

@@ -1,0 +1,57 @@
+"""The stepping test under each compensation scheme, one after the other on one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from hdbridge.bench import Bench, Run, compensation_for
+from hdbridge.drive.drive import Drive
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What the stepping test gave under each scheme."""
+
+    results: dict[Scheme, SchemeResult]
+    runs: dict[Scheme, Run[SteppingOutcome]]
+    quantisation_floor_arcsec: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract of ``hdbridge step --json``."""
+        return {
+            "schema": "hdbridge.stepping/1",
+            **{scheme.value: result.as_dict() for scheme, result in self.results.items()},
+            "quantisation_floor_arcsec": self.quantisation_floor_arcsec,
+        }
+
+
+def compare_schemes(
+    drive: Drive,
+    model: TransmissionModel,
+    schemes: Sequence[Scheme],
+    stepping: Stepping,
+    *,
+    progress: Callable[[Scheme, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
+) -> Comparison:
+    """Run the stepping test under each scheme on a booted drive; it is enabled for each and disabled after.
+
+    ``progress`` receives the share of the present scheme that is done; ``finished`` each run as it ends, so
+    that nothing measured is lost when a later one fails.
+    """
+    runs: dict[Scheme, Run[SteppingOutcome]] = {}
+    for scheme in schemes:
+        compensation = compensation_for(drive.axis, scheme.of(model))
+        with Bench(drive, compensation, interrupted=interrupted) as bench:
+            runs[scheme] = bench.run(stepping, partial(progress, scheme))
+        drive.disable()
+        finished(scheme, runs[scheme])
+    floor = quantisation_floor_arcsec(drive.axis.motor_encoder.counts_per_turn, drive.axis.gear.ratio)
+    return Comparison({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
