@@ -1,0 +1,121 @@
+"""Writes the tables of docs/files.md from the models that read the files, so that the page cannot lag behind.
+
+python tools/file_reference.py           rewrite the tables
+python tools/file_reference.py --check   say whether they are up to date (exit status 1 if not)
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import CATALOGUE
+from hdbridge.expectation import Field, field_at, key_of, type_words
+from hdbridge.modelfile import ModelFile
+from hdbridge.modelstore import LogFile
+from hdbridge.record import OPTIONAL, REQUIRED
+from hdbridge.recording import RecordingFile
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "files.md"
+_BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def key_table(model: type[BaseModel]) -> str:
+    """Every key of a file with what it expects, its default and its meaning."""
+    lines = ["| key | expected | default | meaning |", "|---|---|---|---|"]
+    lines += (f"| `{key}` | {what} | {default} | {about} |" for key, what, default, about in _rows(model))
+    return "\n".join(lines) + "\n"
+
+
+def column_table() -> str:
+    """The columns of a record."""
+    lines = ["| column | required | meaning |", "|---|---|---|"]
+    for columns, needed in ((REQUIRED, "yes"), (OPTIONAL, "no")):
+        lines += (f"| `{name}` | {needed} | {about} |" for name, about in columns.items())
+    return "\n".join(lines) + "\n"
+
+
+def effect_tables() -> str:
+    """The parameters of the two parts that every gear has."""
+    parts = []
+    for name in ("synchronous", "hysteresis"):
+        effect = CATALOGUE[name]
+        parts.append(
+            f"### `{name}`: {effect.about.title}\n\n`{effect.about.equation}`\n\n{key_table(effect)}"
+        )
+    return "\n" + "\n".join(parts)
+
+
+BLOCKS: Mapping[str, Any] = {
+    "axis": lambda: key_table(AxisConfig),
+    "model": lambda: key_table(ModelFile),
+    "effects": effect_tables,
+    "columns": column_table,
+    "recording": lambda: key_table(RecordingFile),
+    "history": lambda: key_table(LogFile),
+}
+
+
+def updated(page: str) -> str:
+    """The page with its tables as they must be."""
+    return _BLOCK.sub(lambda match: match[1] + BLOCKS[match["name"]]() + match[3], page)
+
+
+def _rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+    for name, info in model.model_fields.items():
+        key = key_of(name, info)
+        place = field_at(model, (key,))
+        assert place is not None
+        inner, many = _inner(place)
+        what = type_words(place).replace("|", "\\|")
+        yield prefix + key, what, _default(key, info), place.description.replace("|", "\\|")
+        if inner is not None:
+            yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.")
+
+
+def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
+    """The model of a nested mapping, or of the items of a list."""
+    for member in place.types():
+        if isinstance(member, type) and issubclass(member, BaseModel):
+            return member, False
+        for item in getattr(member, "__args__", ()):
+            if isinstance(item, type) and issubclass(item, BaseModel):
+                return item, True
+    return None, False
+
+
+def _default(key: str, info: FieldInfo) -> str:
+    if info.is_required():
+        return "required"
+    value = info.get_default(call_default_factory=True, validated_data={})
+    if value is None or value is PydanticUndefined or value in ((), {}, "") or isinstance(value, BaseModel):
+        return ""
+    if isinstance(value, Enum):
+        value = value.value
+    if key == "index":
+        return f"`{value:#x}`"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def main(arguments: list[str]) -> int:
+    """Rewrite, or check with ``--check``."""
+    page = PAGE.read_text(encoding="utf-8")
+    new = updated(page)
+    if "--check" in arguments:
+        print("up to date" if new == page else f"{PAGE} lags behind: run python tools/file_reference.py")
+        return int(new != page)
+    PAGE.write_text(new, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
