@@ -7,10 +7,10 @@ from hdbridge.drive.link import BusSettings, Dropped, Frame, Link, TransmitBuffe
 from hdbridge.drive.monitor import Emergency, NetworkMonitor, NodeStatus
 from hdbridge.drive.objects import IntegerType, Mode, NmtCommand, NmtState
 from hdbridge.drive.pdo import PdoCodec, PdoEntry, PdoLengthError
-from hdbridge.drive.plan import PlannedWrite, plan
 from hdbridge.drive.sdo import SdoAbortError, SdoClient, load_eds
 from hdbridge.drive.states import Command, PowerWalk, State, Transition, controlword_for, decode
 from hdbridge.drive.unwrap import Unwrap, wrap_int32
+from hdbridge.drive.writes import PlannedWrite, plan
 
 __all__ = [
     "BootReport",

@@ -14,9 +14,9 @@ from hdbridge.drive import objects
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import Address, Mode, NmtCommand, NmtState
-from hdbridge.drive.plan import PlannedWrite, plan
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
+from hdbridge.drive.writes import PlannedWrite, plan
 from hdbridge.errors import DriveError, IdentityError, SdoError
 
 if TYPE_CHECKING:

@@ -47,6 +47,7 @@ class Commander:
 
     def statusword(self) -> int:
         """Read the statusword."""
+        self._beat()
         return self.sdo.fetch(objects.STATUSWORD)
 
     def state(self) -> State:
@@ -57,21 +58,26 @@ class Commander:
 
     def control(self, controlword: int) -> None:
         """Write the controlword."""
+        self._beat()
         self.sdo.store(objects.CONTROLWORD, controlword)
 
     def pause(self, duration_s: float) -> None:
         """Let time pass: receive what comes and send the master's heartbeat when it is due."""
         end_s = self.link.now() + duration_s
         while True:
-            now_s = self.link.now()
-            if now_s >= self._heartbeat_due_s:
-                self.link.send(self.image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
-                self._heartbeat_due_s = now_s + self.image.heartbeat_period_s
+            self._beat()
             frame = self.link.recv(min(end_s, self._heartbeat_due_s))
             if frame is not None:
                 self.monitor.dispatch(frame)
             if self.link.now() >= end_s:
                 return
+
+    def _beat(self) -> None:
+        """Send the master's heartbeat when it is due."""
+        now_s = self.link.now()
+        if now_s >= self._heartbeat_due_s:
+            self.link.send(self.image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
+            self._heartbeat_due_s = now_s + self.image.heartbeat_period_s
 
     def wait_for(
         self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False

@@ -166,6 +166,14 @@ class Drive:
         """Halt without leaving 'operation enabled' (605Dh says how); whether the axis came to rest."""
         return modes.halt(self._commander)
 
+    def wait(self, duration_s: float) -> None:
+        """Let time pass while the drive is enabled, outside the control cycle.
+
+        A drive that hears no heartbeat of the master for ``drive.heartbeat_ms`` stops by itself; this keeps
+        it going, a plain sleep does not.
+        """
+        self._commander.pause(duration_s)
+
     def move_to(
         self,
         load_deg: float,

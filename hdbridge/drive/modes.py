@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from hdbridge.drive import objects
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import HALT_BIT, ProcessImage
-from hdbridge.drive.plan import motor_rate
 from hdbridge.drive.states import HOLD, State, decode
+from hdbridge.drive.writes import motor_rate
 from hdbridge.errors import DriveError, HdbridgeError, InputError
 
 if TYPE_CHECKING:

@@ -204,3 +204,24 @@ def test_a_vendor_object_as_load_encoder(
     drive.boot()
     assert tiny.values[0x1A01, 1] == 0x21000010
     assert drive.read_positions().load_counts == -3
+
+
+def test_a_load_encoder_that_is_a_node_of_its_own(
+    bus: Any, clock: Any, tiny: Any, channel: str, build_axis: Callable[..., AxisConfig]
+) -> None:
+    source = {"index": 0x60E4, "subindex": 1, "type": "int32", "node": 2}
+    with can.Bus(interface="virtual", channel=channel, ignore_config=True) as other_bus:
+        encoder = type(tiny)(other_bus, clock, node_id=2)
+        encoder.position = 5000.0
+        bus.peers.append(encoder)
+        drive = Drive(bus, build_axis(load_encoder__source=source), clock, tiny.od)
+        drive.boot()
+        assert (encoder.values[0x1800, 1], encoder.values[0x1A00, 1]) == (0x182, 0x60E40120)
+        assert (encoder.values[0x1800, 2], encoder.values[0x1017, 0]) == (1, 50)
+        assert (tiny.nmt_state, encoder.nmt_state) == (5, 5)
+        assert tiny.values[0x1A01, 0] == 1
+        assert drive.read_positions().load_counts == 36_000
+        encoder.silent = True
+        with pytest.raises(DriveError, match=r"node 2 .*load_encoder\.source\.node"):
+            drive.boot()
+        assert tiny.nmt_state == 127
