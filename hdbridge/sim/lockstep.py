@@ -17,6 +17,7 @@ from uuid import uuid4
 
 import can
 
+from hdbridge.sim.frame import frame
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
 from hdbridge.sim.nameplate import Nameplate
@@ -84,7 +85,8 @@ class LockstepBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send, and let every node take it in and answer."""
-        self._inner.send(msg, timeout)
+        light = frame(msg.arbitration_id, bytes(msg.data)) if _is_plain(msg) else msg
+        self._inner.send(light, timeout)
         now_s = self._clock.now()
         for node in self._clock.nodes:
             node.poll(now_s)
@@ -122,6 +124,10 @@ class LockstepBus(can.BusABC):
         """Leave the channel."""
         super().shutdown()
         self._inner.shutdown()
+
+
+def _is_plain(msg: can.Message) -> bool:
+    return not (msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults, Outgoing
 from hdbridge.sim.firmware import Firmware
+from hdbridge.sim.frame import frame
 from hdbridge.sim.motion import Machine
 from hdbridge.sim.nameplate import Nameplate
 from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
@@ -183,7 +184,7 @@ class SimulatedDrive:
 
     def _send(self, can_id: int, data: bytes) -> None:
         if not self.faults.silent:
-            self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            self.bus.send(frame(can_id, data))
 
     def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
         if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):

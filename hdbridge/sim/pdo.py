@@ -214,7 +214,7 @@ class ReceivePdo(Pdo):
         return self._codec.size
 
     def apply(self, data: bytes) -> None:
-        """Write ``data`` (``length`` bytes or more) to the mapped entries in order; refused ones are dropped."""
+        """Write ``data``, ``length`` bytes or more, to the mapped entries; refused values are dropped."""
         for write, value in zip(self._writers, self._codec.unpack_from(data), strict=True):
             try:
                 write(value)
