@@ -128,5 +128,5 @@ def test_a_machine_that_carries_nothing_is_told_so() -> None:
 
 
 def test_a_percentile_outside_its_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 .. 100"):
+    with pytest.raises(ValueError, match=r"0 \.\. 100"):
         Histogram().percentile_us(101.0)
