@@ -181,3 +181,22 @@ def test_an_opened_bus_is_closed_again() -> None:
         assert bus.recv(0) is not None
     with pytest.raises(can.CanOperationError):
         bus.send(message())
+
+
+def test_what_the_interface_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: dict[str, object] = {}
+
+    def bus(**options: object) -> FakeBus:
+        told.update(options)
+        return FakeBus()
+
+    monkeypatch.setattr("can.Bus", bus)
+    with open_bus(BusConfig(interface="socketcan", channel="can0", bitrate_bps=500_000)):
+        pass
+    assert told == {
+        "interface": "socketcan",
+        "channel": "can0",
+        "ignore_config": True,
+        "bitrate": 500_000,
+        "can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}],
+    }

@@ -250,3 +250,8 @@ def test_a_foreign_answer_does_not_help(client: SdoClient, tiny: Any, peer_bus: 
     tiny.scripts[0x6064, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     with pytest.raises(SdoError, match="Unexpected response 0x60"):
         client.read(0x6064)
+
+
+def test_an_old_answer_for_the_same_object_is_not_taken_for_the_new_one(client: SdoClient, tiny: Any) -> None:
+    tiny.send(0x580, b"\x43\x64\x60\x00" + struct.pack("<i", 99))
+    assert client.read(0x6064) == 1000
