@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hdbridge.atomic import write_atomically
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
-from hdbridge.expectation import nearest
+from hdbridge.expectation import nearest, one_line
 
 Column = NDArray[Any]
 """A column: float64, or text where it holds something else than numbers."""
@@ -90,30 +90,34 @@ def _cell(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if quoted else text
 
 
+def _wrong(text: str) -> InputError:
+    return InputError(one_line(text))
+
+
 def _content(path: Path) -> bytes:
     """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise _wrong(f"{path}: no such file") from None
     except OSError as problem:
-        raise InputError(f"{path}: cannot be read: {problem.strerror}") from None
+        raise _wrong(f"{path}: cannot be read: {problem.strerror}") from None
     if content.startswith(_GZIP_MAGIC):
         try:
             with gzip.GzipFile(fileobj=io.BytesIO(content)) as file:
                 content = file.read(MAXIMUM_BYTES + 1)
         except (gzip.BadGzipFile, EOFError, zlib.error) as problem:
-            raise InputError(f"{path}: gzip data are damaged or cut off ({problem})") from None
+            raise _wrong(f"{path}: gzip data are damaged or cut off ({problem})") from None
     elif path.suffix == ".gz":
-        raise InputError(f"{path}: not gzip data; expected a compressed file, or a name without .gz")
+        raise _wrong(f"{path}: not gzip data; expected a compressed file, or a name without .gz")
     if len(content) > MAXIMUM_BYTES:
-        raise InputError(f"{path}: more than {MAXIMUM_BYTES >> 30} GiB; split the record")
+        raise _wrong(f"{path}: more than {MAXIMUM_BYTES >> 30} GiB; split the record")
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         content.decode()
     except UnicodeDecodeError as problem:
         line = content.count(b"\n", 0, problem.start) + 1
-        raise InputError(f"{path}:{line}: not UTF-8 text; expected CSV in UTF-8") from None
+        raise _wrong(f"{path}:{line}: not UTF-8 text; expected CSV in UTF-8") from None
     return content
 
 
@@ -129,7 +133,7 @@ def _header(path: Path, reader: Any) -> tuple[list[str], int]:
     """The column names, and the lines that they and what is blank before them take."""
     for row in _rows(path, reader):
         return [name.strip() for name in row], reader.line_num
-    raise InputError(f"{path}: the file is empty; expected a header line and one row per sample")
+    raise _wrong(f"{path}: the file is empty; expected a header line and one row per sample")
 
 
 def _check_header(path: Path, line: int, names: Sequence[str], required: Sequence[str]) -> None:
@@ -138,19 +142,17 @@ def _check_header(path: Path, line: int, names: Sequence[str], required: Sequenc
         if name in names:
             continue
         if len(names) == 1 and any(each in names[0] for each in ";\t"):
-            raise InputError(
-                f"{where}: the columns are not separated by commas; expected comma-separated values"
-            )
+            raise _wrong(f"{where}: the columns are not separated by commas; expected comma-separated values")
         if all(map(_is_number, names)):
-            raise InputError(f"{where}: the first line holds numbers; expected the names of the columns")
+            raise _wrong(f"{where}: the first line holds numbers; expected the names of the columns")
         close = nearest(name, [each for each in names if each not in required])
         hint = f"; is '{close}' meant?" if close else ""
-        raise InputError(f"{where}: column '{name}' is missing; found {', '.join(names)}{hint}")
+        raise _wrong(f"{where}: column '{name}' is missing; found {', '.join(names)}{hint}")
     for place, name in enumerate(names):
         if not name:
-            raise InputError(f"{where}: column {place + 1} has no name")
+            raise _wrong(f"{where}: column {place + 1} has no name")
         if name in names[:place]:
-            raise InputError(f"{where}: column '{name}' stands twice")
+            raise _wrong(f"{where}: column '{name}' stands twice")
 
 
 def _fast(content: bytes, header_lines: int, names: Sequence[str]) -> dict[str, Column] | None:
@@ -174,7 +176,7 @@ def _slow(path: Path, reader: Any, names: Sequence[str], finite: Collection[str]
     lines: list[int] = []
     for row in _rows(path, reader):
         if len(row) != len(names):
-            raise InputError(
+            raise _wrong(
                 f"{path}:{reader.line_num}: {len(row)} values; expected {len(names)}, one for each column"
             )
         rows.append(row)
@@ -190,7 +192,7 @@ def _slow(path: Path, reader: Any, names: Sequence[str], finite: Collection[str]
         row_number, name = min(wrong)
         cell = cells[name][row_number].strip()
         what = f"'{cell}' is not a number" if cell else "no value"
-        raise InputError(f"{path}:{lines[row_number]}: {name}: {what}; expected a number")
+        raise _wrong(f"{path}:{lines[row_number]}: {name}: {what}; expected a number")
     return columns
 
 
@@ -201,7 +203,7 @@ def _rows(path: Path, reader: Any) -> Iterator[list[str]]:
             if row and (len(row) > 1 or row[0].strip()):
                 yield row
     except csv.Error as problem:
-        raise InputError(f"{path}:{reader.line_num}: not CSV: {problem}") from None
+        raise _wrong(f"{path}:{reader.line_num}: not CSV: {problem}") from None
 
 
 def _column(cells: Sequence[str], *, blanks: bool) -> Column:
@@ -227,7 +229,7 @@ def _check_finite(path: Path, content: bytes, header_lines: int, name: str, colu
     wrong = np.flatnonzero(~np.isfinite(column))
     if len(wrong):
         line = _line_of_row(content, header_lines, int(wrong[0]))
-        raise InputError(f"{path}:{line}: {name}: {column[wrong[0]]}; expected a finite number")
+        raise _wrong(f"{path}:{line}: {name}: {column[wrong[0]]}; expected a finite number")
 
 
 def _line_of_row(content: bytes, header_lines: int, row: int) -> int:

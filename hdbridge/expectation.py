@@ -50,6 +50,11 @@ def nearest(word: str, choices: Sequence[str]) -> str | None:
     return next((each for each in choices if close and each.lower() == close[0]), None)
 
 
+def one_line(text: str) -> str:
+    """A text as one line, whatever it holds: line breaks and other unprintable characters are escaped."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+
+
 def key_of(name: str, field: FieldInfo) -> str:
     """A field's key in the file."""
     return field.alias or name

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,43 +20,18 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from hdbridge.atomic import write_atomically
-from hdbridge.errors import InputError
 from hdbridge.expectation import expected_words, field_at, field_names, nearest
+from hdbridge.yamlnodes import FLOAT, INTEGER, OCTAL, FileError, Node, compose
 
 __all__ = [
     "Document", "FileError", "Hex", "document_from_text", "dump_yaml", "load_yaml", "nearest", "read_yaml",
     "write_atomically", "wrong",
 ]  # fmt: skip
 
+MAXIMUM_BYTES = 4 << 20
+
 Location = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
-
-MAXIMUM_BYTES = 4 << 20
-MAXIMUM_DEPTH = 32
-MAXIMUM_DIGITS = 400
-
-
-class FileError(InputError):
-    """A file is wrong. The text is the first complaint; `details` has every one, a line each."""
-
-    def __init__(self, *lines: str) -> None:
-        more = len(lines) - 1
-        super().__init__(lines[0] + (f" (and {more} more)" if more else ""))
-        self.details = lines
-
-
-@dataclass(frozen=True, slots=True)
-class Node:
-    """A value of the file with its position (line and column count from 1)."""
-
-    line: int
-    column: int
-    value: Any
-    """Plain Python: dict, list, str, int, float, bool or None."""
-    found: str
-    """The value in words, as a complaint shows it."""
-    children: dict[str, tuple[Node, Node]] | list[Node] | None = None
-    """Of a mapping: key -> (key's node, value's node)."""
 
 
 def load_yaml(path: Path | str, model: type[M]) -> M:
@@ -88,7 +63,7 @@ def read_yaml(path: Path | str) -> Document:
 def document_from_text(text: str, path: Path | str) -> Document:
     """YAML text as a document; ``path`` only names it in complaints."""
     path = Path(path)
-    return Document(path, _Composer(text, path).document())
+    return Document(path, compose(text, path))
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,145 +184,6 @@ def _hint(word: str, choices: Sequence[str]) -> str:
     return f"did you mean '{close}'?" if close else ""
 
 
-# ---------------------------------------------------------------------------------------------------------
-# Reading: events of the YAML parser -> nodes with positions
-
-_INTEGER = re.compile(r"[-+]?[0-9]+")
-_HEX = re.compile(r"0x[0-9a-fA-F]+")
-_OCTAL = re.compile(r"0o[0-7]+")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
-_WORDS: dict[str, bool | None] = {
-    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-}
-_CONVERSIONS: tuple[tuple[re.Pattern[str], Callable[[str], int | float]], ...] = (
-    (_INTEGER, int),
-    (_HEX, lambda text: int(text, 16)),
-    (_OCTAL, lambda text: int(text, 8)),
-    (_FLOAT, float),
-    (_INFINITE, lambda text: float(text.replace(".", ""))),
-)
-
-
-class _Composer:
-    """Builds nodes from parser events, refusing what a configuration has no use for."""
-
-    def __init__(self, text: str, path: Path) -> None:
-        self._path = path
-        self._text = text
-        self._events = self._parse()
-
-    def document(self) -> Node:
-        event = next(self._events)
-        while not isinstance(event, yaml.DocumentStartEvent):
-            if isinstance(event, yaml.StreamEndEvent):
-                raise FileError(f"{self._path}:1:1: the file is empty")
-            event = next(self._events)
-        root = self._node(next(self._events), 0)
-        next(self._events)
-        end = next(self._events)
-        if not isinstance(end, yaml.StreamEndEvent):
-            raise self._error(end, "a second document begins here; expected one document per file")
-        return root
-
-    def _parse(self) -> Iterator[yaml.Event]:
-        fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        try:
-            yield from yaml.parse(self._text, Loader=fast)
-        except yaml.YAMLError:
-            # The pure parser says it better, and alike on every machine.
-            try:
-                for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
-                    pass
-            except yaml.MarkedYAMLError as problem:
-                mark = problem.problem_mark or problem.context_mark
-                place = f"{mark.line + 1}:{mark.column + 1}" if mark else "1:1"
-                problem_words = (problem.problem or "unreadable").replace("\n", " ")
-                while_words = f" ({problem.context})" if problem.context else ""
-                raise FileError(f"{self._path}:{place}: not YAML: {problem_words}{while_words}") from None
-            except yaml.reader.ReaderError as problem:
-                before = self._text[: problem.position]
-                line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
-                what = f"character U+{ord(self._text[problem.position]):04X} is not allowed in YAML"
-                raise FileError(f"{self._path}:{line}:{column}: not YAML: {what}") from None
-            raise
-
-    def _error(self, event: yaml.Event, message: str) -> FileError:
-        line, column = _position(event)
-        return FileError(f"{self._path}:{line}:{column}: {message}")
-
-    def _node(self, event: yaml.Event, depth: int) -> Node:
-        if isinstance(event, yaml.AliasEvent):
-            raise self._error(event, f"alias *{event.anchor}; expected values written out, without aliases")
-        if getattr(event, "anchor", None) is not None:
-            raise self._error(
-                event, f"anchor &{getattr(event, 'anchor', '')}; expected plain values, without anchors"
-            )
-        tag = getattr(event, "tag", None)
-        if tag is not None and tag != "!":
-            raise self._error(event, f"tag {tag}; expected plain values, without tags")
-        if depth > MAXIMUM_DEPTH:
-            raise self._error(event, f"nested deeper than {MAXIMUM_DEPTH} levels")
-        line, column = _position(event)
-        if isinstance(event, yaml.MappingStartEvent):
-            return self._mapping(line, column, depth)
-        if isinstance(event, yaml.SequenceStartEvent):
-            return self._sequence(line, column, depth)
-        assert isinstance(event, yaml.ScalarEvent)
-        value = self._scalar(event)
-        return Node(line, column, value, _found(value, event.value))
-
-    def _mapping(self, line: int, column: int, depth: int) -> Node:
-        children: dict[str, tuple[Node, Node]] = {}
-        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
-            key = self._node(event, depth + 1)
-            if not isinstance(key.value, str):
-                raise self._error(event, f"key {key.found} is not text; expected a name")
-            if key.value in children:
-                first = children[key.value][0].line
-                raise self._error(event, f"key '{key.value}' stands twice; it stands first in line {first}")
-            children[key.value] = (key, self._node(next(self._events), depth + 1))
-        data = {name: child.value for name, (_, child) in children.items()}
-        return Node(line, column, data, "a mapping", children)
-
-    def _sequence(self, line: int, column: int, depth: int) -> Node:
-        children: list[Node] = []
-        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            children.append(self._node(event, depth + 1))
-        return Node(line, column, [each.value for each in children], "a list", children)
-
-    def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        text: str = event.value
-        if event.style or event.tag == "!":
-            return text
-        if text in _WORDS:
-            return _WORDS[text]
-        for pattern, convert in _CONVERSIONS:
-            if pattern.fullmatch(text):
-                if len(text) > MAXIMUM_DIGITS:
-                    raise self._error(event, f"a number of {len(text)} digits; expected a plain number")
-                return convert(text)
-        return text
-
-
-def _position(event: yaml.Event) -> tuple[int, int]:
-    mark = event.start_mark
-    return (mark.line + 1, mark.column + 1) if mark else (1, 1)
-
-
-def _found(value: object, text: str) -> str:
-    if value is None:
-        return "nothing"
-    short = text if len(text) <= 40 else text[:37] + "..."
-    return repr(short) if isinstance(value, str) else short
-
-
-# ---------------------------------------------------------------------------------------------------------
-# Writing
-
-
 class Hex(int):
     """An integer that is written in hexadecimal: object indices, vendor and product numbers."""
 
@@ -365,9 +201,9 @@ class _Dumper(yaml.SafeDumper):
 
 
 for _tag, _pattern, _first in (
-    ("tag:yaml.org,2002:int", _INTEGER, "-+0123456789"),
-    ("tag:yaml.org,2002:int", _OCTAL, "0"),
-    ("tag:yaml.org,2002:float", _FLOAT, "-+.0123456789"),
+    ("tag:yaml.org,2002:int", INTEGER, "-+0123456789"),
+    ("tag:yaml.org,2002:int", OCTAL, "0"),
+    ("tag:yaml.org,2002:float", FLOAT, "-+.0123456789"),
 ):
     _Dumper.add_implicit_resolver(_tag, re.compile(f"^(?:{_pattern.pattern})$"), list(_first))
 _Dumper.add_representer(
