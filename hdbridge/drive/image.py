@@ -166,8 +166,8 @@ class ProcessImage:
     def pack_rpdo(self, target_counts: int) -> bytes:
         """Data of the RPDO: the controlword of ``power`` and the target, checked against the limits.
 
-        While power is not enabled, a target outside the limits is no error (the axis may stand there), but
-        the caller passes the actual position then, so that enabling never moves the axis.
+        `InputError`, and nothing to send, when the target is outside them. Before power is enabled use
+        `pack_rpdo_idle`: the axis may stand anywhere then.
         """
         self.check_target(target_counts)
         return self._pack(target_counts)

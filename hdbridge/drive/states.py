@@ -34,6 +34,9 @@ class State(Enum):
     UNKNOWN = "unknown"
     """No statusword yet, or one that no row describes."""
 
+    # By identity: the hash that Enum has is computed in Python, which shows in a control cycle.
+    __hash__ = object.__hash__
+
 
 _DECODING: Final[tuple[tuple[State, int, int], ...]] = (
     # state, mask, value: bits 0-3, 5, 6 of the statusword
@@ -187,6 +190,16 @@ def controlword_for(state: State, target: State) -> int:
 _NO_RESET, _RESET_LOW, _RESET_HIGH = range(3)
 
 
+def _word(state: State, aim: State) -> int:
+    try:
+        return controlword_for(state, aim)
+    except TransitionError:
+        return 0  # nothing leads there: power off, and wait to be told more
+
+
+_WORDS: Final = {state: {aim: _word(state, aim) for aim in State} for state in State}
+
+
 class PowerWalk:
     """Walks a drive through its states, one statusword in and one controlword out at a time.
 
@@ -265,9 +278,7 @@ class PowerWalk:
         if self._aim is State.QUICK_STOP_ACTIVE and self._state is not State.QUICK_STOP_ACTIVE:
             # Also blind, when nothing is known about the drive: a quick stop harms in no state.
             return Command.QUICK_STOP.word
-        if self._state is not self._aim and _FIRST_ROWS[self._state, self._aim] is None:
-            return 0
-        return controlword_for(self._state, self._aim)
+        return _WORDS[self._state][self._aim]
 
 
 def states_on_the_way(state: State, target: State) -> Iterator[State]:
