@@ -141,18 +141,18 @@ def lockstep_bench(
 ) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
     """A simulated drive that moves ``machine``, and the master's bus and clock to it.
 
+    The drive has been switched on, and its boot-up message sent, before the master joins the bus.
     ``channel`` names the python-can virtual channel (by default one of its own), so that a test may listen
     or interfere there. ``others`` are further nodes to be polled.
     """
     channel = channel or f"hdbridge-{uuid4()}"
     clock = VirtualClock()
-    with (
-        can.Bus(interface="virtual", channel=channel, ignore_config=True) as node_bus,
-        LockstepBus(channel, clock) as bus,
-    ):
+    with can.Bus(interface="virtual", channel=channel, ignore_config=True) as node_bus:
         node = SimulatedDrive(node_bus, machine, eds_path, node_id, clock, nameplate)
+        node.poll(clock.now())
         clock.nodes += [node, *others]
-        yield bus, clock, node
+        with LockstepBus(channel, clock) as bus:
+            yield bus, clock, node
 
 
 @contextmanager

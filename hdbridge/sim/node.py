@@ -76,6 +76,7 @@ class SimulatedDrive:
         self.bus = bus
         self.node_id = node_id
         self.faults = Faults()
+        self.lost_frames = 0
         self.dictionary = Dictionary(Path(eds_path), node_id)
         (nameplate or Nameplate()).engrave(self.dictionary)
         self.dictionary.restore()
@@ -100,9 +101,8 @@ class SimulatedDrive:
             entry[0x60C2, sub].follower = lambda _: self._take_period()
 
     def _begin(self) -> None:
-        """Start from the dictionary as it stands, with a boot-up message."""
+        """Start from the dictionary as it stands; the boot-up message is still to come."""
         self.nmt = Nmt.INITIALISING
-        self._boot_up_pending = True
         self._sdo.reset()
         self._take_period()
         self._run_due_s = self._now_s + self._period_s
@@ -112,6 +112,10 @@ class SimulatedDrive:
         self._watch_heartbeat()
         self._start_heartbeat()
         self._due_s = self._now_s
+
+    def _boot(self) -> None:
+        self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
+        self._enter(Nmt.PRE_OPERATIONAL)
 
     def _take_period(self) -> None:
         value = self.dictionary.value
@@ -147,9 +151,16 @@ class SimulatedDrive:
     def poll(self, now_s: float) -> None:
         """Take in all frames that have come, answer them, and do what is due until ``now_s``."""
         self._now_s = now_s
+        if self.nmt is Nmt.INITIALISING:
+            self._boot()
         receive = self.bus.recv
         while (message := receive(0)) is not None:
             self.handle(message, now_s)
+        self.run_until(now_s)
+
+    def run_until(self, now_s: float) -> None:
+        """Do what is due until ``now_s`` without looking at the bus; ``poll`` ends with it."""
+        self._now_s = now_s
         if self.faults.concerns_poll:
             self._make_faults()
         if now_s >= self._due_s:
@@ -183,8 +194,12 @@ class SimulatedDrive:
     # ---------------------------------------------------------------- frames
 
     def _send(self, can_id: int, data: bytes) -> None:
-        if not self.faults.silent:
+        if self.faults.silent:
+            return
+        try:
             self.bus.send(frame(can_id, data))
+        except can.CanOperationError:
+            self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and carries on
 
     def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
         if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
@@ -242,6 +257,7 @@ class SimulatedDrive:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
             self.dictionary.restore(0x1000, 0x1FFF)
             self._begin()
+            self._boot()
 
     def _enter(self, state: Nmt) -> None:
         if self.nmt is state:
@@ -263,6 +279,7 @@ class SimulatedDrive:
         self.emergency.reset()
         self.firmware.reset()
         self._begin()
+        self._boot()
 
     def _on_watched_heartbeat(self, now_s: float) -> None:
         self._watch_due_s = now_s + self._watched_s
@@ -288,10 +305,6 @@ class SimulatedDrive:
         return due_s
 
     def _do_what_is_due(self, now_s: float) -> None:
-        if self._boot_up_pending:
-            self._boot_up_pending = False
-            self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
-            self._enter(Nmt.PRE_OPERATIONAL)
         self._run_due_s = max(self._run_due_s, now_s - LONGEST_CATCH_UP_S)
         while self._run_due_s <= now_s:
             self._run_due_s += self._period_s

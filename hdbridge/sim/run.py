@@ -1,0 +1,44 @@
+"""The simulated drive in real time, on any bus: one thread waits for a frame or the drive's next event."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import can
+
+from hdbridge.clock import Clock
+from hdbridge.errors import BusError
+from hdbridge.sim.node import SimulatedDrive
+
+LONGEST_WAIT_S: Final = 0.1
+"""How long ``should_stop`` may go unasked."""
+
+PATIENCE_S: Final = 5.0
+"""How long reading the bus may fail without a break: an interface that is down may come up again."""
+
+
+def run(bus: can.BusABC, node: SimulatedDrive, clock: Clock, should_stop: Callable[[], bool]) -> None:
+    """Serve ``node``, whose bus is ``bus``, until ``should_stop`` says so.
+
+    While the interface fails the drive goes on by its own clock, so that its watchdogs stop the axis. Raises
+    BusError when reading has failed for ``PATIENCE_S``.
+    """
+    failing_since_s: float | None = None
+    while not should_stop():
+        try:
+            wait_s = min(node.next_event_s() - clock.now(), LONGEST_WAIT_S)
+            message = bus.recv(max(wait_s, 0.0))
+            if message is not None:
+                node.handle(message, clock.now())
+            node.poll(clock.now())
+            failing_since_s = None
+        except can.CanError as error:
+            now_s = clock.now()
+            failing_since_s = now_s if failing_since_s is None else failing_since_s
+            if now_s - failing_since_s > PATIENCE_S:
+                raise BusError(
+                    f"{bus.channel_info}: cannot be read ({error}); bring the interface up and start again"
+                ) from error
+            node.run_until(now_s)
+            clock.sleep_until(now_s + LONGEST_WAIT_S)
