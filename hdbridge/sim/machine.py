@@ -26,6 +26,7 @@ class Machine:
         self._servo = Servo(truth)
         self._powered = False
         self._hold_counts: float | None = None
+        self._hold_deg = 0.0
         self._torque_nm = 0.0
         self._copper_loss_w = truth.temperature.copper_loss_w / truth.motor.rated_torque_nm**2
         motor, load = truth.motor.encoder, truth.load_.encoder
@@ -48,7 +49,7 @@ class Machine:
         conditions = plant.now
         if not self._powered:
             self._powered = True
-            servo.engage(conditions.motor_deg, plant.motor_deg_s)
+            self._hold_deg = servo.engage(conditions.motor_deg, plant.motor_deg_s)
             near = abs(self._motor_reading() - start_counts) <= 1.0
             self._hold_counts = start_counts if near else None
         zero = self.truth.motor.encoder.zero_counts
@@ -56,7 +57,7 @@ class Machine:
         speed = (end_counts - start_counts) / self._motor_counts_per_deg / (substeps * self.dt_s)
         if self._hold_counts is not None:
             if start_counts == end_counts == self._hold_counts:
-                demand = servo.standing_deg
+                demand = self._hold_deg
             else:
                 self._hold_counts = None
         dt = self.dt_s

@@ -23,26 +23,9 @@ class Plant:
     """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
 
     __slots__ = (
-        "_arm",
-        "_coulomb",
-        "_coupling",
-        "_damping",
-        "_drag",
-        "_dt",
-        "_encoder_rate",
-        "_flexspline",
-        "_gear",
-        "_inertia",
-        "_load_drag",
-        "_load_friction",
-        "_ratio",
-        "_stiffness",
-        "encoder_deg",
-        "load_deg_s",
-        "loss_j",
-        "motor_deg_s",
-        "now",
-        "output_deg",
+        "_arm", "_coulomb", "_coupling", "_damping", "_drag", "_dt", "_encoder_rate", "_flexspline", "_gear",
+        "_inertia", "_load_drag", "_load_friction", "_ratio", "_stiffness", "encoder_deg", "load_deg_s",
+        "loss_j", "motor_deg_s", "now", "output_deg",
     )  # fmt: skip
 
     def __init__(self, truth: Truth) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from hdbridge.sim.oscillator import exact_step
 from hdbridge.sim.truth import Truth
 
 RAD_PER_DEG = math.pi / 180.0
@@ -20,9 +21,10 @@ class Servo:
     """Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
 
     __slots__ = (
-        "_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction", "_integral",
-        "_integral_rate", "_last_reference", "_measured", "_position_gain", "_reference", "_reference_speed",
-        "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
+        "_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction",
+        "_hunting_band", "_integral", "_integral_rate", "_last_reference", "_load_ahead", "_load_gain", "_load_model",
+        "_load_speed", "_measured", "_position_gain", "_reference", "_reference_speed", "_step_deg",
+        "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
         "measured_deg_s",
     )  # fmt: skip
 
@@ -37,26 +39,28 @@ class Servo:
         self._integral_rate = self._velocity_gain * dt / (servo.integral_time_ms / 1000.0)
         self._velocity_feedforward = servo.velocity_feedforward
         self._acceleration_gain = servo.inertia_feedforward_kg_m2 * RAD_PER_DEG / dt
+        load = servo.load_feedforward
+        self._load_model = exact_step(math.tau * load.frequency_hz, load.damping_ratio, dt) if load else None
+        self._load_gain = load.inertia_kg_m2 * RAD_PER_DEG / dt if load else 0.0
         self._viscous = servo.viscous_feedforward_nm_s_per_rad * RAD_PER_DEG
         self._friction = servo.friction_feedforward_nm
         self._steps_per_deg = encoder.counts_per_turn * encoder.interpolation / 360.0
         self._step_deg = 1.0 / self._steps_per_deg
         self._dead_band = (servo.integral_dead_band + 0.5) * self._step_deg
+        self._hunting_band = (servo.hunting_band + 0.5) * self._step_deg
         self.limit_nm = truth.motor.rated_torque_nm * servo.torque_limit_percent / 100.0
         """Highest torque, either way."""
         self.engage(0.0, 0.0)
 
-    def engage(self, motor_deg: float, motor_deg_s: float) -> None:
-        """Start from where the motor is: no torque, no error."""
+    def engage(self, motor_deg: float, motor_deg_s: float) -> float:
+        """Start from where the motor is, without torque or error; returns its angle as the loops see it."""
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
+        self._load_ahead = 0.0
+        self._load_speed = motor_deg_s
         self._integral = 0.0
         self._direction = 0.0
-
-    @property
-    def standing_deg(self) -> float:
-        """Where the motor stood, as the loops see it, when they last looked."""
         return self._measured
 
     def torque_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
@@ -85,10 +89,11 @@ class Servo:
         self._last_reference = reference
         speed_error = self._velocity_feedforward * wanted_speed + self._position_gain * error - measured_speed
         rests = -self.AT_REST_DEG_S < new_speed < self.AT_REST_DEG_S
-        if not rests:
-            self._direction = 1.0 if new_speed > 0.0 else -1.0
         integral = self._integral
-        if not rests or error > self._dead_band or error < -self._dead_band:
+        if not rests and new_speed * self._direction <= 0.0:
+            integral = self._turn(1.0 if new_speed > 0.0 else -1.0)
+        short = error * self._direction
+        if not rests or short > self._dead_band or short < -self._hunting_band:
             integral += self._integral_rate * speed_error
         torque = (
             self._velocity_gain * speed_error
@@ -97,6 +102,8 @@ class Servo:
             + self._viscous * new_speed
             + self._friction * self._direction
         )
+        if self._load_model is not None:
+            torque += self._load_torque((self._reference - reference) / dt)
         limit = self.limit_nm
         if torque > limit:
             # At the limit the integral may only go back.
@@ -107,6 +114,22 @@ class Servo:
             return -limit
         self._integral = integral
         return torque
+
+    def _load_torque(self, reference_speed: float) -> float:
+        """What a load on a spring needs, on average over the substep, to come along with the reference."""
+        assert self._load_model is not None
+        a, b, c, d = self._load_model
+        ahead, speed = self._load_ahead, self._load_speed
+        slip = speed - reference_speed
+        self._load_ahead = a * ahead + b * slip
+        self._load_speed = new_speed = reference_speed + c * ahead + d * slip
+        return self._load_gain * (new_speed - speed)
+
+    def _turn(self, direction: float) -> float:
+        """Reverse the friction feed-forward; what the integral had already done of it is taken off."""
+        standing = self._integral + self._friction * self._direction
+        self._direction = direction
+        return direction * max(0.0, direction * standing - self._friction)
 
     def _interpolated(self, motor_deg: float) -> float:
         return math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg

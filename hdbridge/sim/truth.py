@@ -70,6 +70,14 @@ class TrueMotor(_Part):
     encoder: TrueMotorEncoder = Field(description="encoder on the motor shaft")
 
 
+class TrueLoadFeedforward(_Part):
+    """The drive's own picture of the load behind the gear's spring, as its commissioning has set it."""
+
+    inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of the load, seen by the motor")
+    frequency_hz: float = Field(ge=1, le=500, description="natural frequency of the load, the motor held")
+    damping_ratio: float = Field(ge=0, le=2, description="damping ratio of the load, the motor held")
+
+
 class TrueServo(_Part):
     """The drive's loops: position and velocity cascade with feed-forward, limited in torque."""
 
@@ -82,15 +90,23 @@ class TrueServo(_Part):
         1.0,
         ge=0,
         le=1_000,
-        description="position error within which the integral rests once the demand does, "
-        "in interpolated steps",
+        description="shortfall within which the integral rests once the demand does, in interpolated steps",
+    )
+    hunting_band: float = Field(
+        16.0,
+        ge=0,
+        le=100_000,
+        description="overshoot within which it rests, so as not to turn back and hunt, in interpolated steps",
     )
     command_filter_ms: float = Field(
         gt=0, le=100, description="time constant of the second-order filter on the demand"
     )
     velocity_feedforward: float = Field(1.0, ge=0, le=1.5, description="part of the demanded speed")
     inertia_feedforward_kg_m2: float = Field(
-        0.0, ge=0, le=100, description="torque per demanded acceleration"
+        0.0, ge=0, le=100, description="torque per demanded acceleration, for the motor itself"
+    )
+    load_feedforward: TrueLoadFeedforward | None = Field(
+        None, description="torque that carries the load along; without it: none"
     )
     viscous_feedforward_nm_s_per_rad: float = Field(
         0.0, ge=0, le=1_000, description="torque per demanded speed"
@@ -218,7 +234,7 @@ class Truth(_Part):
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
     substep_ms: float = Field(
-        0.5, ge=0.05, le=2, description="time step of the simulation and of the drive's loops"
+        0.5, ge=0.05, le=1, description="time step of the simulation and of the drive's loops"
     )
     motor: TrueMotor = Field(description="motor and wave generator")
     servo: TrueServo = Field(description="the drive's loops")
