@@ -18,7 +18,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import CATALOGUE
 from hdbridge.expectation import Field, field_at, key_of, type_words
 from hdbridge.modelfile import ModelFile
 from hdbridge.modelstore import LogFile
@@ -44,21 +43,9 @@ def column_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def effect_tables() -> str:
-    """The parameters of the two parts that every gear has."""
-    parts = []
-    for name in ("synchronous", "hysteresis"):
-        effect = CATALOGUE[name]
-        parts.append(
-            f"### `{name}`: {effect.about.title}\n\n`{effect.about.equation}`\n\n{key_table(effect)}"
-        )
-    return "\n" + "\n".join(parts)
-
-
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
     "model": lambda: key_table(ModelFile),
-    "effects": effect_tables,
     "columns": column_table,
     "recording": lambda: key_table(RecordingFile),
     "history": lambda: key_table(LogFile),

@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from hdbridge.axis import AxisConfig
+from hdbridge.bundled import bundled_profile
+from hdbridge.model import TransmissionModel
+
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "file_reference.py"
 
 
@@ -36,3 +40,11 @@ def test_every_key_has_a_meaning(tool):
         for row in tool.BLOCKS[name]().splitlines()[2:]
     ]
     assert [row for row in rows if row.endswith("|  |")] == []
+
+
+def test_the_model_on_the_page_is_right(tool):
+    page = tool.PAGE.read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    model = TransmissionModel.from_text(example)
+    assert [each.name for each in model.effects] == ["synchronous", "hysteresis"]
+    model.check_bound_to(AxisConfig.load(bundled_profile("article")))
