@@ -112,7 +112,7 @@ class Supervision:
     Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
     """
 
-    __slots__ = ("_frozen", "_runs", "counts", "events", "stop")
+    __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "stop")
 
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}
@@ -122,7 +122,9 @@ class Supervision:
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
         """Cycles in which each fault was seen."""
         self.stop: Event | None = None
-        """What stopped the axis (the gravest, of equals the first), or None while it may run."""
+        """What stopped the axis, the first cause, or None while it may run."""
+        self.gravest: Event | None = None
+        """What decides how it is stopped: the first cause, or something graver that came of it."""
 
     @property
     def quiet(self) -> bool:
@@ -132,7 +134,7 @@ class Supervision:
     @property
     def reaction(self) -> Reaction:
         """The latched reaction; GO when nothing is latched."""
-        return self.stop.reaction if self.stop is not None else Reaction.GO
+        return self.gravest.reaction if self.gravest is not None else Reaction.GO
 
     def judge(self, cycle: int, faults: Iterable[tuple[Fault, str]]) -> Reaction:
         """The reaction to one cycle's faults, each with its detail for a person; none is a good cycle.
@@ -164,20 +166,24 @@ class Supervision:
         event = Event(cycle, fault, reaction, detail)
         self.events.append(event)
         self.counts[fault] += 1
-        if reaction >= Reaction.QUICK_STOP and reaction > self.reaction:
-            self.stop = event
+        if reaction >= Reaction.QUICK_STOP:
+            self.stop = self.stop or event
+            if reaction > self.reaction:
+                self.gravest = event
         return reaction
 
     def error(self) -> SafetyStop:
         """The latched stop as the error to raise."""
-        stop = self.stop
+        stop, gravest = self.stop, self.gravest
         assert stop is not None, "there is no stop to report"
+        assert gravest is not None
         row = ROWS[stop.fault]
         detail = f" ({stop.detail})" if stop.detail else ""
         again = ", the second cycle in a row" if row.first < row.then else ""
-        done = "quick stop" if stop.reaction is Reaction.QUICK_STOP else "set-points stopped"
+        done = "quick stop" if self.reaction is Reaction.QUICK_STOP else "set-points stopped"
+        then = "" if gravest is stop else f"; then {gravest.fault.value}"
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}: {done}, latched; {row.hint}"
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}: {done}, latched; {row.hint}"
         )
 
     def reset(self, *, verified: bool = False) -> None:
@@ -187,6 +193,6 @@ class Supervision:
         """
         if self.reaction is Reaction.LATCH and not verified:
             raise self.error()
-        self.stop = None
+        self.stop = self.gravest = None
         self._runs = {}
         self._frozen = False

@@ -1,0 +1,150 @@
+"""A simulated axis on a virtual clock, enabled and moving, with an intruder's bus on the same channel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import uuid4
+
+import can
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.cycle import Cycle, Feedback
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.objects import Mode
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault, Reaction, Supervision
+from hdbridge.errors import SafetyStop
+from hdbridge.sim.lockstep import LockstepBus, VirtualClock, simulated_bench
+from hdbridge.sim.node import SimulatedDrive
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+STEP_COUNTS = 40
+"""Target step per cycle: 9 load degrees per second at 4 ms."""
+
+
+class SpoiltBus(LockstepBus):
+    """The master's end of the channel, with an interface that can fail."""
+
+    send_error: Exception | None = None
+    recv_error: Exception | None = None
+    sent: list[tuple[float, int, bytes]]
+
+    def __init__(self, bus: LockstepBus, channel: str, clock: VirtualClock) -> None:
+        bus.shutdown()
+        super().__init__(channel, clock)
+        self.clock = clock
+        self.sent = []
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.send_error is not None:
+            raise self.send_error
+        self.sent.append((self.clock.now(), msg.arbitration_id, bytes(msg.data)))
+        super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self.recv_error is not None:
+            raise self.recv_error
+        return super().recv(timeout)
+
+
+@dataclass
+class Rig:
+    """An axis under way, and everything a test may turn."""
+
+    bus: SpoiltBus
+    clock: VirtualClock
+    node: SimulatedDrive
+    drive: Drive
+    cycle: Cycle
+    supervision: Supervision
+    intruder: can.BusABC
+    target: int = 0
+
+    def enable(self) -> None:
+        self.drive.enable(Mode.CSP)
+        self.cycle.restart()
+        for _ in range(50):
+            feedback = self.cycle.tick()
+            if self.drive.image.power.state is State.OPERATION_ENABLED:
+                break
+        assert self.drive.image.power.state is State.OPERATION_ENABLED
+        self.target = feedback.motor_counts
+
+    def move(self, cycles: int = 1) -> Feedback:
+        """Go on at constant speed."""
+        for _ in range(cycles):
+            self.target += STEP_COUNTS
+            feedback = self.cycle.tick(self.target)
+        return feedback
+
+    def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
+        """A frame from another node, on the bus before the next cycle."""
+        kind = {"is_extended_id": False, **kind}
+        self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
+
+    def events(self, fault: Fault) -> list[Reaction]:
+        return [event.reaction for event in self.supervision.events if event.fault is fault]
+
+    def stopped_within(self, cycles: int, fault: Fault) -> str:
+        """Go on until the stop comes, which must be by this many cycles and for this fault; its text."""
+        first = self.drive.image.target_counts
+        for _ in range(cycles):
+            try:
+                self.move()
+            except SafetyStop as stop:
+                assert self.supervision.stop is not None
+                assert self.supervision.stop.fault is fault
+                return str(stop)
+        raise AssertionError(f"no stop within {cycles} cycles; target went from {first} to {self.target}")
+
+    def stands_still(self) -> None:
+        """Time passes without the master: the axis comes to rest where it is, and stays."""
+        self.clock.sleep_until(self.clock.now() + 1.0)
+        place = self.node.firmware.motion.machine.motor_counts
+        self.clock.sleep_until(self.clock.now() + 0.5)
+        assert abs(self.node.firmware.motion.machine.motor_counts - place) <= 2
+        assert abs(place - self.target) < 8000
+
+    def frames(self, can_id: int) -> list[tuple[float, bytes]]:
+        return [(time_s, data) for time_s, sent, data in self.bus.sent if sent == can_id]
+
+
+@contextmanager
+def rig(profile: Path = PROFILE) -> Iterator[Rig]:
+    axis = AxisConfig.load(profile)
+    channel = f"cycle-{uuid4()}"
+    with simulated_bench(profile / "truth.yaml", axis.eds_path, axis.drive.node_id, channel=channel) as (
+        bus,
+        clock,
+        node,
+    ):
+        intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+        with intruder, SpoiltBus(bus, channel, clock) as spoilt:
+            drive = Drive(spoilt, axis, clock)
+            drive.boot()
+            supervision = Supervision()
+            cycle = Cycle(
+                drive.link, clock, drive.image, supervision, axis.drive.cycle_s, monitor=drive.monitor
+            )
+            yield Rig(spoilt, clock, node, drive, cycle, supervision, intruder)
+
+
+@pytest.fixture
+def idle() -> Iterator[Rig]:
+    """Booted, not enabled."""
+    with rig() as made:
+        yield made
+
+
+@pytest.fixture
+def moving() -> Iterator[Rig]:
+    """Enabled and moving at constant speed."""
+    with rig() as made:
+        made.enable()
+        made.move(60)
+        made.bus.sent.clear()
+        yield made

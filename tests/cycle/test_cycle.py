@@ -1,0 +1,145 @@
+"""The control cycle on the simulated drive and a virtual clock: its order, its deadlines, its answers."""
+
+from __future__ import annotations
+
+import struct
+from itertools import pairwise
+
+import pytest
+
+from hdbridge.cycle import Feedback
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault
+
+STEP_COUNTS = 40
+
+
+def test_sync_comes_first_and_the_rpdo_after_the_feedback(moving) -> None:
+    seen = []
+
+    def command(feedback: Feedback) -> int:
+        seen.append([can_id for _, can_id, _ in moving.bus.sent])
+        return moving.target
+
+    moving.cycle.tick(command)
+    assert seen == [[0x080]]
+    assert [can_id for _, can_id, _ in moving.bus.sent][:2] == [0x080, 0x201]
+
+
+def test_syncs_come_on_absolute_deadlines(moving) -> None:
+    moving.move(100)
+    times = [time_s for time_s, _ in moving.frames(0x080)]
+    assert len(times) == 100
+    for count, time_s in enumerate(times):
+        assert time_s == pytest.approx(times[0] + 0.004 * count, abs=1e-9)
+    assert moving.cycle.histogram.maximum_us == 0
+
+
+def test_work_between_ticks_does_not_shift_the_deadlines(moving) -> None:
+    for _ in range(20):
+        moving.clock.sleep_until(moving.clock.now() + 0.0015)
+        moving.move()
+    times = [time_s for time_s, _ in moving.frames(0x080)]
+    assert times[-1] - times[0] == pytest.approx(0.004 * 19, abs=1e-9)
+    assert moving.cycle.overruns == 0
+
+
+def test_the_feedback_follows_the_target(moving) -> None:
+    first = moving.move()
+    last = moving.move(50)
+    assert last.fresh
+    assert last.cycle == first.cycle + 50
+    assert last.time_s == pytest.approx(last.cycle * 0.004)
+    assert last.motor_counts - first.motor_counts == pytest.approx(50 * STEP_COUNTS, abs=STEP_COUNTS)
+    ratio = 50 * 8000 / 2_880_000
+    assert (last.load_counts - first.load_counts) * ratio == pytest.approx(50 * STEP_COUNTS, abs=300)
+    assert last.demand_counts == pytest.approx(last.motor_counts, abs=200)
+
+
+def test_the_rpdo_carries_controlword_and_target(moving) -> None:
+    moving.move()
+    assert moving.frames(0x201)[-1][1] == struct.pack("<Hi", 0x0F, moving.target)
+
+
+def test_a_command_of_none_holds_the_last_target(moving) -> None:
+    moving.move()
+    moving.cycle.tick(None)
+    moving.cycle.tick(lambda feedback: None)
+    targets = [struct.unpack("<Hi", data)[1] for _, data in moving.frames(0x201)]
+    assert targets == [moving.target] * 3
+
+
+def test_before_the_drive_is_enabled_the_target_is_where_it_stands(idle) -> None:
+    for _ in range(10):
+        feedback = idle.cycle.tick(123_456)
+    assert idle.drive.image.power.state is not State.OPERATION_ENABLED
+    for _, data in idle.frames(0x201):
+        assert struct.unpack("<Hi", data)[1] == feedback.motor_counts
+
+
+def test_the_master_sends_its_heartbeat_at_its_period(moving) -> None:
+    moving.move(250)
+    times = [time_s for time_s, _ in moving.frames(0x77F)]
+    gaps = [b - a for a, b in pairwise(times)]
+    assert max(gaps) <= 0.025 + 0.004 + 1e-9
+    assert len(times) == pytest.approx(40, abs=4)
+    assert all(data == b"\x05" for _, data in moving.frames(0x77F))
+
+
+def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:
+    before = moving.move()
+    moving.clock.sleep_until(moving.clock.now() + 0.007)
+    after = moving.move()
+    assert moving.cycle.overruns == 1
+    assert moving.cycle.skipped == 1
+    assert after.cycle == before.cycle + 2
+    moving.move(10)
+    times = [time_s for time_s, _ in moving.frames(0x080)]
+    gaps = [b - a for a, b in pairwise(times)]
+    assert gaps == pytest.approx([0.008] + [0.004] * 10, abs=1e-9)
+    assert moving.supervision.stop is None
+
+
+def test_late_but_less_than_half_a_period_is_only_recorded(moving) -> None:
+    moving.move()
+    moving.clock.sleep_until(moving.clock.now() + 0.0055)
+    moving.move()
+    assert moving.cycle.overruns == 0
+    assert 1400 <= moving.cycle.histogram.maximum_us <= 1600
+
+
+def test_two_overruns_in_a_row_stop_the_axis(moving) -> None:
+    moving.clock.sleep_until(moving.clock.now() + 0.007)
+    moving.move()
+    moving.clock.sleep_until(moving.clock.now() + 0.007)
+    moving.stopped_within(1, Fault.OVERRUN)
+    moving.stands_still()
+
+
+def test_a_rest_is_not_judged_after_restart(moving) -> None:
+    moving.cycle.tick()
+    number = moving.cycle.tick().cycle
+    moving.drive.image.power.go(State.SWITCHED_ON)
+    for _ in range(10):
+        number = moving.cycle.tick().cycle
+    moving.clock.sleep_until(moving.clock.now() + 0.03)
+    moving.cycle.restart()
+    feedback = moving.cycle.tick()
+    assert feedback.cycle == number + 1
+    assert feedback.fresh
+    assert moving.supervision.stop is None
+    assert moving.cycle.skipped == 0
+
+
+def test_errors_of_the_command_pass_through(moving) -> None:
+    def broken(feedback: Feedback) -> int:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        moving.cycle.tick(broken)
+
+
+def test_the_cycle_keeps_a_bounded_amount_of_memory(moving) -> None:
+    moving.move(300)
+    assert moving.cycle.stopping == []
+    assert len(moving.supervision.events) == 0
