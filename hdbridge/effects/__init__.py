@@ -1,8 +1,11 @@
 """The catalogue: one cause of transmission error per file, found by its name."""
 
+from hdbridge.effects.amplitude_drift import AmplitudeDrift
+from hdbridge.effects.backlash import Backlash
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Compensable,
     Effect,
     FloatArray,
     Moment,
@@ -10,25 +13,121 @@ from hdbridge.effects.base import (
     Shape,
     Start,
     Tracker,
+    unmet,
 )
+from hdbridge.effects.carried import Loop, loop_of, orders_of
+from hdbridge.effects.channel_skew import ChannelSkew
+from hdbridge.effects.combine import compensable, extended, fall_bound, of_another_ratio, refreshed
+from hdbridge.effects.compliance import Compliance
+from hdbridge.effects.count_loss import CountLoss, Step
+from hdbridge.effects.creep import Creep, Relaxation
+from hdbridge.effects.direction_phase import DirectionPhase
+from hdbridge.effects.flexspline_order import FlexsplineOrders
 from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.synchronous import MotorOrder, Synchronous
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.effects.hysteresis_parameters import HysteresisParameters
+from hdbridge.effects.inertial_windup import InertialWindup
+from hdbridge.effects.kinematics import Observer, moments
+from hdbridge.effects.load_order import LoadOrders
+from hdbridge.effects.local_defect import LocalDefect
+from hdbridge.effects.motor_encoder_eccentricity import MotorEncoderEccentricity
+from hdbridge.effects.motor_order import MotorOrders
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.effects.rate_dependence import RateDependence
+from hdbridge.effects.ratio_error import RatioError
+from hdbridge.effects.subdivisional_error import SubdivisionalError
+from hdbridge.effects.synchronous import Synchronous
+from hdbridge.effects.torque_modulation import TorqueModulation
+from hdbridge.effects.velocity_windup import VelocityWindup
+from hdbridge.effects.vibration import Vibration
+from hdbridge.effects.wear import Wear
+from hdbridge.effects.zero_drift import ZeroDrift
 
-CATALOGUE: dict[str, type[Effect]] = {each.name: each for each in (Synchronous, Hysteresis)}
+CATALOGUE: dict[str, type[Effect]] = {
+    each.name: each
+    for each in (
+        Synchronous,
+        Hysteresis,
+        MotorOrders,
+        MotorEncoderEccentricity,
+        LoadOrders,
+        FlexsplineOrders,
+        DirectionPhase,
+        TorqueModulation,
+        Compliance,
+        InertialWindup,
+        VelocityWindup,
+        ChannelSkew,
+        Backlash,
+        HysteresisMemory,
+        HysteresisParameters,
+        RateDependence,
+        SubdivisionalError,
+        ZeroDrift,
+        AmplitudeDrift,
+        Wear,
+        Creep,
+        RatioError,
+        CountLoss,
+        Vibration,
+        LocalDefect,
+    )
+}
 """Every effect by its canonical name."""
+
+CAUSES: tuple[str, ...] = tuple(name for name in CATALOGUE if name not in {"synchronous", "hysteresis"})
+"""Names of the causes that a diagnosis can find beside the two basic parts of a model."""
 
 __all__ = [
     "CATALOGUE",
+    "CAUSES",
+    "AmplitudeDrift",
+    "Backlash",
     "Cause",
     "Channel",
+    "ChannelSkew",
+    "Compensable",
+    "Compliance",
+    "CountLoss",
+    "Creep",
+    "DirectionPhase",
     "Effect",
+    "FlexsplineOrders",
     "FloatArray",
     "Hysteresis",
+    "HysteresisMemory",
+    "HysteresisParameters",
+    "InertialWindup",
+    "LoadOrders",
+    "LocalDefect",
+    "Loop",
     "Moment",
     "Motion",
+    "MotorEncoderEccentricity",
     "MotorOrder",
+    "MotorOrders",
+    "Observer",
+    "RateDependence",
+    "RatioError",
+    "Relaxation",
     "Shape",
     "Start",
+    "Step",
+    "SubdivisionalError",
     "Synchronous",
+    "TorqueModulation",
     "Tracker",
+    "VelocityWindup",
+    "Vibration",
+    "Wear",
+    "ZeroDrift",
+    "compensable",
+    "extended",
+    "fall_bound",
+    "loop_of",
+    "moments",
+    "of_another_ratio",
+    "orders_of",
+    "refreshed",
+    "unmet",
 ]

@@ -6,19 +6,25 @@ and named as a cause. Batch and on-line give the same numbers; `tests/effects` h
 
 An effect is a frozen pydantic model: its fields are the parameters of the model file, with the unit in the
 name, a physical range and a description. Nothing here does any I/O.
+
+Speed, acceleration and direction are channels like any other: they are those of the *uncompensated* command
+(`kinematics.py` defines them once), so an effect that depends on them does not depend on the angle that the
+inverse is trying out. Otherwise one cycle's correction would be differenced into the next one's.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hdbridge.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +36,14 @@ class Channel(Enum):
     LOAD_TORQUE = "load_torque_nm"
     MOTOR_TORQUE = "motor_torque_nm"
     TEMPERATURE = "temperature_c"
+    SPEED = "motor_speed_deg_s"
+    """Of the command; derived from angle and time where it is not given."""
+    ACCELERATION = "motor_acceleration_deg_s2"
+    """Of the command; derived from angle and time where it is not given."""
+    DIRECTION = "direction"
+    """Sign of the last motion of the command, held at rest; always derived."""
+    LOAD_ANGLE = "load_deg"
+    """Predicted load angle: motor angle / N plus the model's error (never the noisy measured one)."""
 
 
 class Start(Enum):
@@ -45,12 +59,21 @@ class Start(Enum):
 
 
 class Moment(NamedTuple):
-    """The channels of one control cycle; the motor angle is given apart, because the inverse varies it."""
+    """The channels of one control cycle; the motor angle is given apart, because the inverse varies it.
+
+    `kinematics.Observer` makes one per cycle from the command, with the derived channels filled in.
+    """
 
     time_s: float = 0.0
     load_torque_nm: float = 0.0
     motor_torque_nm: float = 0.0
     temperature_c: float = 20.0
+    motor_speed_deg_s: float = 0.0
+    motor_acceleration_deg_s2: float = 0.0
+    direction: int = 0
+    """1 or -1, held at rest; 0 before the first motion: then what `Start` says counts."""
+    load_deg: float = 0.0
+    """Predicted load angle, degrees of the load, multi-turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +90,39 @@ class Motion:
     load_torque_nm: FloatArray | None = None
     motor_torque_nm: FloatArray | None = None
     temperature_c: FloatArray | None = None
+    motor_speed_deg_s: FloatArray | None = None
+    """Given where something better is known than differences of a quantised angle."""
+    motor_acceleration_deg_s2: FloatArray | None = None
+    load_deg: FloatArray | None = None
+    """Predicted load angle, degrees of the load; only the load encoder's own lines need it so exactly."""
 
     def __len__(self) -> int:
         """Number of samples."""
         return len(self.motor_deg)
+
+    def available(self) -> frozenset[Channel]:
+        """The channels that these arrays give, derived ones included."""
+        found = {each for each in Channel if getattr(self, each.value, None) is not None}
+        found.add(Channel.DIRECTION)
+        if self.time_s is not None:
+            found |= {Channel.SPEED, Channel.ACCELERATION}
+        return frozenset(found)
+
+    def channel(self, channel: Channel, effect: str) -> FloatArray:
+        """A channel as given, shape (n,); InputError where it is not, naming the effect that asks."""
+        values: FloatArray | None = getattr(self, channel.value, None)
+        if values is None:
+            raise missing_error(effect, frozenset({channel}))
+        return values
+
+
+def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
+    """The one complaint about channels that are not there."""
+    names = ", ".join(sorted(each.value for each in channels))
+    return InputError(
+        f"the effect '{effect}' needs the channel {names}, which is not there; "
+        "record it (a column of that name), or leave the effect out of the model"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +156,16 @@ class Cause:
     """Names of the causes it can be taken for."""
     source: str = ""
     """Where the equation comes from."""
+    size: str = ""
+    """How large it typically is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compensable:
+    """Whether the compensation should make up for an effect, and why (not)."""
+
+    possible: bool
+    why: str
 
 
 class Tracker(ABC):
@@ -133,9 +195,15 @@ class Effect(BaseModel, ABC):
     """The canonical name: in model files, findings and tests."""
     about: ClassVar[Cause]
     channels: ClassVar[frozenset[Channel]] = frozenset()
-    """What it needs beside the motor angle."""
+    """What it needs beside the motor angle as a rule; an instance's own needs: `needs`."""
+    compensable: ClassVar[Compensable]
+    """Whether the load really moves so, and can be told in advance; see `is_compensable`."""
+    replaces: ClassVar[str] = ""
+    """Name of the effect in whose place it stands in a model, where it does not add to the others."""
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Its non-linear parameters; all others are spoken for by `columns`."""
+    typical: ClassVar[Mapping[str, Any]] = {}
+    """Parameters of typical size, for `candidate`."""
 
     @abstractmethod
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -169,9 +237,78 @@ class Effect(BaseModel, ABC):
         3600 / N. Hysteresis only ever rises along its path, so its bound is zero.
         """
 
+    @classmethod
+    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
+        """One of typical size for a gear of this ratio, to start a fit or a plan from.
+
+        An effect that carries orders or a loop (because it modulates them) takes them from the effects in
+        ``base``, or typical ones where these have none.
+        """
+        values = {**cls.typical, **cls._carried(base)}
+        if "ratio" in cls.model_fields:
+            values["ratio"] = ratio
+        return cls(**values)
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:  # noqa: ARG003
+        """Parameters that are copies of what a model has."""
+        return {}
+
     def parameters(self) -> dict[str, Any]:
         """The parameters as the model file has them."""
         return self.model_dump(mode="json")
+
+    def needs(self) -> frozenset[Channel]:
+        """The channels that this very effect needs, as its parameters have it."""
+        return self.channels
+
+    def is_compensable(self) -> bool:
+        """Whether the compensation should make up for this very effect."""
+        return self.compensable.possible
+
+    def violations(self) -> list[str]:
+        """Parameters outside their physical ranges, in words; `fitted` does not refuse them."""
+        try:
+            type(self).model_validate(self.parameters())
+        except ValidationError as error:
+            return [
+                f"{'.'.join(map(str, each['loc'])) or self.name}: {each['msg']}" for each in error.errors()
+            ]
+        return []
+
+
+class Linear(Effect):
+    """Base for effects whose coefficients simply are some of their parameters: `linear` names them.
+
+    `columns` is all that is left to write, in the unit of the parameters.
+    """
+
+    linear: ClassVar[tuple[str, ...]]
+    """The parameters that the error is linear in, in the order of the columns."""
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
+
+    def coefficients(self) -> FloatArray:
+        """The linear parameters, in their units."""
+        return np.array([getattr(self, each) for each in self.linear], dtype=np.float64)
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Other linear parameters, and other shape parameters where given."""
+        values = dict(zip(self.linear, map(float, coefficients), strict=True))
+        return self.model_copy(update={**values, **dict(shape or {})})
+
+
+def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str, frozenset[Channel]]:
+    """Per effect the channels that it needs and that are not there; empty when all is well.
+
+    ``available`` is `Motion.available()` for a record, or what a control loop can supply. On line nothing
+    complains later: a `Moment` has defaults, so ask before the axis moves.
+    """
+    lacking = {each.name: each.needs() - available for each in effects}
+    return {name: channels for name, channels in lacking.items() if channels}
 
 
 class Memoryless(Tracker):

@@ -17,12 +17,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Motion, Shape, Start, Tracker
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
@@ -53,23 +63,31 @@ def rise_at(xi: float, n: float) -> float:
 
 
 class Hysteresis(Effect):
-    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, limited to the offset."""
+    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, to the offset."""
 
     name: ClassVar[str] = "hysteresis"
     about: ClassVar[Cause] = Cause(
         title="nonlinear-elastic transmission error (hysteresis)",
-        equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; xi = |theta_M - theta_M,rev| / width",
-        signature="a loop of constant height between the two directions; after a reversal it takes a fixed motor angle to cross",
+        equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; "
+        "xi = |theta_M - theta_M,rev| / width",
+        signature="a loop of constant height between the two directions; after a reversal it takes a fixed "
+        "motor angle to cross",
         consequence="the load arrives short of its target, from either side",
         remedy="compensate it; it grows with preload and friction in the mesh",
         experiment="slow sines of several amplitudes, some smaller than the width",
         aliases=("backlash",),
         source="rolling-friction law with exponent n; the height is twice the offset",
+        size="10-80 arcsec from side to side",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, and the command says where it reverses"
     )
     shape: ClassVar[tuple[Shape, ...]] = (
         Shape("width_deg", 0.5, 120.0, logarithmic=True),
         Shape("exponent", 1.02, 4.0),
     )
+    typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
+    """A published gear of ratio 50."""
 
     offset_arcsec: Annotated[
         float, Field(ge=0, le=3600, description="half the height of the loop, at the load")
@@ -149,7 +167,8 @@ class _HysteresisTracker(Tracker):
     """State: the present branch (where it began, from which value, in which direction) and the last angle."""
 
     __slots__ = (
-        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_value", "_virgin", "_width",
+        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_value", "_virgin",
+        "_width",
     )  # fmt: skip
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start) -> None:

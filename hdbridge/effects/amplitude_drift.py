@@ -1,0 +1,118 @@
+"""Ripple and friction change with temperature."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.carried import Loop, loop_of, orders_of
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+from hdbridge.effects.warmth import Warmed, WarmthState
+
+
+class AmplitudeDrift(Linear, Warmed):
+    """w (ripple S(theta_M) + friction H): ripple and loop of the model follow the gear's warmth w."""
+
+    name: ClassVar[str] = "amplitude_drift"
+    about: ClassVar[Cause] = Cause(
+        title="ripple and friction change with temperature",
+        equation="w (ripple S + friction H), S the model's orders, H its loop, w the gear's warmth as in "
+        "zero_drift",
+        signature="the ripple within a motor turn, or the height of the loop, follows the temperature",
+        consequence="a compensation measured warm is wrong in the cold morning",
+        remedy="warm up before work; calibrate at working temperature; compensate it with a temperature "
+        "sensor",
+        experiment="the same sweeps both ways cold, while it soaks, and warm, at one load",
+        aliases=("torque_modulation", "wear", "hysteresis_parameters"),
+        source="first-order dependence on temperature with a first-order lag",
+        size="10-30 % over the warm-up",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+    )
+    linear: ClassVar[tuple[str, ...]] = ("ripple_percent_per_k", "friction_percent_per_k")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "ripple_percent_per_k": 0.5,
+        "friction_percent_per_k": -0.5,
+        "tau_s": 1800.0,
+    }
+    """Half a per cent per kelvin, the loop falling."""
+
+    orders: Orders
+    loop: Annotated[Loop, Field(description="the model's loop")]
+    ripple_percent_per_k: Annotated[
+        float, Field(ge=-10, le=10, description="growth of the orders per kelvin")
+    ]
+    friction_percent_per_k: Annotated[
+        float, Field(ge=-10, le=10, description="growth of the loop per kelvin")
+    ]
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """One per cent per kelvin of ripple and of loop, shape (n, 2)."""
+        ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
+        parts = np.column_stack([ripple, self.loop.law().predict(motion, start)])
+        columns: FloatArray = 0.01 * self.warmth(motion)[:, np.newaxis] * parts
+        return columns
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; in thermal equilibrium at its first moment."""
+        return _Tracker(self, start)
+
+    def bound_arcsec(self) -> float:
+        """At the highest warmth."""
+        ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
+        return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k) * self.loop.offset_arcsec)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """The ripple's steepest fall; no bound where the loop changes: it falls as steeply as the loop rises.
+
+        Beside the model's loop, of which it takes only a share, the sum does not fall: `combine.fall_bound`.
+        """
+        return self.ripple_fall() if not self.friction_percent_per_k else math.inf
+
+    def ripple_fall(self) -> float:
+        """The ripple's steepest fall alone, arcsec per motor degree."""
+        slope = sum(each.order * each.amplitude_arcsec for each in self.orders)
+        return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope
+
+    def loop_share(self) -> float:
+        """The largest share of the loop that it may take away."""
+        return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"orders": orders_of(base), "loop": loop_of(base)}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_friction", "_loop", "_orders", "_ripple", "_warmth")
+
+    def __init__(self, effect: AmplitudeDrift, start: Start) -> None:
+        self._orders = OrderTracker(phasors(effect.orders))
+        self._loop = effect.loop.law().tracker(start)
+        self._ripple = 0.01 * effect.ripple_percent_per_k
+        self._friction = 0.01 * effect.friction_percent_per_k
+        self._warmth = WarmthState(effect)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        ripple = self._ripple * self._orders.peek(motor_deg, moment)
+        return self._warmth.at(moment) * (ripple + self._friction * self._loop.peek(motor_deg, moment))
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        ripple = self._ripple * self._orders.peek(motor_deg, moment)
+        return self._warmth.to(moment) * (ripple + self._friction * self._loop.advance(motor_deg, moment))

@@ -1,0 +1,104 @@
+"""A dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.play import Stop, stop
+from hdbridge.units import ARCSEC_PER_DEG
+
+_SOFTNESS = 1.25
+
+
+class Backlash(Linear):
+    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap, on either side.
+
+    In an ideal gap the load rests while the motor crosses ``gap N / 3600`` degrees, and then the total has no
+    inverse: many motor angles give one load angle. `crossing_deg` may be larger (a soft contact); from 1.25
+    times the ideal on the compensation can invert it, and then makes the motor jump most of the gap at once.
+    """
+
+    name: ClassVar[str] = "backlash"
+    about: ClassVar[Cause] = Cause(
+        title="backlash behind the gear",
+        equation="-(gap / 2) s, s = clip(s_before + 2 d theta_M / crossing, -1, 1)",
+        signature="after each reversal the load rests while the motor moves on, then it follows: a loop "
+        "opposite in sense "
+        "to the elastic one, crossed within a fraction of a motor degree",
+        consequence="the load lags by half the gap on either side, and is free within the gap",
+        remedy="tighten the coupling or key; preload the axis by torque; compensate what is left",
+        experiment="reversals with a load torque to one side: it holds the play closed, hysteresis stays",
+        aliases=("hysteresis_parameters", "wear", "hysteresis_memory"),
+        source="play operator (dead zone with a resting load)",
+        size="2-36 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "as long as friction holds the load against one side; the motor has to jump the gap at each "
+        "reversal, so with "
+        "a load that swings freely leave it out",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
+    linear: ClassVar[tuple[str, ...]] = ("gap_arcsec",)
+
+    gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
+    crossing_deg: Annotated[
+        float, Field(gt=0, le=360, description="motor angle that crosses it; at least gap N / 3600")
+    ]
+
+    @classmethod
+    def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
+        """A gap that takes ``softness`` times its ideal motor angle; from 1.25 on it has an inverse."""
+        crossing = max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
+        return cls(gap_arcsec=gap_arcsec, crossing_deg=crossing)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """A gap of one arcsec, shape (n, 1)."""
+        return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; its first `advance` only says where the motor stands."""
+        return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
+
+    def bound_arcsec(self) -> float:
+        """Half the gap."""
+        return 0.5 * self.gap_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """The gap over the angle that crosses it."""
+        return self.gap_arcsec / self.crossing_deg
+
+    @classmethod
+    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
+        """A gap of 10 arcsec."""
+        return cls.of_gap(10.0, ratio)
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_height", "_stop")
+
+    def __init__(self, height: float, play: Stop) -> None:
+        self._height = height
+        self._stop = play
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._height * self._stop.at(motor_deg)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._height * self._stop.to(motor_deg)

@@ -1,0 +1,55 @@
+"""What an effect carries of the model that it modulates: orders of the synchronous part, or the loop.
+
+An effect such as `torque_modulation` says "the synchronous part grows with torque". So that it can be
+predicted, tracked and read on its own, it carries a copy of the part that it modulates, taken from the model
+when it is made; `combine.refreshed` keeps the copy in step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.effects.base import Effect
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.effects.synchronous import TYPICAL_ORDERS, Synchronous
+
+
+class Loop(BaseModel):
+    """The elastic loop that is modulated: the parameters of `hysteresis`, and which law it follows."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    offset_arcsec: Annotated[float, Field(ge=0, le=3600, description="half the height, at the load")]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle of a full crossing")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
+    memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
+
+    def law(self) -> Hysteresis | HysteresisMemory:
+        """The effect with these parameters."""
+        kind = HysteresisMemory if self.memory else Hysteresis
+        return kind(offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent)
+
+
+TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
+"""A published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+
+
+def loop_of(base: Iterable[Effect]) -> Loop:
+    """The loop of a model's elastic law, whichever it is; a typical one where it has none."""
+    for each in base:
+        if isinstance(each, Hysteresis | HysteresisMemory):
+            return Loop(**each.parameters(), memory=isinstance(each, HysteresisMemory))
+    return TYPICAL_LOOP
+
+
+def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
+    """The orders of a model's synchronous part; typical ones where it has none."""
+    for each in base:
+        if isinstance(each, Synchronous) and each.orders:
+            return each.orders
+    return TYPICAL_ORDERS

@@ -1,0 +1,97 @@
+"""How effects go together in one model: extend, keep carried parts in step, what may be compensated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from hdbridge.effects.amplitude_drift import AmplitudeDrift
+from hdbridge.effects.base import Effect
+from hdbridge.effects.carried import Loop, loop_of
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.effects.hysteresis_parameters import HysteresisParameters
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.effects.synchronous import Synchronous
+
+_LAWS = (Hysteresis, HysteresisMemory)
+
+
+def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
+    """The effects of a model with a new one.
+
+    It takes the place of one of the same name, or of the one that it replaces (`hysteresis_memory` replaces
+    `hysteresis`, and the other way round); changed hysteresis parameters go into the model's own loop;
+    everything else is added. What other effects carry of the changed one follows (`refreshed`).
+    """
+    given = list(effects)
+    if isinstance(new, HysteresisParameters):
+        new = new.changed().law()
+    old = {new.name, new.replaces} | {each.name for each in given if each.replaces == new.name}
+    places = [i for i, each in enumerate(given) if each.name in old]
+    if places:
+        given[places[0]] = new
+        given = [each for i, each in enumerate(given) if i not in places[1:]]
+    else:
+        given.append(new)
+    return refreshed(given)
+
+
+def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """The same effects; those that carry orders or a loop carry what the model now has.
+
+    Which orders an effect carries stays as it is: only their amplitudes and phases follow.
+    """
+    given = tuple(effects)
+    loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
+    orders = {order.order: order for each in given if isinstance(each, Synchronous) for order in each.orders}
+    return tuple(_refreshed(each, loop, orders) for each in given)
+
+
+def _refreshed(effect: Effect, loop: Loop | None, orders: dict[int, MotorOrder]) -> Effect:
+    update: dict[str, object] = {}
+    if loop is not None and "loop" in type(effect).model_fields:
+        update["loop"] = loop
+    carried = getattr(effect, "orders", ())
+    if effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"} and carried:
+        update["orders"] = tuple(orders.get(each.order, each) for each in carried)
+    return effect.model_copy(update=update) if update else effect
+
+
+def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """The effects that a compensation should make up for: real motions of the load that can be foreseen."""
+    return tuple(each for each in effects if each.is_compensable())
+
+
+def fall_bound(effects: Iterable[Effect]) -> float:
+    """A bound on how steeply the *sum* can fall, arcsec per motor degree.
+
+    The sum of the effects' own bounds, but for one case: what takes a share from the model's loop falls as
+    steeply as the loop rises, and as long as no more than the whole loop is taken, the sum still rises.
+    """
+    given = tuple(effects)
+    left = {
+        _key(Loop(**each.parameters(), memory=isinstance(each, HysteresisMemory))): 1.0
+        for each in given
+        if isinstance(each, _LAWS)
+    }
+    total = 0.0
+    for each in given:
+        if isinstance(each, AmplitudeDrift) and each.friction_percent_per_k:
+            key = _key(each.loop)
+            left[key] = left.get(key, 0.0) - each.loop_share()
+            total += each.ripple_fall() if left[key] >= 0.0 else math.inf
+        else:
+            total += each.slope_bound_arcsec_per_deg()
+    return total
+
+
+def _key(loop: Loop) -> tuple[object, ...]:
+    return tuple(loop.model_dump().values())
+
+
+def of_another_ratio(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
+    """Names of the effects that were made for another gear ratio than the model's."""
+    return tuple(
+        each.name for each in effects if not math.isclose(getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
+    )

@@ -1,0 +1,160 @@
+"""Wind-up of the gear by the load torque: a spring that stiffens at two torques."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.torque_modulation import TorqueChannel, TorqueLimit
+
+ARCSEC_PER_RAD = 648_000.0 / np.pi
+"""A stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
+
+_Softness = Annotated[float, Field(ge=0, le=1000)]
+
+
+class Compliance(Linear):
+    """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
+
+    Written in compliances because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
+    """
+
+    name: ClassVar[str] = "compliance"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by the load torque",
+        equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
+        "206265 arcsec / K",
+        signature="the error follows the torque; with a mass off centre it looks like once per load turn",
+        consequence="the load sags under its weight and gives way to process forces",
+        remedy="compensate it where the torque is known; balance the load; a larger or stiffer gear",
+        experiment="move or take off the mass: the wind-up goes with it, a load order stays",
+        aliases=("load_order", "inertial_windup", "velocity_windup"),
+        source="catalogue stiffness K1, K2, K3 of strain wave gears with torques T1, T2",
+        size="about 16 arcsec/Nm in a size 20; 10-100 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "the load really moves so, where the torque is known on line (a torque sensor, or gravity from a "
+        "model)",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("torque1_nm", 0.1, 500.0, logarithmic=True),
+        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True),
+    )
+    linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "c1_arcsec_per_nm": 15.9,
+        "c2_arcsec_per_nm": 11.5,
+        "c3_arcsec_per_nm": 9.0,
+        "torque1_nm": 7.0,
+        "torque2_nm": 25.0,
+    }
+    """Size 20, ratio 50: K1, K2, K3 of 1.3, 1.8 and 2.3e4 Nm/rad, T1 and T2 of 7 and 25 Nm."""
+
+    c1_arcsec_per_nm: Annotated[
+        _Softness, Field(description="compliance up to T1: 206265 / K1, K1 in Nm/rad")
+    ]
+    c2_arcsec_per_nm: Annotated[_Softness, Field(description="compliance from T1 to T2")]
+    c3_arcsec_per_nm: Annotated[_Softness, Field(description="compliance beyond T2")]
+    torque1_nm: Annotated[float, Field(gt=0, le=1e5, description="T1")]
+    torque2_nm: Annotated[float, Field(gt=0, le=1e5, description="T2, above T1")]
+    sense: Annotated[
+        Literal[1, -1],
+        Field(description="1: a positive torque pushes the load forward; -1: it is what the gear delivers"),
+    ] = 1
+    torque: TorqueChannel = "load_torque_nm"
+    limit_nm: TorqueLimit = 1000.0
+
+    @model_validator(mode="after")
+    def _stiffens(self) -> Self:
+        if not self.torque1_nm < self.torque2_nm:
+            raise ValueError("T1 (torque1_nm) must be below T2 (torque2_nm)")
+        return self
+
+    def needs(self) -> frozenset[Channel]:
+        """The torque channel."""
+        return frozenset({Channel(self.torque)})
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """The torque's part in each of the three zones, signed, shape (n, 3)."""
+        given = motion.channel(Channel(self.torque), self.name)
+        torque = np.minimum(np.abs(given), self.limit_nm)
+        low, high = self.torque1_nm, self.torque2_nm
+        zones = np.column_stack(
+            [
+                np.minimum(torque, low),
+                np.clip(torque - low, 0.0, high - low),
+                np.maximum(torque - high, 0.0),
+            ]
+        )
+        signed: FloatArray = self.sense * np.sign(given)[:, np.newaxis] * zones
+        return signed
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Other compliances; where their sum is negative the sense turns: a torque's sign is a convention."""
+        values = np.asarray(coefficients, dtype=np.float64)
+        turned = values.sum() < 0.0
+        effect = super().fitted(-values if turned else values, shape)
+        return effect.model_copy(update={"sense": -self.sense}) if turned else effect
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """The wind-up at the highest torque."""
+        low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
+        return (
+            abs(self.c1_arcsec_per_nm) * min(most, low)
+            + abs(self.c2_arcsec_per_nm) * min(max(most - low, 0.0), high - low)
+            + abs(self.c3_arcsec_per_nm) * max(most - high, 0.0)
+        )
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: it depends on the torque, not on the motor angle."""
+        return 0.0
+
+    def stiffness_nm_per_rad(self) -> tuple[float, float, float]:
+        """K1, K2, K3 as catalogues give them; infinite where a compliance is zero."""
+        first, second, third = (ARCSEC_PER_RAD / each if each else np.inf for each in self.coefficients())
+        return float(first), float(second), float(third)
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_torque")
+
+    def __init__(self, effect: Compliance) -> None:
+        self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
+        self._low = effect.torque1_nm
+        self._high = effect.torque2_nm
+        self._limit = effect.limit_nm
+        self._sense = effect.sense
+        self._torque = effect.torque
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        given: float = getattr(moment, self._torque)
+        torque = min(abs(given), self._limit)
+        first, second, third = self._c
+        error = first * min(torque, self._low)
+        if torque > self._low:
+            error += second * min(torque - self._low, self._high - self._low)
+            if torque > self._high:
+                error += third * (torque - self._high)
+        return self._sense * error if given >= 0.0 else -self._sense * error

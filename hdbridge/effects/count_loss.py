@@ -1,0 +1,112 @@
+"""Counts lost by an encoder, or a tooth jumped: a step at one time that stays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+
+
+class Step(BaseModel):
+    """One loss: from this time on the error is larger by its size."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    time_s: Annotated[float, Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")]
+    size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]
+
+
+class CountLoss(Effect):
+    """Sum of size_j for all steps with time_j <= t."""
+
+    name: ClassVar[str] = "count_loss"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    about: ClassVar[Cause] = Cause(
+        title="a step that stays",
+        equation="sum of size_j over the steps with t >= t_j",
+        signature="at one instant everything shifts, by whole counts of an encoder or by a tooth, and "
+        "stays so",
+        consequence="every position after it is off by the step, until the axis is homed",
+        remedy="home again; check cable, shield and supply of the encoder. A step of a whole tooth (360/z "
+        "deg) is "
+        "ratcheting: stop and look at the gear",
+        experiment="pass an index pulse or a reference mark before and after",
+        aliases=("zero_drift", "wear"),
+        source="kinematics",
+        size="3 arcsec (one motor count) and up; a tooth is 360/z degrees",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False,
+        "it cannot be foreseen, and after homing it is gone; a loss in the load encoder is no motion at all",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10),)
+    typical: ClassVar[Mapping[str, Any]] = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
+    """One step of ten arcsec at time zero."""
+
+    steps: Annotated[
+        tuple[Step, ...], Field(min_length=1, max_length=100, description="losses: time_s, size_arcsec each")
+    ]
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state but the clock's."""
+        return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """A unit step per loss, shape (n, steps)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
+
+    def coefficients(self) -> FloatArray:
+        """The sizes, arcsec."""
+        return np.array([each.size_arcsec for each in self.steps])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Other sizes; ``time_s`` in ``shape`` moves the last step."""
+        times = [each.time_s for each in self.steps]
+        if shape and "time_s" in shape:
+            times[-1] = float(shape["time_s"])
+        steps = tuple(
+            Step.model_construct(time_s=time_s, size_arcsec=float(size))
+            for time_s, size in zip(times, coefficients, strict=True)
+        )
+        return self.model_copy(update={"steps": steps})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the sizes."""
+        return sum(abs(each.size_arcsec) for each in self.steps)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: it depends on time alone."""
+        return 0.0
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_steps",)
+
+    def __init__(self, steps: list[tuple[float, float]]) -> None:
+        self._steps = steps
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        now = moment.time_s
+        return sum((size for time_s, size in self._steps if now >= time_s), 0.0)

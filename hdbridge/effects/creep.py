@@ -1,0 +1,159 @@
+"""Relaxation after a stop: what has been strained in motion lets go slowly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.kinematics import speed_of
+from hdbridge.effects.recurrence import recurrence
+
+
+class Relaxation(BaseModel):
+    """One exponential."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    amplitude_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="strain after a long move forward, at the load")
+    ]
+    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
+
+
+class Creep(Effect):
+    """Sum of A_j y_j; in motion y_j goes to the direction, at rest to zero.
+
+    In motion the time constant is ``build_up`` tau_j. 1 is a linear viscoelastic element (short moves strain
+    it little); well below 1 each move strains it fully, and after each stop there is A_j exp(-t / tau_j).
+    """
+
+    name: ClassVar[str] = "creep"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME, Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="relaxation after a stop",
+        equation="sum of A_j y_j; tau_j dy_j/dt = -y_j at rest, build_up tau_j dy_j/dt = sgn(v) - y_j in "
+        "motion",
+        signature="after a stop the load moves on for seconds to minutes while the motor stands still",
+        consequence="the position at the end of a move is not the one a minute later",
+        remedy="compensate it, or wait; less preload or friction torque; it is the flexspline and the grease",
+        experiment="long rests after moves in either direction; servo settling would show at the motor too",
+        aliases=("zero_drift",),
+        source="generalised Kelvin-Voigt element: a sum of exponentials",
+        size="1-10 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, and the command says when it stopped"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("tau_s", 0.05, 3600.0, logarithmic=True),
+        Shape("build_up", 0.01, 1.0, logarithmic=True),
+    )
+    """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
+
+    typical: ClassVar[Mapping[str, Any]] = {
+        "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
+        "build_up": 0.1,
+    }
+
+    parts: Annotated[
+        tuple[Relaxation, ...],
+        Field(min_length=1, max_length=8, description="exponentials: amplitude_arcsec, tau_s each"),
+    ]
+    build_up: Annotated[
+        float, Field(gt=0, le=10, description="time constants in motion, relative to those at rest")
+    ] = 1.0
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; fully relaxed at its first moment."""
+        return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """y_j of each exponential, shape (n, parts)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        going = np.sign(speed_of(motion, self.name))
+        step = np.maximum(np.diff(time_s, prepend=time_s[:1]), 0.0)
+        step = np.where(going != 0.0, step / self.build_up, step)
+        columns = np.empty((len(motion), len(self.parts)))
+        for j, each in enumerate(self.parts):
+            decay = np.exp(-step / each.tau_s)
+            columns[:, j] = recurrence(decay, (1.0 - decay) * going, 0.0)
+        return columns
+
+    def coefficients(self) -> FloatArray:
+        """The amplitudes, arcsec."""
+        return np.array([each.amplitude_arcsec for each in self.parts])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Other amplitudes, and other time constants (``tau_s`` scales them all) and build-up where given."""
+        given = dict(shape or {})
+        scale = given.pop("tau_s", self.parts[0].tau_s) / self.parts[0].tau_s
+        parts = tuple(
+            Relaxation.model_construct(amplitude_arcsec=float(amplitude), tau_s=scale * each.tau_s)
+            for each, amplitude in zip(self.parts, coefficients, strict=True)
+        )
+        return self.model_copy(update={"parts": parts, **given})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the amplitudes."""
+        return sum(abs(each.amplitude_arcsec) for each in self.parts)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: it depends on time and on the command's direction."""
+        return 0.0
+
+
+class _Tracker(Tracker):
+    """State: y_j and the time they are of."""
+
+    __slots__ = ("_amplitudes", "_build_up", "_rates", "_strains", "_time")
+
+    def __init__(self, parts: list[tuple[float, float]], build_up: float) -> None:
+        self._amplitudes = [amplitude for amplitude, _ in parts]
+        self._rates = [1.0 / tau_s for _, tau_s in parts]
+        self._build_up = build_up
+        self._strains = [0.0] * len(parts)
+        self._time: float | None = None
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return sum(map(float.__mul__, self._amplitudes, self._at(moment)))
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        self._strains = self._at(moment)
+        self._time = moment.time_s
+        return sum(map(float.__mul__, self._amplitudes, self._strains))
+
+    def _at(self, moment: Moment) -> list[float]:
+        if self._time is None:
+            return self._strains
+        speed = moment.motor_speed_deg_s
+        step = max(moment.time_s - self._time, 0.0)
+        going = 0.0
+        if speed:
+            going = math.copysign(1.0, speed)
+            step /= self._build_up
+        strains = []
+        for rate, strain in zip(self._rates, self._strains, strict=True):
+            decay = math.exp(-step * rate)
+            strains.append(decay * strain + (1.0 - decay) * going)
+        return strains

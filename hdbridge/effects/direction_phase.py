@@ -1,0 +1,122 @@
+"""The synchronous part shifts with the direction of travel: other flanks of the teeth carry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.carried import orders_of
+from hdbridge.effects.kinematics import direction_of
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors
+
+
+class DirectionPhase(Effect):
+    """The part odd in direction of S(theta_M + d shift): d (S(theta_M + shift) - S(theta_M - shift)) / 2.
+
+    The even part, A_k cos(k shift) instead of A_k, is in the model's synchronous part already, because that
+    was fitted over both directions. One angle shifts all orders: a free amplitude per order would be many
+    parameters for one cause.
+    """
+
+    name: ClassVar[str] = "direction_phase"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.DIRECTION})
+    about: ClassVar[Cause] = Cause(
+        title="synchronous part shifted with the direction",
+        equation="d (S(theta_M + shift) - S(theta_M - shift)) / 2, S the synchronous part, d the direction "
+        "held at rest",
+        signature="the ripple within a motor turn is displaced between the two directions, by one angle "
+        "for all orders",
+        consequence="a compensation without it leaves the ripple's difference, with opposite signs in the "
+        "two directions",
+        remedy="compensate it; it is the change of tooth flanks, and grows with preload and with load",
+        experiment="slow sweeps over the same motor turns both ways; even and odd part in the direction",
+        aliases=("hysteresis_parameters",),
+        source="phase of the kinematic error differs between the tooth flanks that carry",
+        size="1-5 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so; the direction is commanded"
+    )
+    typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
+    """A shift of one degree of the base's orders."""
+
+    orders: Orders
+    shift_deg: Annotated[
+        float,
+        Field(ge=-45, le=45, description="shift of the motor angle, forward ahead of backward by twice this"),
+    ]
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        return self.columns(motion, start)[:, 0] * self.shift_deg
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; the direction comes with the moment."""
+        return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Per degree of shift, *at the present shift*, shape (n, 1): nearly linear, so fit, and fit again."""
+        turn = np.exp(1j * (RAD_PER_DEG * motion.motor_deg))
+        error: FloatArray = direction_of(motion, start) * horner(self._odd(), turn).real
+        return error[:, np.newaxis]
+
+    def coefficients(self) -> FloatArray:
+        """The shift, degrees of the motor."""
+        return np.array([self.shift_deg])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Another shift."""
+        return self.model_copy(update={"shift_deg": float(coefficients[0])})
+
+    def bound_arcsec(self) -> float:
+        """Sum of A_k |sin(k shift)|."""
+        return abs(self.shift_deg) * sum(map(abs, self._odd()))
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Sum of k A_k |sin(k shift)|, per degree."""
+        steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
+        return RAD_PER_DEG * abs(self.shift_deg) * steepness
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"orders": orders_of(base)}
+
+    def _odd(self) -> tuple[complex, ...]:
+        """Phasors of the odd part per degree of shift: j A_k sin(k shift) / shift exp(j phi_k)."""
+        given = phasors(self.orders)
+        highest = len(given) - 1
+        return tuple(1j * each * self._sine(highest - i) for i, each in enumerate(given))
+
+    def _sine(self, order: int) -> float:
+        if abs(self.shift_deg) < 1e-9:
+            return order * RAD_PER_DEG
+        return math.sin(order * RAD_PER_DEG * self.shift_deg) / self.shift_deg
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_phasors", "_start")
+
+    def __init__(self, amplitudes: tuple[complex, ...], start: int) -> None:
+        self._phasors = amplitudes
+        self._start = start
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        angle = RAD_PER_DEG * motor_deg
+        error = horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real
+        return (moment.direction or self._start) * error

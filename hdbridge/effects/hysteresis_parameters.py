@@ -1,0 +1,115 @@
+"""The elastic loop has changed: another offset, width or exponent than the model has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.carried import Loop, loop_of
+from hdbridge.effects.hysteresis import Hysteresis
+
+
+class HysteresisParameters(Effect):
+    """The loop with new parameters less the loop with the model's (`base`).
+
+    It names a change. When a model is extended by it, it does not become an entry of its own: the model's
+    loop takes over the new parameters (`combine.extended`). As an entry beside the model's loop it would
+    predict the same, but a difference of loops falls infinitely steeply where the old one rises, so that the
+    compensation cannot invert it.
+    """
+
+    name: ClassVar[str] = "hysteresis_parameters"
+    about: ClassVar[Cause] = Cause(
+        title="the elastic loop has changed",
+        equation="H(offset, width, exponent) - H(the model's offset, width, exponent)",
+        signature="a rest of the loop after each reversal, or a constant distance between the two directions",
+        consequence="the compensation makes up for a loop that is not the axis's any more",
+        remedy="calibrate again; a smaller offset hints at lost preload, a larger one at friction (cold, "
+        "dry, misaligned)",
+        experiment="slow sines of several amplitudes, some smaller than the width",
+        aliases=("backlash", "hysteresis_memory", "direction_phase"),
+        source="the difference of two loops of one law",
+        size="5-30 % of the offset",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "through the model's loop, which takes over the new parameters"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
+
+    base: Annotated[Loop, Field(description="the model's loop")]
+    offset_arcsec: Annotated[float, Field(ge=0, le=3600, description="new offset")]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="new width")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
+
+    def changed(self) -> Loop:
+        """The loop as it is now."""
+        return self.base.model_copy(
+            update={each: getattr(self, each) for each in ("offset_arcsec", "width_deg", "exponent")}
+        )
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        return self.changed().law().predict(motion, start) - self.base.law().predict(motion, start)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker of the difference."""
+        return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """The loops of unit offset, new and old, shape (n, 2)."""
+        new, old = self.changed().law(), self.base.law()
+        return np.hstack([new.columns(motion, start), old.columns(motion, start)])
+
+    def coefficients(self) -> FloatArray:
+        """The new offset, and less the old one."""
+        return np.array([self.offset_arcsec, -self.base.offset_arcsec])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Other offsets, and another new width and exponent where given."""
+        base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
+        update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
+        return self.model_copy(update=update)
+
+    def bound_arcsec(self) -> float:
+        """Sum of the offsets."""
+        return self.offset_arcsec + self.base.offset_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """No bound: where the old loop sets out infinitely steeply, the difference falls so."""
+        return math.inf if self.base.offset_arcsec else 0.0
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        """An offset larger by a fifth."""
+        loop = loop_of(base)
+        changed = {**loop.model_dump(exclude={"memory"}), "offset_arcsec": 1.2 * loop.offset_arcsec}
+        return {"base": loop, **changed}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_new", "_old")
+
+    def __init__(self, new: Tracker, old: Tracker) -> None:
+        self._new = new
+        self._old = old
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._new.peek(motor_deg, moment) - self._old.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._new.advance(motor_deg, moment) - self._old.advance(motor_deg, moment)

@@ -1,0 +1,87 @@
+"""Wind-up of the gear by the load's own inertia while it accelerates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.kinematics import acceleration_of
+from hdbridge.effects.load_order import Ratio
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+class InertialWindup(Linear):
+    """-(J / K) alpha_L: the load lags while it is sped up."""
+
+    name: ClassVar[str] = "inertial_windup"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.ACCELERATION})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by inertia",
+        equation="-(J / K) alpha_L, alpha_L = commanded motor acceleration / N, limited to the limit / N",
+        signature="the error follows the acceleration; nothing at rest or at constant speed",
+        consequence="the load lags in each acceleration and leads in each deceleration",
+        remedy="compensate it, or accept it where only positions at rest count; less inertia, a stiffer gear",
+        experiment="the same move at another acceleration: it scales; a resonance rings at its own frequency",
+        aliases=("channel_skew", "compliance"),
+        source="spring and inertia far below the resonance: J / K = 1 / (2 pi f)^2",
+        size="7 arcsec at 200 deg/s^2 of the load with a resonance at 50 Hz",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
+    )
+    linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
+    typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
+    """A resonance at 50 Hz."""
+
+    ratio: Ratio
+    inertia_over_stiffness_s2: Annotated[
+        float, Field(ge=0, le=0.1, description="J / K at the load, 1 / (2 pi f)^2 of its resonance")
+    ]
+    limit_deg_s2: Annotated[
+        float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
+    ] = 1e6
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """J / K of one second squared, shape (n, 1)."""
+        limit = self.limit_deg_s2
+        acceleration = np.clip(acceleration_of(motion, self.name), -limit, limit)
+        return (-ARCSEC_PER_DEG / self.ratio * acceleration)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; acceleration comes with the moment."""
+        gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
+        return _Tracker(gain, self.limit_deg_s2)
+
+    def bound_arcsec(self) -> float:
+        """The wind-up at the highest acceleration."""
+        return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: the acceleration is the command's, whatever angle is asked about."""
+        return 0.0
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_gain", "_limit")
+
+    def __init__(self, gain: float, limit: float) -> None:
+        self._gain = gain
+        self._limit = limit
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._gain * min(max(moment.motor_acceleration_deg_s2, -self._limit), self._limit)

@@ -1,0 +1,122 @@
+"""Speed, acceleration and direction of the command, defined once for records and for the control loop.
+
+Backward differences over the samples' own time steps:
+
+    v[i] = (theta[i] - theta[i-1]) / (t[i] - t[i-1])        v[0] = 0
+    a[i] = (v[i] - v[i-1]) / (t[i] - t[i-1])                a[0] = a[1] = 0
+    d[i] = sign(theta[i] - theta[i-1]), held at rest
+
+A time step of zero gives a speed of zero. On line the angle is the uncompensated command (N times the load
+target): what the compensation adds is far slower than the motion, and feeding it back would difference each
+cycle's correction into the next. A record that knows its speed better (from the procedure, or smoothed from
+the load encoder) gives it in `Motion`, and then it is taken as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hdbridge.effects.base import Channel, FloatArray, Moment, Motion, Start, missing_error
+
+
+def speed_of(motion: Motion, effect: str) -> FloatArray:
+    """Motor speed in degrees of the motor per second, shape (n,)."""
+    if motion.motor_speed_deg_s is not None:
+        return motion.motor_speed_deg_s
+    return _differences(motion.motor_deg, _time(motion, effect, Channel.SPEED))
+
+
+def acceleration_of(motion: Motion, effect: str) -> FloatArray:
+    """Motor acceleration in degrees of the motor per second squared, shape (n,)."""
+    if motion.motor_acceleration_deg_s2 is not None:
+        return motion.motor_acceleration_deg_s2
+    time_s = _time(motion, effect, Channel.ACCELERATION)
+    result = _differences(speed_of(motion, effect), time_s)
+    result[:2] = 0.0
+    return result
+
+
+def direction_of(motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+    """Direction of the last motion, -1 or 1, held at rest; before the first motion what ``start`` says."""
+    if motion.motor_speed_deg_s is not None:
+        signs = np.sign(motion.motor_speed_deg_s)
+    else:
+        signs = np.sign(np.diff(motion.motor_deg, prepend=motion.motor_deg[:1]))
+    last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), -1))
+    held: FloatArray = np.where(last >= 0, signs[last], float(start.value)) if len(signs) else signs
+    return held
+
+
+def _time(motion: Motion, effect: str, channel: Channel) -> FloatArray:
+    if motion.time_s is None:
+        raise missing_error(effect, frozenset({channel, Channel.TIME}))
+    return motion.time_s
+
+
+def _differences(values: FloatArray, time_s: FloatArray) -> FloatArray:
+    steps = np.diff(time_s)
+    result = np.zeros(len(values))
+    np.divide(np.diff(values), steps, out=result[1:], where=steps > 0.0)
+    return result
+
+
+class Observer:
+    """Makes the `Moment` of each control cycle from the command; the on-line side of this file."""
+
+    __slots__ = ("_angle", "_count", "_direction", "_speed", "_time")
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._angle = self._time = self._speed = 0.0
+        self._direction = 0
+
+    def moment(
+        self,
+        motor_deg: float,
+        time_s: float,
+        *,
+        load_torque_nm: float = 0.0,
+        motor_torque_nm: float = 0.0,
+        temperature_c: float = 20.0,
+        load_deg: float = 0.0,
+    ) -> Moment:
+        """One call per cycle; ``motor_deg`` is the uncompensated command, N times the load target."""
+        speed = acceleration = 0.0
+        if self._count:
+            step = time_s - self._time
+            moved = motor_deg - self._angle
+            if step > 0.0:
+                speed = moved / step
+                if self._count > 1:
+                    acceleration = (speed - self._speed) / step
+            if moved:
+                self._direction = 1 if moved > 0.0 else -1
+        self._count += 1
+        self._angle, self._time, self._speed = motor_deg, time_s, speed
+        return Moment(
+            time_s, load_torque_nm, motor_torque_nm, temperature_c,
+            speed, acceleration, self._direction, load_deg,
+        )  # fmt: skip
+
+
+def moments(motion: Motion) -> Iterator[Moment]:
+    """A record as the control loop would have seen it, sample by sample (channels not there: defaults)."""
+    here = motion.available()
+    zeros = np.zeros(len(motion))
+    columns = (
+        _or(motion.time_s, zeros),
+        _or(motion.load_torque_nm, zeros),
+        _or(motion.motor_torque_nm, zeros),
+        _or(motion.temperature_c, zeros + 20.0),
+        speed_of(motion, "") if Channel.SPEED in here else zeros,
+        acceleration_of(motion, "") if Channel.ACCELERATION in here else zeros,
+        direction_of(motion).astype(np.int64),
+        _or(motion.load_deg, zeros),
+    )
+    yield from map(Moment, *(each.tolist() for each in columns))
+
+
+def _or(values: FloatArray | None, default: FloatArray) -> FloatArray:
+    return default if values is None else values

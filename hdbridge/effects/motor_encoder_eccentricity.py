@@ -1,0 +1,43 @@
+"""The motor encoder's disc runs out of true: the motor stands where the encoder is wrong about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from hdbridge.effects.base import Cause, Compensable
+from hdbridge.effects.orders import OrderSeries, orders_from
+
+
+class MotorEncoderEccentricity(OrderSeries):
+    """A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2), amplitudes at the load."""
+
+    name: ClassVar[str] = "motor_encoder_eccentricity"
+    few: ClassVar[frozenset[int]] = frozenset({1, 2})
+    about: ClassVar[Cause] = Cause(
+        title="eccentric motor encoder disc",
+        equation="A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2); A_1 = (e / r) / N for a disc of "
+        "radius r "
+        "that is out of centre by e",
+        signature="order 1 (eccentric) and 2 (tilted or oval) of the motor angle, divided by N at the load",
+        consequence="the drive holds the encoder, so the motor and with it the load really run ahead and "
+        "behind "
+        "once per motor turn",
+        remedy="compensate it with the synchronous part; centre the disc; calibrate again whenever the "
+        "encoder has "
+        "been off",
+        experiment="re-clock the encoder on the motor shaft by 90 deg: its part turns with it, the gear's "
+        "does not",
+        aliases=("motor_order", "synchronous"),
+        source="geometry of an eccentric disc: reading error (e / r) sin(theta), first order in e / r",
+        size="1-10 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the position loop is closed on this encoder, so its error becomes a real motion of the load"
+    )
+    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 3.0)}
+    """Eccentricity and tilt."""
+
+    def turns_per_motor_turn(self) -> float:
+        """One: the disc is on the motor shaft."""
+        return 1.0

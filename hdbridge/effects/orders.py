@@ -1,0 +1,163 @@
+"""Series of harmonics over an angle that turns with the motor: what all effects of orders share."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, ClassVar, Self, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from hdbridge.effects.base import (
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+
+RAD_PER_DEG = math.pi / 180.0
+_Phasor = TypeVar("_Phasor", complex, "np.ndarray[tuple[int], np.dtype[np.complex128]]")
+
+
+class MotorOrder(BaseModel):
+    """One harmonic: amplitude * cos(order * angle + phase)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    order: Annotated[int, Field(ge=1, le=1000, description="periods per turn")]
+    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
+    phase_deg: Annotated[float, Field(ge=-360, le=360, description="phase of the cosine")]
+
+
+Orders = Annotated[
+    tuple[MotorOrder, ...], Field(description="harmonics: order, amplitude_arcsec, phase_deg each")
+]
+
+
+class OrderSeries(Effect):
+    """Sum of A_k cos(k c theta_M + phi_k), where c says which angle the orders count on."""
+
+    few: ClassVar[frozenset[int]] = frozenset()
+    """The orders that make sense, where only few do."""
+
+    orders: Orders
+
+    @field_validator("orders")
+    @classmethod
+    def _distinct(cls, orders: tuple[MotorOrder, ...]) -> tuple[MotorOrder, ...]:
+        numbers = [each.order for each in orders]
+        if len(set(numbers)) != len(numbers):
+            raise ValueError("each order may stand only once")
+        if cls.few and not cls.few.issuperset(numbers):
+            raise ValueError(f"only orders {', '.join(map(str, sorted(cls.few)))} are of this cause")
+        return orders
+
+    @abstractmethod
+    def turns_per_motor_turn(self) -> float:
+        """c: periods of order 1 per motor turn."""
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        turn = np.exp(1j * (self._scale() * motion.motor_deg))
+        error: FloatArray = horner(phasors(self.orders), turn).real
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state."""
+        return OrderTracker(phasors(self.orders), self._scale())
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """For each order its cosine and its sine, shape (n, 2 * orders)."""
+        return cosines_and_sines(self._scale() * motion.motor_deg, [each.order for each in self.orders])
+
+    def coefficients(self) -> FloatArray:
+        """A cos(phi) and -A sin(phi) of each order, arcsec."""
+        return coefficients_of(self.orders)
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """The same orders with amplitudes and phases from cosine and sine coefficients."""
+        return self.model_copy(update={"orders": orders_fitted(self.orders, coefficients)})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the amplitudes."""
+        return sum(each.amplitude_arcsec for each in self.orders)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Sum of order times amplitude, per degree."""
+        return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
+
+    def _scale(self) -> float:
+        return RAD_PER_DEG * self.turns_per_motor_turn()
+
+
+def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
+    """Harmonics of one amplitude and phase zero, to start a fit from."""
+    return tuple(MotorOrder(order=each, amplitude_arcsec=amplitude_arcsec, phase_deg=0.0) for each in numbers)
+
+
+def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
+    """Columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
+    angles = np.outer(angle_rad, np.asarray(numbers, dtype=np.float64))
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(angle_rad), -1)
+
+
+def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:
+    """A cos(phi) and -A sin(phi) of each order, in the order of `cosines_and_sines`."""
+    pairs = [
+        (each.amplitude_arcsec * math.cos(phase), -each.amplitude_arcsec * math.sin(phase))
+        for each in orders
+        for phase in [math.radians(each.phase_deg)]
+    ]
+    return np.array(pairs, dtype=np.float64).reshape(-1)
+
+
+def orders_fitted(orders: Sequence[MotorOrder], coefficients: FloatArray) -> tuple[MotorOrder, ...]:
+    """The same orders with the amplitudes and phases that the coefficients say."""
+    pairs = np.asarray(coefficients, dtype=np.float64).reshape(len(orders), 2)
+    return tuple(
+        MotorOrder.model_construct(  # not validated: a fit may stray, `Effect.violations` tells
+            order=each.order,
+            amplitude_arcsec=math.hypot(cosine, sine),
+            phase_deg=math.degrees(math.atan2(-sine, cosine)),
+        )
+        for each, (cosine, sine) in zip(orders, pairs.tolist(), strict=True)
+    )
+
+
+def phasors(orders: Iterable[MotorOrder]) -> tuple[complex, ...]:
+    """Complex amplitudes from the highest order down to order 0, for `horner`."""
+    given = {each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders}
+    return tuple(given.get(order, 0j) for order in range(max(given, default=0), -1, -1))
+
+
+def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
+    """Polynomial in ``turn`` = exp(j theta), for one angle or for a whole record.
+
+    One exponential and a few multiplications per order is several times faster in the control loop than a
+    cosine per order, and the same lines serve a record.
+    """
+    total = 0.0 * turn
+    for amplitude in amplitudes:
+        total = total * turn + amplitude
+    return total
+
+
+class OrderTracker(Memoryless):
+    """A series of harmonics on line; ``scale`` is radians of order 1 per motor degree."""
+
+    __slots__ = ("_phasors", "_scale")
+
+    def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
+        self._phasors = amplitudes
+        self._scale = scale
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        """Error in arcsec at this motor angle."""
+        angle = self._scale * motor_deg
+        return horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real

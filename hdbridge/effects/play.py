@@ -1,0 +1,59 @@
+"""The stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from hdbridge.effects.base import FloatArray, Start
+from hdbridge.effects.hysteresis import branches
+
+
+def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
+    """s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
+
+    Between two reversals nothing is lost by clipping only once, so only the reversals are a loop.
+    """
+    if not len(motor_deg):
+        return np.empty(0)
+    turning, _ = branches(motor_deg, start)
+    gain = 2.0 / width_deg
+    angles = motor_deg[turning].tolist()
+    value = float(start.value)
+    begin = [value]
+    for last, angle in pairwise(angles):
+        value = min(max(value + gain * (angle - last), -1.0), 1.0)
+        begin.append(value)
+    lengths = np.diff(turning)
+    from_value = np.repeat(begin[:-1], lengths)
+    from_angle = np.repeat(angles[:-1], lengths)
+    result = np.full(len(motor_deg), float(start.value))
+    result[turning[0] + 1 :] = np.clip(
+        from_value + gain * (motor_deg[turning[0] + 1 :] - from_angle), -1.0, 1.0
+    )
+    return result
+
+
+class Stop:
+    """The same on line: `at` asks, `to` moves."""
+
+    __slots__ = ("_angle", "_gain", "_value")
+
+    def __init__(self, width_deg: float, start: Start) -> None:
+        self._gain = 2.0 / width_deg
+        self._value = float(start.value)
+        self._angle: float | None = None
+
+    def at(self, motor_deg: float) -> float:
+        """Value after going straight to ``motor_deg``; changes nothing."""
+        if self._angle is None:
+            return self._value
+        value = self._value + self._gain * (motor_deg - self._angle)
+        return 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
+
+    def to(self, motor_deg: float) -> float:
+        """Move to ``motor_deg`` and return the value there."""
+        self._value = self.at(motor_deg)
+        self._angle = motor_deg
+        return self._value

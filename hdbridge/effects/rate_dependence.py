@@ -1,0 +1,100 @@
+"""The elastic loop grows with speed: friction rises with the logarithm of the sliding rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.carried import Loop, loop_of
+from hdbridge.effects.kinematics import speed_of
+
+
+class RateDependence(Linear):
+    """growth log10(1 + |v| / reference) H: nothing at rest, ``growth`` per decade above the reference."""
+
+    name: ClassVar[str] = "rate_dependence"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="loop that grows with speed",
+        equation="growth log10(1 + |v| / v_ref) H, H the model's loop, v the commanded motor speed, "
+        "limited to v_limit",
+        signature="the same sine at a higher frequency has a higher loop; at rest the difference is gone",
+        consequence="a loop measured slowly is too small for fast moves",
+        remedy="compensate it; calibrate at the speeds of the work; a thinner grease",
+        experiment="sines of one amplitude at 0.01 to 1 Hz",
+        aliases=("velocity_windup", "channel_skew", "hysteresis_parameters"),
+        source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",
+        size="5-30 % of the loop",
+    )
+    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so; the speed is commanded")
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
+    linear: ClassVar[tuple[str, ...]] = ("growth_percent",)
+    typical: ClassVar[Mapping[str, Any]] = {"growth_percent": 10.0, "reference_deg_s": 30.0}
+    """Ten per cent per decade."""
+
+    loop: Annotated[Loop, Field(description="the model's loop")]
+    growth_percent: Annotated[float, Field(ge=0, le=200, description="growth per decade of speed")]
+    reference_deg_s: Annotated[float, Field(gt=0, le=1e5, description="motor speed from which on it grows")]
+    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
+        20_000.0
+    )
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """A growth of one per cent, shape (n, 1)."""
+        speed = np.minimum(np.abs(speed_of(motion, self.name)), self.limit_deg_s)
+        rate = np.log1p(speed / self.reference_deg_s) * (0.01 / math.log(10.0))
+        return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; speed comes with the moment."""
+        return _Tracker(self, start)
+
+    def bound_arcsec(self) -> float:
+        """The growth at the highest speed."""
+        decades = math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
+        return 0.01 * self.growth_percent * decades * self.loop.offset_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: a growing loop only rises along its path (one that shrank could fall without bound)."""
+        return 0.0 if self.growth_percent >= 0.0 else math.inf
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"loop": loop_of(base)}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_gain", "_limit", "_loop", "_reference")
+
+    def __init__(self, effect: RateDependence, start: Start) -> None:
+        self._loop = effect.loop.law().tracker(start)
+        self._gain = 0.01 * effect.growth_percent / math.log(10.0)
+        self._reference = effect.reference_deg_s
+        self._limit = effect.limit_deg_s
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._rate(moment) * self._loop.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._rate(moment) * self._loop.advance(motor_deg, moment)
+
+    def _rate(self, moment: Moment) -> float:
+        speed = min(abs(moment.motor_speed_deg_s), self._limit)
+        return self._gain * math.log1p(speed / self._reference)

@@ -1,0 +1,83 @@
+"""The gear ratio is not the one that the model has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+
+class RatioError(Linear):
+    """(1 / N_true - 1 / N) theta_M: a ramp in the motor angle."""
+
+    name: ClassVar[str] = "ratio_error"
+    about: ClassVar[Cause] = Cause(
+        title="wrong gear ratio or encoder scale",
+        equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
+        signature="a ramp over the motor angle, the same both ways, coming back on the way back",
+        consequence="the load is off in proportion to its distance from zero",
+        remedy="correct ratio, teeth or counts per turn in the axis file: a ratio is a fraction of tooth "
+        "numbers, not a fit",
+        experiment="a long sweep both ways, then rest: it grows with the angle, a drift with time",
+        aliases=("load_order", "zero_drift", "wear"),
+        source="kinematics",
+        size="large: 784 arcsec per step of 43.56 motor degrees between ratios 40 and 50",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "the load really moves so (unless the load encoder's scale is wrong), but correct the axis file "
+        "instead",
+    )
+    linear: ClassVar[tuple[str, ...]] = ("ramp_arcsec_per_turn",)
+    typical: ClassVar[Mapping[str, Any]] = {"ramp_arcsec_per_turn": 2.592}
+    """A hundredth of a per cent of a ratio of 50."""
+
+    ramp_arcsec_per_turn: Annotated[float, Field(ge=-1e6, le=1e6, description="ramp per motor turn")]
+    limit_deg: Annotated[float, Field(gt=0, le=1e9, description="motor angle beyond which it is held")] = 1e6
+
+    def true_ratio(self, ratio: float) -> float:
+        """The ratio that would leave no ramp, where the model has ``ratio``."""
+        return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """One arcsec per motor turn, shape (n, 1)."""
+        angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)
+        return (angle / DEG_PER_TURN)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state."""
+        return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
+
+    def bound_arcsec(self) -> float:
+        """The ramp at the limit."""
+        return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """The ramp, where it falls."""
+        return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_limit", "_slope")
+
+    def __init__(self, slope: float, limit: float) -> None:
+        self._slope = slope
+        self._limit = limit
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._slope * min(max(motor_deg, -self._limit), self._limit)

@@ -1,0 +1,116 @@
+"""The synchronous part grows with load: the mesh deflects, and the wave generator's ripple with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.carried import orders_of
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+
+TorqueChannel = Annotated[
+    Literal["load_torque_nm", "motor_torque_nm"],
+    Field(description="the channel that the torque is taken from"),
+]
+TorqueLimit = Annotated[
+    float,
+    Field(
+        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
+    ),
+]
+
+
+class TorqueModulation(Linear):
+    """growth |T| S(theta_M): all carried orders grow alike; carry fewer to let fewer grow."""
+
+    name: ClassVar[str] = "torque_modulation"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
+    about: ClassVar[Cause] = Cause(
+        title="ripple that grows with load",
+        equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T where signed), limited to "
+        "T_limit",
+        signature="the amplitude of the ripple within a motor turn follows the load torque",
+        consequence="the compensation of the synchronous part is too small under load",
+        remedy="compensate it where the torque is known; calibrate with the load of the work; a larger gear",
+        experiment="the same motor turns under two torques at one temperature",
+        aliases=("amplitude_drift", "motor_order"),
+        source="kinematic error of strain wave gears under load: amplitude roughly linear in the torque",
+        size="10-50 % of the ripple at rated torque",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, where the torque is known on line"
+    )
+    linear: ClassVar[tuple[str, ...]] = ("growth_percent_per_nm",)
+    typical: ClassVar[Mapping[str, Any]] = {"growth_percent_per_nm": 1.0}
+    """One per cent per Nm of all orders."""
+
+    orders: Orders
+    growth_percent_per_nm: Annotated[
+        float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")
+    ]
+    signed: Annotated[bool, Field(description="grows with the torque rather than with its magnitude")] = False
+    torque: TorqueChannel = "load_torque_nm"
+    limit_nm: TorqueLimit = 100.0
+
+    def needs(self) -> frozenset[Channel]:
+        """The torque channel."""
+        return frozenset({Channel(self.torque)})
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """A growth of one per cent per Nm, shape (n, 1)."""
+        torque = np.clip(motion.channel(Channel(self.torque), self.name), -self.limit_nm, self.limit_nm)
+        ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
+        column: FloatArray = 0.01 * (torque if self.signed else np.abs(torque)) * ripple
+        return column[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """The ripple's growth at the highest torque."""
+        return self._most() * sum(each.amplitude_arcsec for each in self.orders)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """The slope of the ripple's growth at the highest torque."""
+        return self._most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"orders": orders_of(base)}
+
+    def _most(self) -> float:
+        return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_gain", "_limit", "_orders", "_signed", "_torque")
+
+    def __init__(self, effect: TorqueModulation) -> None:
+        self._orders = OrderTracker(phasors(effect.orders))
+        self._gain = 0.01 * effect.growth_percent_per_nm
+        self._limit = effect.limit_nm
+        self._signed = effect.signed
+        self._torque = effect.torque
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        torque: float = getattr(moment, self._torque)
+        torque = min(max(torque, -self._limit), self._limit)
+        growth = self._gain * (torque if self._signed else abs(torque))
+        return growth * self._orders.peek(motor_deg, moment)

@@ -1,0 +1,109 @@
+"""Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.kinematics import speed_of
+
+
+class VelocityWindup(Linear):
+    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; none of it at rest.
+
+    What remains of the dry friction at rest belongs to the elastic loop. The viscous part falls off with
+    shear: at the shear speed it is half of what it would be, far above it is constant.
+    """
+
+    name: ClassVar[str] = "velocity_windup"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by drag on the output",
+        equation="-(coulomb sgn(v) + viscous v / (1 + |v| / v_shear)), v the commanded motor speed, "
+        "limited to v_limit",
+        signature="the error follows the speed, less than linearly, and goes back at rest",
+        consequence="the load lags while it moves",
+        remedy="compensate it; thinner grease, seals with less drag; warm the axis up first",
+        experiment="sweeps at several speeds both ways: drag bends with speed, a skew is a straight line",
+        aliases=("channel_skew", "rate_dependence"),
+        source="Coulomb and viscous friction with shear thinning, over the gear's stiffness",
+        size="5-50 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really lags and the speed is commanded; at rest it is nothing"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
+    linear: ClassVar[tuple[str, ...]] = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "coulomb_arcsec": 3.0,
+        "viscous_arcsec_s_per_deg": 0.015,
+        "shear_deg_s": 1000.0,
+    }
+    """About ten arcsec at 1000 motor degrees per second."""
+
+    coulomb_arcsec: Annotated[
+        float, Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
+    ]
+    viscous_arcsec_s_per_deg: Annotated[
+        float, Field(ge=0, le=100, description="slope at low speed, per motor degree per second")
+    ]
+    shear_deg_s: Annotated[
+        float, Field(gt=0, le=1e7, description="motor speed at which it has fallen off by half")
+    ]
+    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
+        50_000.0
+    )
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Dry and viscous, shape (n, 2)."""
+        speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
+        return -np.column_stack([np.sign(speed), speed / (1.0 + np.abs(speed) / self.shear_deg_s)])
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; speed comes with the moment."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """The wind-up at the highest speed."""
+        viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
+        return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: the speed is the command's, whatever angle is asked about."""
+        return 0.0
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_coulomb", "_limit", "_shear", "_viscous")
+
+    def __init__(self, effect: VelocityWindup) -> None:
+        self._coulomb = effect.coulomb_arcsec
+        self._viscous = effect.viscous_arcsec_s_per_deg
+        self._shear = effect.shear_deg_s
+        self._limit = effect.limit_deg_s
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        speed = min(max(moment.motor_speed_deg_s, -self._limit), self._limit)
+        if not speed:
+            return 0.0
+        return -(
+            self._coulomb * math.copysign(1.0, speed)
+            + self._viscous * speed / (1.0 + abs(speed) / self._shear)
+        )

@@ -1,0 +1,108 @@
+"""A vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.orders import cosines_and_sines
+
+
+class Vibration(Effect):
+    """amplitude cos(2 pi f t + phase)."""
+
+    name: ClassVar[str] = "vibration"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    about: ClassVar[Cause] = Cause(
+        title="vibration at a fixed frequency",
+        equation="A cos(2 pi f t + phase)",
+        signature="the same frequency in hertz at every speed, and at rest",
+        consequence="the load (or only the reading head) trembles",
+        remedy="find the source by its frequency; decouple it; lower the loop's gain where it is a "
+        "resonance of the axis",
+        experiment="a standstill, and sweeps at two speeds: an order moves in hertz with the speed, a "
+        "vibration stays",
+        aliases=("motor_order", "subdivisional_error"),
+        source="a sinusoid in time",
+        size="0.1-5 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False, "its phase drifts and cannot be foreseen, and it is mostly faster than the axis can follow"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("frequency_hz", 0.05, 5000.0, logarithmic=True),)
+    typical: ClassVar[Mapping[str, Any]] = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
+    """One arcsec at 50 Hz, as an example: the frequency is a matter of search."""
+
+    frequency_hz: Annotated[float, Field(gt=0, le=1e5, description="frequency")]
+    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
+    phase_deg: Annotated[
+        float, Field(ge=-360, le=360, description="phase of the cosine at the record's time zero")
+    ]
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Error in arcsec, shape (n,)."""
+        error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; it has no state but the clock's."""
+        return _Tracker(self)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Cosine and sine, shape (n, 2)."""
+        return cosines_and_sines(self._angle(motion), (1,))
+
+    def coefficients(self) -> FloatArray:
+        """A cos(phase) and -A sin(phase), arcsec."""
+        phase = math.radians(self.phase_deg)
+        return self.amplitude_arcsec * np.array([math.cos(phase), -math.sin(phase)])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Another amplitude and phase, and another frequency where given."""
+        cosine, sine = (float(each) for each in coefficients)
+        update = {
+            "amplitude_arcsec": math.hypot(cosine, sine),
+            "phase_deg": math.degrees(math.atan2(-sine, cosine)),
+            **dict(shape or {}),
+        }
+        return self.model_copy(update=update)
+
+    def bound_arcsec(self) -> float:
+        """The amplitude."""
+        return self.amplitude_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: it depends on time alone."""
+        return 0.0
+
+    def _angle(self, motion: Motion) -> FloatArray:
+        return (2.0 * math.pi * self.frequency_hz) * motion.channel(Channel.TIME, self.name)
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_amplitude", "_omega", "_phase")
+
+    def __init__(self, effect: Vibration) -> None:
+        self._amplitude = effect.amplitude_arcsec
+        self._omega = 2.0 * math.pi * effect.frequency_hz
+        self._phase = math.radians(effect.phase_deg)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._amplitude * math.cos(self._omega * moment.time_s + self._phase)

@@ -1,0 +1,92 @@
+"""How warm the gear is: what the drifts are driven by."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import Channel, Effect, FloatArray, Moment, Motion, Shape
+from hdbridge.effects.recurrence import lagged
+
+
+class Warmed(Effect):
+    """Base for effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order lag.
+
+    Driven by the temperature channel: the gear follows the sensor with the time constant, in equilibrium
+    at the first sample; warmth is what it is above the reference. Where there is no sensor, driven by time:
+    the gear warms up from a cold start at the first sample, by ``warm_up_k`` in the end.
+    """
+
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("tau_s", 60.0, 3 * 3600.0, logarithmic=True),)
+
+    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant of the gear's temperature")]
+    driven_by: Annotated[
+        Literal["temperature", "time"],
+        Field(description="the temperature channel, or time since a cold start"),
+    ] = "temperature"
+    reference_c: Annotated[
+        float, Field(ge=-60, le=200, description="temperature at which the effect is zero")
+    ] = 20.0
+    warm_up_k: Annotated[
+        float, Field(gt=0, le=200, description="warmth in the end, where driven by time (assumed)")
+    ] = 10.0
+    limit_k: Annotated[
+        float, Field(gt=0, le=200, description="warmth, either way, beyond which the effect is held")
+    ] = 60.0
+
+    def needs(self) -> frozenset[Channel]:
+        """Time, and temperature where it is driven by it."""
+        return self.channels | ({Channel.TEMPERATURE} if self.driven_by == "temperature" else frozenset())
+
+    def warmth(self, motion: Motion) -> FloatArray:
+        """Warmth in kelvin, shape (n,)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        if self.driven_by == "time":
+            warmth = self.warm_up_k * -np.expm1(-(time_s - time_s[:1]) / self.tau_s)
+        else:
+            temperature = motion.channel(Channel.TEMPERATURE, self.name)
+            warmth = lagged(temperature, time_s, self.tau_s) - self.reference_c
+        return np.clip(warmth, -self.limit_k, self.limit_k)
+
+
+class WarmthState:
+    """The same on line: `at` asks, `to` moves."""
+
+    __slots__ = ("_by_time", "_final", "_limit", "_reference", "_start", "_tau", "_temperature", "_time")
+
+    def __init__(self, effect: Warmed) -> None:
+        self._tau = effect.tau_s
+        self._by_time = effect.driven_by == "time"
+        self._reference = effect.reference_c
+        self._final = effect.warm_up_k
+        self._limit = effect.limit_k
+        self._start: float | None = None
+        self._time = self._temperature = 0.0
+
+    def at(self, moment: Moment) -> float:
+        """Warmth at this moment, kelvin; changes nothing."""
+        if self._by_time:
+            since = 0.0 if self._start is None else moment.time_s - self._start
+            warmth = -self._final * math.expm1(-since / self._tau)
+        else:
+            warmth = self._followed(moment) - self._reference
+        return min(max(warmth, -self._limit), self._limit)
+
+    def to(self, moment: Moment) -> float:
+        """Move on to this moment and return the warmth."""
+        warmth = self.at(moment)
+        self._temperature = self._followed(moment)
+        if self._start is None:
+            self._start = moment.time_s
+        self._time = moment.time_s
+        return warmth
+
+    def _followed(self, moment: Moment) -> float:
+        if self._start is None:
+            return moment.temperature_c
+        decay = math.exp(-max(moment.time_s - self._time, 0.0) / self._tau)
+        return decay * self._temperature + (1.0 - decay) * moment.temperature_c

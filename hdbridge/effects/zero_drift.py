@@ -1,0 +1,80 @@
+"""The zero moves with temperature: housing, encoder mount and gear grow unevenly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Start,
+    Tracker,
+)
+from hdbridge.effects.warmth import Warmed, WarmthState
+
+
+class ZeroDrift(Linear, Warmed):
+    """drift times the gear's warmth."""
+
+    name: ClassVar[str] = "zero_drift"
+    about: ClassVar[Cause] = Cause(
+        title="zero moves with temperature",
+        equation="drift w, tau dw'/dt = temperature - w', w = w' - reference (or w = warm_up (1 - exp(-t / "
+        "tau)))",
+        signature="everything shifts slowly and alike in both directions, with a time constant of minutes "
+        "to an hour",
+        consequence="all positions are off by the same amount, until the axis has the temperature of its "
+        "calibration",
+        remedy="warm up before work; home warm; a temperature sensor at the gear makes it predictable",
+        experiment="return to one reference pose again and again while it warms and cools, with the "
+        "temperature recorded",
+        aliases=("creep", "wear", "count_loss", "load_order", "ratio_error"),
+        source="thermal expansion with a first-order lag",
+        size="5-60 arcsec, tau 10-60 min",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+    )
+    linear: ClassVar[tuple[str, ...]] = ("drift_arcsec_per_k",)
+    typical: ClassVar[Mapping[str, Any]] = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
+    """One arcsec per kelvin within half an hour."""
+
+    drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """One arcsec per kelvin, shape (n, 1)."""
+        return self.warmth(motion)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; in equilibrium at its first moment."""
+        return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
+
+    def bound_arcsec(self) -> float:
+        """At the highest warmth."""
+        return abs(self.drift_arcsec_per_k) * self.limit_k
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero: it depends on temperature and time."""
+        return 0.0
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_drift", "_warmth")
+
+    def __init__(self, drift: float, warmth: WarmthState) -> None:
+        self._drift = drift
+        self._warmth = warmth
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._drift * self._warmth.at(moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._drift * self._warmth.to(moment)

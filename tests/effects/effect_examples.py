@@ -1,0 +1,177 @@
+"""Examples of every effect, and motions with every channel, sampled unevenly."""
+
+import numpy as np
+from hypothesis import strategies as st
+
+from hdbridge.effects import (
+    AmplitudeDrift,
+    Backlash,
+    ChannelSkew,
+    Compliance,
+    CountLoss,
+    Creep,
+    DirectionPhase,
+    FlexsplineOrders,
+    Hysteresis,
+    HysteresisMemory,
+    HysteresisParameters,
+    InertialWindup,
+    LoadOrders,
+    LocalDefect,
+    Loop,
+    Motion,
+    MotorEncoderEccentricity,
+    MotorOrder,
+    MotorOrders,
+    RateDependence,
+    RatioError,
+    Relaxation,
+    Start,
+    Step,
+    SubdivisionalError,
+    Synchronous,
+    TorqueModulation,
+    VelocityWindup,
+    Vibration,
+    Wear,
+    ZeroDrift,
+)
+
+arcsec = st.floats(0, 40)
+signed = st.floats(-40, 40)
+ratios = st.floats(20, 200)
+
+
+def orders(numbers):
+    """Some of these orders, each with its own amplitude and phase."""
+    return st.lists(numbers, min_size=1, max_size=6, unique=True).flatmap(
+        lambda ks: st.tuples(
+            *[
+                st.builds(
+                    MotorOrder, order=st.just(k), amplitude_arcsec=arcsec, phase_deg=st.floats(-180, 180)
+                )
+                for k in ks
+            ]
+        )
+    )
+
+
+low_orders = orders(st.integers(1, 12))
+loop = {
+    "offset_arcsec": st.floats(0, 80),
+    "width_deg": st.floats(1, 60),
+    "exponent": st.one_of(st.floats(1.05, 3.0), st.just(2.0), st.just(2.0 + 1e-9)),
+}
+loops = st.builds(Loop, **loop, memory=st.booleans())
+warmth = {
+    "tau_s": st.floats(10, 5000),
+    "driven_by": st.sampled_from(["temperature", "time"]),
+    "reference_c": st.floats(10, 40),
+    "limit_k": st.floats(5, 80),
+}
+torque = {
+    "torque": st.sampled_from(["load_torque_nm", "motor_torque_nm"]),
+    "limit_nm": st.floats(1, 100),
+}
+EXAMPLES = {
+    "synchronous": st.builds(Synchronous, orders=low_orders),
+    "hysteresis": st.builds(Hysteresis, **loop),
+    "motor_order": st.builds(MotorOrders, orders=low_orders),
+    "motor_encoder_eccentricity": st.builds(MotorEncoderEccentricity, orders=orders(st.integers(1, 2))),
+    "load_order": st.builds(LoadOrders, orders=orders(st.integers(1, 4)), ratio=ratios),
+    "flexspline_order": st.builds(FlexsplineOrders, orders=low_orders, ratio=ratios),
+    "direction_phase": st.builds(DirectionPhase, orders=low_orders, shift_deg=st.floats(-10, 10)),
+    "torque_modulation": st.builds(
+        TorqueModulation,
+        orders=low_orders, growth_percent_per_nm=st.floats(-5, 5), signed=st.booleans(), **torque,
+    ),
+    "compliance": st.builds(
+        lambda c, t1, more, **rest: Compliance(
+            c1_arcsec_per_nm=c[0], c2_arcsec_per_nm=c[1], c3_arcsec_per_nm=c[2],
+            torque1_nm=t1, torque2_nm=t1 + more, **rest,
+        ),
+        st.tuples(arcsec, arcsec, arcsec), st.floats(1, 20), st.floats(1, 40),
+        sense=st.sampled_from([1, -1]), **torque,
+    ),
+    "inertial_windup": st.builds(InertialWindup, ratio=ratios, inertia_over_stiffness_s2=st.floats(0, 1e-4)),
+    "velocity_windup": st.builds(
+        VelocityWindup,
+        coulomb_arcsec=arcsec, viscous_arcsec_s_per_deg=st.floats(0, 0.1), shear_deg_s=st.floats(10, 1e4),
+    ),
+    "channel_skew": st.builds(
+        ChannelSkew, ratio=ratios, delay_ms=st.floats(-5, 5), second_order_ms2=st.floats(-25, 25)
+    ),
+    "backlash": st.builds(Backlash, gap_arcsec=arcsec, crossing_deg=st.floats(0.05, 20)),
+    "hysteresis_memory": st.builds(HysteresisMemory, **loop),
+    "hysteresis_parameters": st.builds(HysteresisParameters, base=loops, **loop),
+    "rate_dependence": st.builds(
+        RateDependence, loop=loops, growth_percent=st.floats(0, 50), reference_deg_s=st.floats(1, 1000)
+    ),
+    "subdivisional_error": st.builds(
+        SubdivisionalError, lines_per_turn=st.integers(16, 20_000), orders=orders(st.sampled_from([1, 2, 4]))
+    ),
+    "zero_drift": st.builds(ZeroDrift, drift_arcsec_per_k=st.floats(-5, 5), **warmth),
+    "amplitude_drift": st.builds(
+        AmplitudeDrift,
+        orders=low_orders,
+        loop=loops,
+        ripple_percent_per_k=st.floats(-1, 1),
+        friction_percent_per_k=st.one_of(st.just(0.0), st.floats(-1, 1)),
+        **warmth,
+    ),
+    "wear": st.builds(
+        Wear,
+        growth_arcsec_per_kiloturn=st.floats(-100, 100),
+        width_deg=st.floats(0.1, 30),
+        turns_before=st.floats(0, 50),
+        turns_limit=st.floats(1, 1000),
+    ),
+    "creep": st.builds(
+        Creep,
+        parts=st.lists(
+            st.builds(Relaxation, amplitude_arcsec=signed, tau_s=st.floats(0.01, 100)), min_size=1, max_size=4
+        ).map(tuple),
+        build_up=st.floats(0.01, 2),
+    ),
+    "ratio_error": st.builds(RatioError, ramp_arcsec_per_turn=signed, limit_deg=st.floats(100, 1e5)),
+    "count_loss": st.builds(
+        CountLoss,
+        steps=st.lists(
+            st.builds(Step, time_s=st.floats(-1, 50), size_arcsec=signed), min_size=1, max_size=4
+        ).map(tuple),
+    ),
+    "vibration": st.builds(
+        Vibration, frequency_hz=st.floats(0.1, 500), amplitude_arcsec=arcsec, phase_deg=st.floats(-180, 180)
+    ),
+    "local_defect": st.builds(
+        LocalDefect,
+        ratio=ratios, height_arcsec=signed, centre_deg=st.floats(0, 360), half_width_deg=st.floats(0.1, 20),
+    ),
+}  # fmt: skip
+"""Effect name -> strategy for effects of that kind."""
+
+angle_steps = st.lists(
+    st.one_of(st.sampled_from([0.0, 1e-6, -1e-6]), st.floats(-30, 30, allow_subnormal=False)),
+    min_size=1,
+    max_size=40,
+)
+starts = st.sampled_from(list(Start))
+
+
+def _motion(first, steps, seed, even):
+    """A path, with the other channels drawn at random; every channel is there."""
+    angle = np.cumsum(np.array([first, *steps]))
+    draw = np.random.default_rng(seed)
+    count = len(angle)
+    period = np.full(count, 0.004) if even else draw.uniform(0.001, 2.0, count)
+    return Motion(
+        angle,
+        time_s=draw.uniform(-5, 5) + np.cumsum(period),
+        load_torque_nm=draw.normal(0, 30, count),
+        motor_torque_nm=draw.normal(0, 1, count),
+        temperature_c=np.clip(25 + np.cumsum(draw.normal(0, 2, count)), -20, 90),
+        load_deg=angle / 50 + draw.normal(0, 0.01, count),
+    )
+
+
+motions = st.builds(_motion, st.floats(-2000, 2000), angle_steps, st.integers(0, 2**32 - 1), st.booleans())

@@ -1,0 +1,142 @@
+"""The synchronous part and the plain elastic loop: the two parts of the article's model."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from hdbridge.effects import Hysteresis, Moment, Motion, MotorOrder, Start, Synchronous
+
+ARTICLE_ORDERS = [
+    (1, 4.9, -126.8),
+    (2, 9.33, -132.1),
+    (3, 2.09, -96.2),
+    (4, 12.21, 105.7),
+    (6, 3.18, -127.0),
+    (8, 1.87, 124.3),
+]
+loops = st.builds(
+    Hysteresis,
+    offset_arcsec=st.floats(0, 80),
+    width_deg=st.floats(1, 60),
+    exponent=st.one_of(st.floats(1.05, 3.0), st.just(2.0), st.just(2.0 + 1e-9)),
+)
+steps = st.lists(
+    st.one_of(st.sampled_from([0.0, 1e-6, -1e-6]), st.floats(-30, 30, allow_subnormal=False)),
+    min_size=1,
+    max_size=60,
+)
+paths = st.builds(lambda first, rest: np.cumsum(np.array([first, *rest])), st.floats(-2000, 2000), steps)
+starts = st.sampled_from(list(Start))
+
+
+def test_article_synchronous_part_has_the_peak_to_peak_of_its_table():
+    effect = Synchronous(
+        orders=tuple(MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in ARTICLE_ORDERS)
+    )
+    assert np.ptp(effect.predict(Motion(np.linspace(0, 360, 200_001)))) == pytest.approx(42.93, abs=0.01)
+
+
+def test_an_order_may_stand_only_once():
+    order = MotorOrder(order=2, amplitude_arcsec=1, phase_deg=0)
+    with pytest.raises(ValidationError, match="only once"):
+        Synchronous(orders=(order, order))
+
+
+ARTICLE = Hysteresis(offset_arcsec=40, width_deg=20, exponent=1.6)
+
+
+@pytest.mark.parametrize("amplitude_deg", [180, 45, 5])
+def test_lissajous_loops_close(amplitude_deg):
+    time = np.linspace(0, 3, 3 * 2000 + 1)
+    angle = amplitude_deg * np.cos(2 * np.pi * time)
+    error = ARTICLE.predict(Motion(angle))
+    np.testing.assert_allclose(error[4000:], error[2000:4001], atol=1e-9)
+    assert np.ptp(error[4000:]) > 1.0
+
+
+def test_loops_wider_than_the_width_reach_the_offset_and_narrow_ones_have_the_height_of_the_law():
+    time = np.linspace(0, 2, 4001)
+    for amplitude, height in [(180, 80.0), (45, 80.0), (5, 80 * (0.5**0.6 - 0.6 * 0.5) / 0.4)]:
+        error = ARTICLE.predict(Motion(amplitude * np.cos(2 * np.pi * time)), Start.FORWARD)
+        assert np.ptp(error[2000:]) == pytest.approx(height, abs=1e-6)
+
+
+@given(effect=loops, path=paths, start=starts)
+def test_error_is_continuous_also_at_reversals(effect, path, start):
+    """A step of 1e-9 deg anywhere, in either direction, moves the error by what the law gives it."""
+    tracker = effect.tracker(start)
+    for angle in path:
+        before = tracker.advance(float(angle), Moment())
+        for nudge in (1e-9, -1e-9):
+            after = tracker.peek(float(angle) + nudge, Moment())
+            most = 4 * effect.offset_arcsec * rise_of(4e-9 / effect.width_deg, effect.exponent)
+            assert abs(after - before) <= most + 1e-9
+
+
+def rise_of(xi: float, n: float) -> float:
+    """g as the literature writes it, for comparison."""
+    return xi * (1 - math.log(xi)) if abs(n - 2) < 1e-6 else (xi ** (n - 1) - (n - 1) * xi) / (2 - n)
+
+
+def test_exponent_two_is_the_limit_of_its_neighbours():
+    path = np.array([0.0, 30.0, 27.0, 20.0, 28.0, 35.0])
+    at_two = Hysteresis(offset_arcsec=40, width_deg=20, exponent=2.0).predict(Motion(path))
+    for exponent in (2 - 1e-7, 2 + 1e-7, 2 - 1e-12, 2 + 1e-15):
+        near = Hysteresis(offset_arcsec=40, width_deg=20, exponent=exponent).predict(Motion(path))
+        np.testing.assert_allclose(near, at_two, atol=1e-4)
+    assert at_two[2] == pytest.approx(40 - 80 * 0.15 * (1 - math.log(0.15)))
+
+
+def test_law_follows_the_formula_between_reversals():
+    path = np.array([0.0, 50.0, 48.0, 45.0, 40.0, 29.0])
+    error = ARTICLE.predict(Motion(path))
+    expected = [0.0, 40.0, *[40 - 80 * rise_of(min(d / 20, 1.0), 1.6) for d in (2, 5, 10, 21)]]
+    np.testing.assert_allclose(error, expected, atol=1e-9)
+
+
+def test_saturation_is_no_relay():
+    """A saturated reversal leaves the offset gradually; taken literally the law would jump by 80 arcsec."""
+    tracker = ARTICLE.tracker()
+    for angle in (0.0, 100.0):
+        tracker.advance(angle, Moment())
+    first_count = tracker.peek(100.0 - 360 / 8000, Moment())
+    assert 40 - first_count == pytest.approx(4.9, abs=0.1)
+
+
+def test_direction_holds_at_rest():
+    moving = np.array([0.0, 10.0, 12.0, 9.0, 8.0, 5.0])
+    with_rests = np.repeat(moving, 3)
+    np.testing.assert_array_equal(
+        ARTICLE.predict(Motion(with_rests)), np.repeat(ARTICLE.predict(Motion(moving)), 3)
+    )
+
+
+def test_start_is_what_it_says():
+    ahead = np.array([0.0, 1.0, 9.9, 10.0, 15.0])
+    virgin = ARTICLE.predict(Motion(ahead))
+    assert virgin[0] == 0
+    assert virgin[2] < 40
+    assert virgin[3] == pytest.approx(40)
+    np.testing.assert_allclose(ARTICLE.predict(Motion(ahead), Start.FORWARD), 40.0)
+    backward = ARTICLE.predict(Motion(ahead), Start.BACKWARD)
+    assert backward[0] == -40
+    assert all(b > a for a, b in pairwise(backward))
+
+
+def test_back_and_forth_comes_back_to_where_it_was():
+    """Any excursion within the loop, out and back by the same angle, closes."""
+    for depth in (0.01, 0.5, 3.0, 9.0):
+        path = np.array([0.0, 50.0, 50.0 - depth, 50.0])
+        assert ARTICLE.predict(Motion(path))[-1] == pytest.approx(40.0)
+
+
+def test_it_does_not_remember_return_points():
+    """The law has no return-point memory: that is its known weakness, and an effect of its own."""
+    back_step = np.array([0.0, -50.0, -45.0, -47.0, -45.0, -40.0])
+    straight = np.array([0.0, -50.0, -40.0])
+    assert ARTICLE.predict(Motion(back_step))[-1] - ARTICLE.predict(Motion(straight))[-1] > 8.0
