@@ -15,7 +15,7 @@ from hdbridge.errors import HdbridgeError
 
 app = typer.Typer(
     name="hdbridge",
-    help="Make a harmonic-drive axis point where it is told.\n\nA CANopen CiA-402 master with a model of its gear.",
+    help="Make a harmonic-drive axis point where it is told: a CANopen master that knows its gear.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -1,2 +1,69 @@
-def register(app):
-    pass
+"""``hdbridge simulate``: the simulated drive by itself, in real time, on any bus."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    TruthOption,
+    load_axis,
+    notes,
+)
+from hdbridge.clock import MonotonicClock
+from hdbridge.drive.link import open_bus
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import nameplate_of
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.run import run
+from hdbridge.sim.truth import Truth
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("simulate")(simulate)
+
+
+def simulate(
+    profile: ProfileArgument,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration", min=0.0, help="Stop after so many seconds; else at Ctrl-C.")
+    ] = None,
+) -> None:
+    """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.
+
+    Another process masters it, for example over SocketCAN:
+
+        hdbridge simulate article --interface socketcan --channel vcan0 &
+
+        hdbridge step article --interface socketcan --channel vcan0
+    """
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel)
+    if axis.bus.interface == "virtual":
+        raise InputError(
+            "the bus 'virtual' lives within one process, nobody could reach the simulated drive there; "
+            "give --interface udp_multicast --channel 239.0.0.1, or socketcan, "
+            "or use 'hdbridge step --simulate'"
+        )
+    known = Truth.load(truth or files.truth)
+    clock = MonotonicClock()
+    with deferred_interrupt() as interrupted, open_bus(axis.bus) as bus:
+        node = SimulatedDrive(
+            bus, Machine(known, seed), axis.eds_path, axis.drive.node_id, clock, nameplate_of(known)
+        )
+        notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")
+        end = float("inf") if duration_s is None else clock.now() + duration_s
+        run(bus, node, clock, lambda: interrupted() or clock.now() >= end)

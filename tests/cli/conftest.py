@@ -1,0 +1,44 @@
+"""The command line as a person uses it: a process, its output and its exit status."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
+
+
+@pytest.fixture
+def hdbridge(tmp_path):
+    """Run `hdbridge ARGS...` in an empty folder."""
+
+    def run(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "hdbridge", *map(str, arguments)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+
+    return run
+
+
+@pytest.fixture
+def profile(tmp_path):
+    """A copy of the article's profile, with a function that edits its files."""
+    folder = tmp_path / "profile"
+    shutil.copytree(PROFILE, folder)
+
+    def edit(old: str, new: str, file: str = "axis.yaml") -> Path:
+        path = folder / file
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        return folder
+
+    edit.folder = folder
+    return edit

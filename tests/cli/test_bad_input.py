@@ -1,0 +1,80 @@
+"""Bad input gives one clear line and a documented exit status, and nothing is written."""
+
+import pytest
+
+
+def refused(done, status: int, *texts: str) -> None:
+    """One line on standard error, with these words, and this status."""
+    lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
+    assert done.returncode == status, done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(lines) == 1, done.stderr
+    for text in texts:
+        assert text in lines[0]
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "texts"),
+    [
+        ("ratio: 50", "ratio: [", ("axis.yaml:", "expected")),
+        ("ratio: 50", "ratoi: 50", ("axis.yaml:", "gear.ratoi", "did you mean 'ratio'")),
+        ("ratio: 50", "ratio: fifty", ("axis.yaml:", "gear.ratio")),
+        ("ratio: 50", "ratio: .nan", ("axis.yaml:", "gear.ratio")),
+        ("100, circular_spline: 102", "80, circular_spline: 82", ("40", "41", "100 and 102")),
+        ("hdbridge-402.eds", "nowhere.eds", ("axis.yaml:", "nowhere.eds", "expected an EDS file")),
+        ("hdbridge.axis/1", "hdbridge.axis/9", ("axis.yaml:", "hdbridge.axis/1")),
+        ("interface: virtual ", "interface: tin-cans ", ("tin-cans", "virtual")),
+    ],
+)  # fmt: skip
+def test_a_wrong_axis_file_is_refused(hdbridge, profile, tmp_path, old, new, texts):
+    folder = profile(old, new)
+    done = hdbridge("step", folder, "--json", "out.json")
+    refused(done, 3 if "tin-cans" in new else 2, *texts)
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_no_such_profile(hdbridge):
+    refused(hdbridge("step", "artcile", "--simulate"), 2, "artcile", "did you mean 'article'")
+
+
+def test_wrong_identity_is_refused_by_the_drive(hdbridge, profile):
+    done = hdbridge("step", profile("product_code: 0x402", "product_code: 0x403"), "--simulate")
+    refused(done, 4, "1018h", "product_code")
+
+
+def test_absent_node(hdbridge, profile):
+    done = hdbridge("step", profile("channel: hdbridge", "channel: nobody-there"))
+    refused(done, 4, "node 1", "Virtual bus channel nobody-there", "drive.node_id")
+
+
+def test_absent_interface(hdbridge, profile):
+    done = hdbridge("step", profile.folder, "--interface", "socketcan", "--channel", "nocan7")
+    refused(done, 3, "socketcan:nocan7")
+
+
+@pytest.mark.parametrize(
+    ("options", "texts"),
+    [
+        (("--count", 1000), ("400", "nothing was moved")),
+        (("--start-deg", "nan"), ("nan",)),
+        (("--step-deg", "inf"), ("inf",)),
+        (("--start-deg", "-399"), ("-401", "nothing was moved")),
+    ],
+)
+def test_targets_outside_the_limits_never_reach_the_axis(hdbridge, options, texts):
+    refused(hdbridge("step", "article", "--simulate", *options), 2, *texts)
+
+
+def test_truth_without_simulation(hdbridge, profile):
+    refused(hdbridge("step", "article", "--truth", profile.folder / "truth.yaml"), 2, "--simulate")
+
+
+def test_a_scheme_that_the_model_does_not_have(hdbridge):
+    refused(hdbridge("step", "article", "--simulate", "--scheme", "extended"), 2, "extended")
+
+
+def test_usage_errors_have_status_2(hdbridge):
+    done = hdbridge("step")
+    assert done.returncode == 2
+    assert "PROFILE" in done.stderr

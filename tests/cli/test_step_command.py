@@ -1,0 +1,57 @@
+"""`hdbridge step`, `demo` and `check` on the simulated drive."""
+
+import gzip
+import json
+
+import pytest
+
+
+def test_step_prints_a_table_and_writes_the_contract(hdbridge, tmp_path):
+    done = hdbridge("step", "article", "--simulate", "--count", 12, "--json", "out.json", "--record", "kept")
+    assert done.returncode == 0, done.stderr
+    for word in ("none", "synchronous", "hysteresis", "both", "quantisation floor"):
+        assert word in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["schema"] == "hdbridge.stepping/1"
+    assert result["quantisation_floor_arcsec"] == pytest.approx(2.806, abs=0.001)
+    for scheme in ("none", "synchronous", "hysteresis", "both"):
+        for part in ("cw", "ccw", "pooled"):
+            assert set(result[scheme][part]) == {"three_sigma_arcsec", "mean_arcsec"}
+    assert result["none"]["cw"]["mean_arcsec"] > 30
+    assert result["none"]["ccw"]["mean_arcsec"] < -30
+    assert result["both"]["pooled"]["three_sigma_arcsec"] < 4.5
+    with gzip.open(tmp_path / "kept" / "stepping-both.csv.gz", "rt") as file:
+        assert file.readline().strip().split(",")[0] == "time_s"
+
+
+def test_the_same_seed_gives_the_same_record_bit_for_bit(hdbridge, tmp_path):
+    (tmp_path / "none.yaml").write_text("schema: hdbridge.model/1\nratio: 50\neffects: []\n")
+    options = ("--simulate", "--model", "none.yaml", "--scheme", "none", "--count", 2)
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        done = hdbridge("step", "demo", *options, "--seed", seed, "--record", name)
+        assert done.returncode == 0, done.stderr
+    a, b, c = ((tmp_path / each / "stepping-none.csv.gz").read_bytes() for each in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_demo_makes_everything_that_it_names(hdbridge, tmp_path):
+    done = hdbridge("demo", "--count", 4)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "demo-output" / "stepping.html").read_text()
+    assert "<html" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert json.loads((tmp_path / "demo-output" / "stepping.json").read_text())["both"]
+
+
+def test_check_says_what_the_files_mean(hdbridge):
+    done = hdbridge("check", "article")
+    assert done.returncode == 0, done.stderr
+    for fact in ("ratio", "50", "3.24 arcsec", "synchronous, hysteresis", "all right"):
+        assert fact in done.stdout
+
+
+def test_one_scheme_only(hdbridge, tmp_path):
+    done = hdbridge("step", "article", "--simulate", "--count", 3, "--scheme", "both", "--json", "out.json")
+    assert done.returncode == 0, done.stderr
+    assert "none" not in json.loads((tmp_path / "out.json").read_text())
