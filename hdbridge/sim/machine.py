@@ -140,13 +140,11 @@ class Machine:
         """What is slow against a control cycle: the temperature, and a new sample of the noise."""
         if self._noise_deg:
             self._noise_now_deg = self._noise.gauss(0.0, self._noise_deg)
-        heat = self.truth.temperature
-        plant = self._plant
+        heat, plant = self.truth.temperature, self._plant
         elapsed_s = substeps * self.dt_s
         if elapsed_s:
-            now = plant.now
-            warmed = (copper_j + plant.loss_j) / elapsed_s * heat.resistance_k_per_w
-            now.temperature_c += (
-                (heat.ambient_c + warmed - now.temperature_c) * elapsed_s / heat.time_constant_s
-            )
+            loss_w = (copper_j + plant.loss_j) / elapsed_s
             plant.loss_j = 0.0
+            goal_c = heat.ambient_c + heat.resistance_k_per_w * loss_w
+            nearer = -math.expm1(-elapsed_s / heat.time_constant_s)
+            plant.now.temperature_c += (goal_c - plant.now.temperature_c) * nearer

@@ -22,9 +22,9 @@ class Servo:
 
     __slots__ = (
         "_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction",
-        "_hunting_band", "_integral", "_integral_rate", "_last_reference", "_load_ahead", "_load_gain", "_load_model",
-        "_load_speed", "_measured", "_position_gain", "_reference", "_reference_speed", "_step_deg",
-        "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
+        "_hunting_band", "_integral", "_integral_rate", "_last_reference", "_load_ahead", "_load_gain",
+        "_load_model", "_load_speed", "_measured", "_position_gain", "_reference", "_reference_speed",
+        "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
         "measured_deg_s",
     )  # fmt: skip
 

@@ -1,0 +1,363 @@
+"""The simulated axis in motion and at rest: loops, friction, encoders, heat."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ruckig
+
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+PROFILES = Path(__file__).parents[2] / "profiles"
+CYCLE_S = 0.004
+DEG_PER_COUNT = 360.0 / 8000.0
+STEP_COUNTS = 968
+
+
+def truth(profile: str = "article", **changes: Any) -> Truth:
+    """A profile's axis with values changed, keys like ``gear__ratio``."""
+    data = Truth.load(PROFILES / profile).model_dump(by_alias=True)
+    for path, value in changes.items():
+        *parts, last = path.split("__")
+        place = data
+        for part in parts:
+            place = place[part]
+        place[last] = value
+    return Truth.model_validate(data)
+
+
+def trajectory(distance_counts: int) -> list[int]:
+    """A jerk-limited move in whole counts per cycle, within the limits of the article's axis file."""
+    otg = ruckig.Ruckig(1, CYCLE_S)
+    way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
+    way.current_position = way.current_velocity = way.current_acceleration = [0.0]
+    way.target_position = [float(distance_counts)]
+    counts_per_load_deg = 50.0 / DEG_PER_COUNT
+    way.max_velocity = [20.0 * counts_per_load_deg]
+    way.max_acceleration = [200.0 * counts_per_load_deg]
+    way.max_jerk = [4000.0 * counts_per_load_deg]
+    positions = []
+    while True:
+        result = otg.update(way, out)
+        positions.append(round(out.new_position[0]))
+        if result != ruckig.Result.Working:
+            return positions
+        out.pass_to_input(way)
+
+
+class Axis:
+    """A machine with a master that sends whole counts each cycle."""
+
+    def __init__(self, known: Truth, seed: int = 1) -> None:
+        self.machine = Machine(known, seed)
+        self.target = 0
+        self.overshoot_deg = 0.0
+        self.substeps = round(CYCLE_S / self.machine.dt_s)
+
+    def move(self, distance_counts: int, settle_s: float = 0.3) -> None:
+        """Move by whole counts, and wait."""
+        start, sense = self.target, math.copysign(1.0, distance_counts)
+        end_deg = (start + distance_counts) * DEG_PER_COUNT
+        self.overshoot_deg = 0.0
+        for position in trajectory(distance_counts) + [distance_counts] * round(settle_s / CYCLE_S):
+            self.to(start + position)
+            over_deg = sense * (self.machine.true_motor_deg - end_deg)
+            self.overshoot_deg = max(self.overshoot_deg, over_deg)
+
+    def to(self, target: int) -> None:
+        """One cycle."""
+        self.machine.follow(self.target, target, self.substeps)
+        self.target = target
+
+    def hold(self, time_s: float) -> None:
+        for _ in range(round(time_s / CYCLE_S)):
+            self.to(self.target)
+
+    @property
+    def error_arcsec(self) -> float:
+        """Load error at the target."""
+        return (self.machine.true_load_deg - self.target * DEG_PER_COUNT / 50.0) * 3600.0
+
+
+def static_arcsec(known: Truth, motor_deg: float, direction: int) -> float:
+    """Tables 1 and 2 after long motion in one direction."""
+    law: Any = known.gear.hysteresis
+    tooth = (
+        each.amplitude_arcsec * math.cos(math.radians(each.order * motor_deg + each.phase_deg))
+        for each in known.gear.motor_orders
+    )
+    return math.fsum(tooth) + direction * float(law.offset_arcsec)
+
+
+@pytest.mark.parametrize("profile", ["article", "demo"])
+def test_a_settled_step_stands_at_the_static_law(profile: str) -> None:
+    known = truth(profile)
+    axis = Axis(known)
+    for direction in (1, -1):
+        for step in range(15):
+            axis.move(direction * STEP_COUNTS)
+            assert axis.overshoot_deg < 0.002
+            if step == 0:
+                continue  # this one takes the hysteresis to its side
+            expected = static_arcsec(known, axis.target * DEG_PER_COUNT, direction)
+            assert axis.error_arcsec == pytest.approx(expected, abs=0.25)
+            assert axis.machine.motor_counts == axis.target
+
+
+def test_the_load_has_settled_a_tenth_of_a_second_after_the_move() -> None:
+    axis = Axis(truth())
+    for _ in range(6):
+        axis.move(STEP_COUNTS, settle_s=0.1)
+        early = axis.machine.load_counts
+        axis.hold(1.0)
+        assert abs(axis.machine.load_counts - early) <= 1
+
+
+def test_the_time_step_does_not_matter_once_settled() -> None:
+    errors = []
+    for substep_ms in (1.0, 0.5, 0.25):
+        axis = Axis(truth(substep_ms=substep_ms))
+        axis.move(STEP_COUNTS)
+        axis.move(-STEP_COUNTS // 4)
+        axis.move(STEP_COUNTS)
+        errors.append(axis.error_arcsec)
+    assert max(errors) - min(errors) < 0.15
+
+
+def test_a_small_reversal_stands_at_the_static_law() -> None:
+    axis = Axis(truth())
+    axis.move(STEP_COUNTS)
+    axis.move(STEP_COUNTS)
+    axis.move(-100)
+    crossed = (100 * DEG_PER_COUNT / 20.0) ** 0.6 - 0.6 * (100 * DEG_PER_COUNT / 20.0)
+    expected = static_arcsec(truth(), axis.target * DEG_PER_COUNT, 1) - 80.0 * crossed / 0.4
+    assert axis.error_arcsec == pytest.approx(expected, abs=0.3)
+
+
+@pytest.mark.parametrize("profile", ["article", "demo"])
+def test_small_steps_to_and_fro_stay_within_half_a_count(profile: str) -> None:
+    axis = Axis(truth(profile))
+    for counts in (300, 7, 1, 1, -1, -2, 9, -30, 60, 2, -5, 13, -100, -4):
+        axis.move(counts, settle_s=0.5)
+        assert axis.overshoot_deg < DEG_PER_COUNT / 2
+        assert axis.machine.motor_counts == axis.target
+
+
+@pytest.mark.parametrize("profile", ["article", "demo"])
+def test_a_stopped_axis_sticks(profile: str) -> None:
+    axis = Axis(truth(profile))
+    axis.move(STEP_COUNTS)
+    axis.move(-STEP_COUNTS // 2, settle_s=1.0)
+    stood_deg, load_deg = axis.machine.true_motor_deg, axis.machine.true_load_deg
+    for _ in range(10):
+        axis.hold(1.0)
+        assert axis.machine.true_motor_deg == stood_deg
+        assert axis.machine.velocity_counts_s == 0.0
+    assert axis.machine.true_load_deg == pytest.approx(load_deg, abs=1e-9)
+
+
+def test_the_motor_follows_well_within_the_drive_s_following_error_window() -> None:
+    axis = Axis(truth())
+    worst_deg = 0.0
+    for position in trajectory(20 * STEP_COUNTS):
+        axis.to(position)
+        worst_deg = max(worst_deg, abs(position - axis.machine.motor_counts) * DEG_PER_COUNT)
+    # At 1,000 motor degrees per second the filter on the demand, two lags of 1 ms, is 2 degrees.
+    assert 1.5 < worst_deg < 2.5
+
+
+def test_a_demand_between_counts_is_followed_between_counts() -> None:
+    machine = Machine(truth(), 1)
+    for cycle in range(50):
+        machine.follow(10.0 * cycle, 10.0 * (cycle + 1), 8)
+    machine.follow(500.0, 500.4, 8)
+    for _ in range(100):
+        machine.follow(500.4, 500.4, 8)
+    assert machine.true_motor_deg / DEG_PER_COUNT == pytest.approx(500.4, abs=0.1)
+
+
+def test_switching_on_does_not_move_an_axis_that_stands_between_counts() -> None:
+    axis = Axis(truth())
+    for position in trajectory(STEP_COUNTS)[:20]:
+        axis.to(position)
+    machine = axis.machine
+    machine.coast(1000, braked=False)
+    stood_deg = machine.true_motor_deg
+    assert abs(stood_deg / DEG_PER_COUNT - machine.motor_counts) > 0.05, (
+        "the test needs a motor off its count"
+    )
+    for _ in range(250):
+        machine.follow(machine.motor_counts, machine.motor_counts, 8)
+    assert machine.true_motor_deg == stood_deg
+
+
+def test_the_brake_stops_sooner_than_friction() -> None:
+    ways = []
+    for braked in (False, True):
+        axis = Axis(truth())
+        for position in trajectory(4 * STEP_COUNTS)[:40]:
+            axis.to(position)
+        before_deg = axis.machine.true_motor_deg
+        axis.machine.coast(2000, braked)
+        ways.append(axis.machine.true_motor_deg - before_deg)
+        assert axis.machine.velocity_counts_s == 0.0
+        assert axis.machine.torque_permille == 0
+    assert 0.0 < ways[1] < 0.2 * ways[0]
+
+
+def test_the_torque_stays_within_its_limit() -> None:
+    axis = Axis(truth())
+    machine = axis.machine
+    machine.torque_limit_permille = 120.0
+    peak = 0
+    for _ in range(3):
+        machine.follow(axis.target, axis.target + 4000, 8)  # 45 turns per second at once
+        axis.target += 4000
+        peak = max(peak, abs(machine.torque_permille))
+    for _ in range(500):
+        axis.to(axis.target)
+        peak = max(peak, abs(machine.torque_permille))
+    assert peak == 120
+    assert abs(machine.motor_counts - axis.target) <= 1, "it comes to its target all the same"
+
+
+def test_the_torque_limit_cannot_be_set_beyond_the_drive_s_own() -> None:
+    machine = Machine(truth(), 1)
+    machine.torque_limit_permille = 99_999.0
+    assert machine.torque_limit_permille == pytest.approx(3000.0)
+
+
+def test_less_torque_than_friction_does_not_move_the_motor() -> None:
+    machine = Machine(truth(), 1)
+    machine.torque_limit_permille = 50.0
+    for _ in range(100):
+        machine.follow(5000.0, 5000.0, 8)
+    assert machine.true_motor_deg == 0.0
+    assert machine.torque_permille == 50
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_encoders_count_whole_counts_in_their_direction_from_their_zero(direction: int) -> None:
+    known = truth(
+        motor__encoder__direction=direction,
+        motor__encoder__zero_counts=1234,
+        load__encoder__direction=direction,
+        load__encoder__zero_counts=-77,
+    )
+    machine = Machine(known, 1)
+    rest_deg = machine.true_load_deg
+    assert machine.motor_counts == 1234
+    assert machine.load_counts == math.floor(direction * rest_deg * 8000 - 77 + 0.5)
+    for cycle in range(100):
+        machine.follow(1234 + 20 * cycle, 1234 + 20 * (cycle + 1), 8)
+    for _ in range(100):
+        machine.follow(3234, 3234, 8)
+    assert machine.true_motor_deg == pytest.approx(direction * 90.0, abs=0.02)
+    assert machine.motor_counts == 3234
+    assert machine.load_counts == math.floor(direction * machine.true_load_deg * 8000 - 77 + 0.5)
+
+
+def test_the_torque_has_the_sign_of_the_counts() -> None:
+    for direction in (1, -1):
+        machine = Machine(truth(motor__encoder__direction=direction), 1)
+        for cycle in range(50):
+            machine.follow(20 * cycle, 20 * (cycle + 1), 8)
+        assert machine.torque_permille > 80
+        assert machine.velocity_counts_s == pytest.approx(5000.0, rel=0.05)
+
+
+def record(seed: int) -> list[tuple[int, int, int, float, float]]:
+    axis = Axis(truth("demo"), seed)
+    rows = []
+    for distance in (STEP_COUNTS, -300, 17):
+        for position in trajectory(distance):
+            axis.to(position)
+            m = axis.machine
+            rows.append(
+                (m.motor_counts, m.load_counts, m.torque_permille, m.true_load_deg, m.velocity_counts_s)
+            )
+        axis.target = 0
+    return rows
+
+
+def test_the_same_seed_gives_the_same_record_bit_for_bit() -> None:
+    assert record(3) == record(3)
+
+
+def test_the_seed_is_in_the_noise_of_the_load_encoder_and_nowhere_else() -> None:
+    one, other = record(3), record(4)
+    assert [row[1] for row in one] != [row[1] for row in other]
+    assert [row[:1] + row[2:] for row in one] == [row[:1] + row[2:] for row in other]
+
+
+def test_the_noise_of_the_load_encoder_is_as_stated() -> None:
+    axis = Axis(truth("demo", load__encoder__noise_arcsec=2.0))
+    axis.move(STEP_COUNTS, settle_s=0.5)
+    readings = []
+    for _ in range(1000):
+        axis.hold(CYCLE_S)
+        assert axis.machine.load_counts == axis.machine.load_counts
+        readings.append(axis.machine.load_counts * 0.45)
+    assert statistics.pstdev(readings) == pytest.approx(2.0, rel=0.1)
+
+
+def test_friction_warms_the_axis_and_rest_lets_it_cool() -> None:
+    known = truth(
+        temperature={"ambient_c": 20.0, "resistance_k_per_w": 10.0, "time_constant_s": 0.5},
+    )
+    machine = Machine(known, 1)
+    for cycle in range(750):
+        machine.follow(40.0 * cycle, 40.0 * (cycle + 1), 8)  # 10,000 counts/s: 7.85 rad/s
+    loss_w = (0.03 + 2e-4 * 7.854) * 7.854
+    assert machine.temperature_c == pytest.approx(20.0 + 10.0 * loss_w, rel=0.01)
+    machine.coast(10_000, braked=False)
+    assert machine.temperature_c == pytest.approx(20.0, abs=0.01)
+
+
+def test_the_zero_drifts_with_the_temperature_where_the_truth_says_so() -> None:
+    loads = []
+    for drift in (0.0, 3.0):
+        known = truth(
+            temperature__ambient_c=20.0, temperature__start_c=30.0, temperature__zero_drift_arcsec_per_k=drift
+        )
+        machine = Machine(known, 1)
+        start_deg = machine.true_load_deg
+        for _ in range(1500):
+            machine.coast(8, braked=True)
+        loads.append((start_deg, machine.true_load_deg, machine.temperature_c))
+    (plain, _, _), (start, end, end_c) = loads
+    assert (start - plain) * 3600.0 == pytest.approx(30.0)
+    assert 29.0 < end_c < 30.0
+    assert (end - plain) * 3600.0 == pytest.approx(3.0 * (end_c - 20.0), abs=0.01)
+
+
+def test_load_and_flexspline_orders_are_seen_at_their_own_angles() -> None:
+    one = [{"order": 1, "amplitude_arcsec": 30.0, "phase_deg": 0.0}]
+    for key, angle in (("load_orders", 1 / 50), ("flexspline_orders", 1 + 1 / 50)):
+        known = truth(gear__motor_orders=[], gear__hysteresis=None, **{f"gear__{key}": one})
+        axis = Axis(known)
+        axis.move(50 * 8000 // 3, settle_s=0.3)
+        expected = 30.0 * math.cos(math.radians(axis.target * DEG_PER_COUNT * angle))
+        assert axis.error_arcsec == pytest.approx(expected, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"law": "maxwell_slip", "elements": [{"limit_arcsec": 25, "yield_deg": 2}]},
+        {"law": "bouc_wen", "offset_arcsec": 25, "yield_deg": 3},
+        None,
+    ],
+)
+def test_the_gear_has_the_hysteresis_law_of_the_truth_file(law: dict[str, Any] | None) -> None:
+    axis = Axis(truth(gear__motor_orders=[], gear__hysteresis=law))
+    offset = 25.0 if law else 0.0
+    axis.move(STEP_COUNTS)
+    assert axis.error_arcsec == pytest.approx(offset, abs=0.2)
+    axis.move(-STEP_COUNTS)
+    assert axis.error_arcsec == pytest.approx(-offset, abs=0.2)

@@ -1,0 +1,105 @@
+"""Truth files: what the simulated axis is, read strictly."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+
+from hdbridge.axis import AxisConfig
+from hdbridge.errors import InputError
+from hdbridge.sim import truth as truth_module
+from hdbridge.sim.truth import RollingFriction, Truth
+
+ROOT = Path(__file__).parents[2]
+ARTICLE = ROOT / "profiles" / "article" / "truth.yaml"
+
+
+def changed(old: str, new: str) -> Truth:
+    """The article's truth file with a piece of text replaced."""
+    text = ARTICLE.read_text()
+    assert text.count(old) == 1, f"the test expects '{old}' once in the article's truth file"
+    return Truth.from_text(text.replace(old, new), "truth.yaml")
+
+
+@pytest.mark.parametrize("profile", ["article", "demo"])
+def test_a_profile_s_simulated_axis_is_the_one_that_its_axis_file_describes(profile: str) -> None:
+    folder = ROOT / "profiles" / profile
+    truth, axis = Truth.load(folder), AxisConfig.load(folder)
+    assert truth.name == profile
+    assert truth.gear.ratio == axis.gear.ratio
+    assert truth.motor.rated_torque_nm == axis.drive.rated_torque_nm
+    for there, here in (
+        (truth.motor.encoder, axis.motor_encoder),
+        (truth.load_.encoder, axis.load_encoder),
+    ):
+        assert (there.counts_per_turn, there.direction) == (here.counts_per_turn, here.direction)
+
+
+def test_the_article_s_axis_has_tables_1_and_2_and_nothing_else_at_rest() -> None:
+    truth = Truth.load(ARTICLE)
+    orders = {each.order: (each.amplitude_arcsec, each.phase_deg) for each in truth.gear.motor_orders}
+    assert orders == {
+        1: (4.9, -126.8), 2: (9.33, -132.1), 3: (2.09, -96.2),
+        4: (12.21, 105.7), 6: (3.18, -127.0), 8: (1.87, 124.3),
+    }  # fmt: skip
+    law = truth.gear.hysteresis
+    assert isinstance(law, RollingFriction)
+    assert (law.width_deg, law.offset_arcsec, law.exponent) == (20.0, 40.0, 1.6)
+    assert truth.gear.load_orders == truth.gear.flexspline_orders == ()
+    assert truth.load_.coulomb_nm == truth.load_.encoder.noise_arcsec == 0.0
+    assert truth.temperature.zero_drift_arcsec_per_k == 0.0
+
+
+def test_the_inertias_are_1_to_3_and_the_load_s_resonance_is_realistic() -> None:
+    truth = Truth.load(ARTICLE)
+    reflected = truth.load_.inertia_kg_m2 / truth.gear.ratio**2
+    assert reflected / truth.motor.inertia_kg_m2 == pytest.approx(3.0)
+    assert 20.0 < truth.load_frequency_hz < 60.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("coulomb_nm: 0.03", "coulomb: 0.03", r"truth.yaml:10:3: motor\.coulomb: unknown key; did you mean"),
+        ("inertia_kg_m2: 3.0e-5 ", "inertia_kg_m2: -1 ", r"truth.yaml:8:18: motor\.inertia_kg_m2: found -1"),
+        ("ratio: 50", "ratio: .nan", r"gear\.ratio"),
+        (
+            "exponent: 1.6",
+            "exponent: 1.0",
+            r"gear\.hysteresis\.exponent: found 1.0; expected a number above 1",
+        ),
+        ("law: rolling_friction", "law: rolling", r"gear\.hysteresis"),
+        ("exponent: 1.6", "exponent: 1.6\n    start_arcsec: 41", r"41 arcsec lies outside"),
+        ("order: 8", "order: 6", r"order 6 stands twice"),
+        ("substep_ms: 0.5", "substep_ms: 5", r"substep_ms: found 5"),
+        ("stiffness_nm_per_rad: 16000", "stiffness_nm_per_rad: 4.0e6", r"too long for a resonance"),
+        ("hdbridge.truth/1", "hdbridge.truth/2", r"schema: found 'hdbridge.truth/2'"),
+        ("name: article", "", r"key 'name' is missing"),
+    ],
+)
+def test_a_wrong_truth_file_is_refused_with_place_and_reason(old: str, new: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint) as raised:
+        changed(old, new)
+    assert re.match(r"truth\.yaml:\d+:\d+: ", str(raised.value))
+    assert "\n" not in str(raised.value)
+
+
+def test_an_absent_truth_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        Truth.load(tmp_path)
+
+
+def test_every_key_is_described_in_the_reference() -> None:
+    reference = (ROOT / "docs" / "truth-file.md").read_text()
+    models: list[Any] = [
+        each
+        for each in vars(truth_module).values()
+        if isinstance(each, type) and issubclass(each, BaseModel) and each.__module__ == truth_module.__name__
+    ]
+    keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
+    assert len(keys) > 40
+    assert [key for key in sorted(keys) if f"`{key}`" not in reference] == []
