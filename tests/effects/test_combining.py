@@ -1,0 +1,142 @@
+"""How effects go together in a model, and that the compensation makes up for what it should."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hdbridge.compensation import Inverse
+from hdbridge.effects import (
+    CATALOGUE,
+    AmplitudeDrift,
+    Backlash,
+    CountLoss,
+    DirectionPhase,
+    Hysteresis,
+    HysteresisMemory,
+    HysteresisParameters,
+    LoadOrders,
+    Loop,
+    Motion,
+    MotorOrder,
+    Observer,
+    RateDependence,
+    Start,
+    Synchronous,
+    compensable,
+    extended,
+    fall_bound,
+    of_another_ratio,
+    refreshed,
+)
+from hdbridge.model import TransmissionModel
+
+RATIO = 50.0
+BASE = (CATALOGUE["synchronous"].candidate(RATIO), CATALOGUE["hysteresis"].candidate(RATIO))
+
+
+def names(effects):
+    return [each.name for each in effects]
+
+
+def test_the_law_with_memory_takes_the_place_of_the_plain_one_and_back():
+    memory = HysteresisMemory.candidate(RATIO, BASE)
+    effects = extended(BASE, memory)
+    assert names(effects) == ["synchronous", "hysteresis_memory"]
+    assert names(extended(effects, BASE[1])) == ["synchronous", "hysteresis"]
+
+
+@pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
+def test_changed_parameters_go_into_the_models_own_loop(law):
+    loop = law(offset_arcsec=40, width_deg=20, exponent=1.6)
+    change = HysteresisParameters.candidate(RATIO, [loop])
+    effects = extended([BASE[0], loop], change)
+    assert names(effects) == ["synchronous", law.name]
+    assert effects[1].offset_arcsec == pytest.approx(48)
+    path = Motion(np.array([0.0, 30.0, 25.0, 27.0, 20.0, 40.0]))
+    np.testing.assert_allclose(effects[1].predict(path), loop.predict(path) + change.predict(path), atol=1e-9)
+
+
+def test_a_new_cause_is_added_and_a_known_one_renewed():
+    once = extended(BASE, Backlash.of_gap(10.0, RATIO))
+    assert names(once) == ["synchronous", "hysteresis", "backlash"]
+    twice = extended(once, Backlash.of_gap(5.0, RATIO))
+    assert names(twice) == names(once)
+    assert twice[2].gap_arcsec == 5.0
+
+
+def test_what_is_carried_follows_what_it_was_copied_from():
+    effects = extended(BASE, RateDependence.candidate(RATIO, BASE))
+    effects = extended(effects, HysteresisParameters.candidate(RATIO, BASE))
+    assert effects[2].loop == Loop(offset_arcsec=48, width_deg=20, exponent=1.6)
+    phase = DirectionPhase(orders=(MotorOrder(order=2, amplitude_arcsec=1, phase_deg=0),), shift_deg=1)
+    (order,) = refreshed([*BASE, phase])[2].orders
+    assert order == next(each for each in BASE[0].orders if each.order == 2)
+
+
+def test_errors_of_the_measurement_are_left_out_of_the_compensation():
+    every = [each.candidate(RATIO, BASE) for each in CATALOGUE.values()]
+    left = set(names(every)) - set(names(compensable(every)))
+    assert left == {"channel_skew", "subdivisional_error", "load_order", "count_loss", "vibration"}
+    assert CountLoss.compensable.why
+
+
+def test_a_shrinking_loop_beside_the_models_own_does_not_fall():
+    drift = AmplitudeDrift.candidate(RATIO, BASE)
+    assert drift.slope_bound_arcsec_per_deg() == math.inf
+    assert math.isfinite(fall_bound([*BASE, drift]))
+    assert fall_bound([drift]) == math.inf
+    greedy = drift.model_copy(update={"friction_percent_per_k": -2.0})
+    assert fall_bound([*BASE, greedy]) == math.inf
+    assert fall_bound(BASE) == sum(each.slope_bound_arcsec_per_deg() for each in BASE)
+
+
+def test_effects_of_another_ratio_are_named():
+    order = LoadOrders.candidate(80.0)
+    assert of_another_ratio([*BASE, order], RATIO) == ("load_order",)
+    assert of_another_ratio([*BASE, order], 80.0) == ()
+
+
+INVERTIBLE = sorted(
+    name
+    for name, kind in CATALOGUE.items()
+    if kind.candidate(RATIO, BASE).is_compensable()
+    and math.isfinite(kind.candidate(RATIO, BASE).slope_bound_arcsec_per_deg())
+)
+
+
+@pytest.mark.parametrize("name", INVERTIBLE)
+def test_the_compensation_puts_the_load_on_its_target_whatever_the_cause(name):
+    """There and back with rests, under torque, warming up: whatever the error, it is made up for."""
+    effect = CATALOGUE[name].candidate(RATIO, BASE)
+    base = tuple(each for each in BASE if each.name not in {name, effect.replaces})
+    model = TransmissionModel(ratio=RATIO, effects=(*base, effect))
+    inverse, observer = Inverse(model, Start.BACKWARD), Observer()
+    issued, targets, seen = [], [], []
+    for i in range(300):
+        time_s = 0.01 * i
+        target = 4.0 * round(math.sin(3.0 * time_s), 1) + 0.2 * math.sin(9.0 * time_s)
+        moment = observer.moment(
+            RATIO * target, time_s, load_torque_nm=20 * math.sin(time_s), temperature_c=20 + time_s
+        )
+        motor = inverse.solve(target, moment) if i else RATIO * target
+        inverse.advance(motor, moment)
+        issued.append(motor)
+        targets.append(target)
+        seen.append(moment)
+    motion = Motion(
+        np.array(issued),
+        np.array([each.time_s for each in seen]),
+        load_torque_nm=np.array([each.load_torque_nm for each in seen]),
+        temperature_c=np.array([each.temperature_c for each in seen]),
+        motor_speed_deg_s=np.array([each.motor_speed_deg_s for each in seen]),
+        motor_acceleration_deg_s2=np.array([each.motor_acceleration_deg_s2 for each in seen]),
+    )
+    load = np.array(issued) / RATIO * 3600 + model.predict(motion, Start.BACKWARD)
+    np.testing.assert_allclose(load[1:], 3600 * np.array(targets)[1:], atol=1e-4)
+
+
+def test_most_causes_can_be_inverted():
+    assert len(INVERTIBLE) == 18
+    assert {"backlash", "hysteresis_memory", "creep", "zero_drift"} <= set(INVERTIBLE)
+    assert Synchronous.name in INVERTIBLE
