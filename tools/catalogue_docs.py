@@ -12,7 +12,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
-from hdbridge.effects import CATALOGUE, Effect
+from hdbridge.effects import CATALOGUE, Effect, aliases_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "causes.md"
 
@@ -43,27 +43,27 @@ _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/effects; do not edit. -->
 
-What a gear does wrong, cause by cause: how it shows in a record, what it does to the axis, what to do about it. The
-names are those of findings and of the model file's `effects`. The error is how far the load is ahead of motor
-angle / N, in arcsec at the load.
+What a gear does wrong, cause by cause: how it shows in a record, what it does to the axis, what to do about
+it. The names are those of findings and of the model file's `effects`. The error is how far the load is ahead of
+motor angle / N, in arcsec at the load.
 
 - **Separate it** is the measurement that tells it from its look-alikes (*taken for*).
-- **Compensated** says whether the compensation makes up for it. Errors of the measurement are not compensated: that
-  would move the load away from where it should be. What cannot be foreseen is not either.
-- **Needs** are the record's columns beside `motor_position_deg`. Speed, acceleration and direction are derived: backward
-  differences of the commanded motor angle over the samples' own time steps, the direction held at rest; in the
-  control loop those of the command before compensation. `load_deg` is the predicted load angle.
-- Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a list of
-  `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the effect modulates.
+- **Compensated** says whether the compensation should make up for it. Errors of the measurement should not be:
+  that would move the load away from where it should be. What cannot be foreseen cannot be.
+- **Needs** are the record's columns beside `motor_position_deg`. Speed, acceleration and direction are derived:
+  backward differences of the commanded motor angle over the samples' own time steps, the direction held at
+  rest; in the control loop those of the command before compensation. `load_deg` is the predicted load angle.
+- Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a list
+  of `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the effect
+  modulates: `{offset_arcsec, width_deg, exponent, memory}`.
 - Beyond a *limit* an effect is held, so that a faulty sensor cannot move the axis far.
 """
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join(
-        [_INTRODUCTION, *_overview(), *(line for kind in CATALOGUE.values() for line in _section(kind))]
-    )
+    sections = (line for kind in CATALOGUE.values() for line in _section(kind))
+    return "\n".join([_INTRODUCTION, *_overview(), *sections])
 
 
 def _overview() -> Iterator[str]:
@@ -88,8 +88,8 @@ def _section(kind: type[Effect]) -> Iterator[str]:
     yield f"- **What it does to the axis**: {about.consequence}."
     yield f"- **What to do about it**: {about.remedy}."
     yield f"- **Separate it**: {about.experiment}."
-    if about.aliases:
-        yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in about.aliases)}."
+    if aliases_of(kind.name):
+        yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
     possible = "yes" if kind.compensable.possible else "no"
     why = kind.compensable.why.removeprefix("no, ")
     yield f"- **Compensated**: {possible}; {why}."
@@ -118,11 +118,10 @@ def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") ->
     shapes = {} if within else {each.name: each for each in kind.shape}
     for name, field in model.model_fields.items():
         inner = _model(field.annotation)
-        if inner is not None and within == "" and name in {"orders", "loop", "base"}:
+        if inner is not None:
             yield f"| `{name}` | | | {_cell(field.description or '')} |"
-        elif inner is not None:
-            yield f"| `{name}` | | | {_cell(field.description or '')} |"
-            yield from _parameters(kind, inner, f"{name}.")
+            if name not in {"orders", "loop", "base"}:
+                yield from _parameters(kind, inner, f"{name}.")
         else:
             text = _cell(field.description or "")
             if name in shapes:
@@ -149,12 +148,13 @@ def _range(annotation: Any, metadata: list[Any]) -> str:
     if annotation is bool:
         return "true, false"
     limits = {
-        name: getattr(each, name)
+        limit: getattr(each, limit)
         for each in metadata
-        for name in ("gt", "ge", "lt", "le")
-        if hasattr(each, name)
+        for limit in ("gt", "ge", "le")
+        if hasattr(each, limit)
     }
-    low = f"above {limits['gt']:g}" if "gt" in limits else f"from {limits['ge']:g}" if "ge" in limits else ""
+    low = f"above {limits['gt']:g}" if "gt" in limits else ""
+    low = f"from {limits['ge']:g}" if "ge" in limits else low
     high = f"to {limits['le']:g}" if "le" in limits else ""
     return f"{low} {high}".strip()
 

@@ -78,6 +78,13 @@ CATALOGUE: dict[str, type[Effect]] = {
 CAUSES: tuple[str, ...] = tuple(name for name in CATALOGUE if name not in {"synchronous", "hysteresis"})
 """Names of the causes that a diagnosis can find beside the two basic parts of a model."""
 
+
+def aliases_of(name: str) -> tuple[str, ...]:
+    """The causes that this one can be taken for, whichever of the two says so, in the catalogue's order."""
+    own = CATALOGUE[name].about.aliases
+    return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
+
+
 __all__ = [
     "CATALOGUE",
     "CAUSES",
@@ -121,6 +128,7 @@ __all__ = [
     "Vibration",
     "Wear",
     "ZeroDrift",
+    "aliases_of",
     "compensable",
     "extended",
     "fall_bound",

@@ -27,8 +27,8 @@ class ZeroDrift(Linear, Warmed):
     name: ClassVar[str] = "zero_drift"
     about: ClassVar[Cause] = Cause(
         title="zero moves with temperature",
-        equation="drift w, tau dw'/dt = temperature - w', w = w' - reference (or w = warm_up (1 - exp(-t / "
-        "tau)))",
+        equation="drift w, w = u - reference, tau du/dt = temperature - u "
+        "(or w = warm_up (1 - exp(-t / tau)))",
         signature="everything shifts slowly and alike in both directions, with a time constant of minutes "
         "to an hour",
         consequence="all positions are off by the same amount, until the axis has the temperature of its "
