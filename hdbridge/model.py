@@ -47,9 +47,13 @@ class TransmissionModel:
         return ModelTracker([effect.tracker(start) for effect in self.effects])
 
     def only(self, names: Iterable[str]) -> Self:
-        """The same model with no other effects than those named (unknown names are not an error)."""
+        """The same model with no other effects than those named (unknown names are not an error).
+
+        A law that stands in another's place goes by either name.
+        """
         wanted = set(names)
-        return replace(self, effects=tuple(each for each in self.effects if each.name in wanted))
+        kept = (each for each in self.effects if each.name in wanted or each.replaces in wanted)
+        return replace(self, effects=tuple(kept))
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

@@ -43,19 +43,20 @@ _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/effects; do not edit. -->
 
-What a gear does wrong, cause by cause: how it shows in a record, what it does to the axis, what to do about
-it. The names are those of findings and of the model file's `effects`. The error is how far the load is ahead of
-motor angle / N, in arcsec at the load.
+What a gear does wrong, cause by cause: how it shows in a record, what it does to the axis, what to do
+about it. The names are those of findings and of the model file's `effects`. The error is how far the load is
+ahead of motor angle / N, in arcsec at the load.
 
 - **Separate it** is the measurement that tells it from its look-alikes (*taken for*).
-- **Compensated** says whether the compensation should make up for it. Errors of the measurement should not be:
-  that would move the load away from where it should be. What cannot be foreseen cannot be.
-- **Needs** are the record's columns beside `motor_position_deg`. Speed, acceleration and direction are derived:
-  backward differences of the commanded motor angle over the samples' own time steps, the direction held at
-  rest; in the control loop those of the command before compensation. `load_deg` is the predicted load angle.
-- Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a list
-  of `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the effect
-  modulates: `{offset_arcsec, width_deg, exponent, memory}`.
+- **Compensated** says whether the compensation should make up for it. Errors of the measurement should not
+  be: that would move the load away from where it should be. What cannot be foreseen cannot be.
+- **Needs** are the record's columns beside `motor_position_deg`. Speed, acceleration and direction are
+  derived: backward differences of the commanded motor angle over the samples' own time steps, the direction
+  held at rest; in the control loop those of the command before compensation. `load_deg` is the predicted
+  load angle.
+- Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a
+  list of `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the
+  effect modulates: `{offset_arcsec, width_deg, exponent, memory}`.
 - Beyond a *limit* an effect is held, so that a faulty sensor cannot move the axis far.
 """
 
@@ -128,7 +129,8 @@ def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") ->
                 text += f"; *shape*, sought from {shapes[name].lower:g} to {shapes[name].upper:g}"
             if not field.is_required():
                 text += f"; {field.default} where not given"
-            yield f"| `{within}{name}` | {_unit(name)} | {_range(field.annotation, field.metadata)} | {text} |"
+            limits = _range(field.annotation, field.metadata)
+            yield f"| `{within}{name}` | {_unit(name)} | {limits} | {text} |"
 
 
 def _model(annotation: Any) -> type[BaseModel] | None:

@@ -17,7 +17,7 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.carried import Loop, loop_of, orders_of
 from hdbridge.effects.channel_skew import ChannelSkew
-from hdbridge.effects.combine import compensable, extended, fall_bound, of_another_ratio, refreshed
+from hdbridge.effects.combine import compensable, conflicts, extended, fall_bound, refreshed
 from hdbridge.effects.compliance import Compliance
 from hdbridge.effects.count_loss import CountLoss, Step
 from hdbridge.effects.creep import Creep, Relaxation
@@ -130,11 +130,11 @@ __all__ = [
     "ZeroDrift",
     "aliases_of",
     "compensable",
+    "conflicts",
     "extended",
     "fall_bound",
     "loop_of",
     "moments",
-    "of_another_ratio",
     "orders_of",
     "refreshed",
     "unmet",

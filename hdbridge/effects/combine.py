@@ -90,8 +90,19 @@ def _key(loop: Loop) -> tuple[object, ...]:
     return tuple(loop.model_dump().values())
 
 
-def of_another_ratio(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
-    """Names of the effects that were made for another gear ratio than the model's."""
-    return tuple(
-        each.name for each in effects if not math.isclose(getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
+def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
+    """Why these effects cannot be of one model with this gear ratio, in words; empty when they can."""
+    given = tuple(effects)
+    names = {each.name for each in given}
+    return (
+        *(
+            f"'{each.name}' stands in place of '{each.replaces}': keep one of the two"
+            for each in given
+            if each.replaces in names
+        ),
+        *(
+            f"'{each.name}' was made for a gear of ratio {theirs:g}, the model's is {ratio:g}"
+            for each in given
+            if not math.isclose(theirs := getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
+        ),
     )

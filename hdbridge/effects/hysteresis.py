@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -124,22 +125,28 @@ class Hysteresis(Effect):
         return 0.0
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """The loop for an offset of one, branch by branch."""
-        result = np.empty(len(motor_deg))
+        """The loop for an offset of one: a loop over the reversals, then all samples at once."""
         if not len(motor_deg):
-            return result
+            return np.empty(0)
         turning, signs = branches(motor_deg, start)
         value = float(start.value)
-        result[: turning[0] + 1] = value
-        virgin = start is Start.VIRGIN
-        for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
-            span = slice(first + 1, last + 1)
-            xi = np.abs(motor_deg[span] - motor_deg[first]) / self.width_deg
-            height = rise(2.0 * xi, self.exponent) if virgin else 2.0 * rise(xi, self.exponent)
-            branch = np.minimum(sign * value + height, 1.0)
-            result[span] = sign * branch
-            value = float(result[last])
-            virgin = False
+        result = np.full(len(motor_deg), value)
+        angles = motor_deg[turning].tolist()
+        values = []
+        scale = 1.0 if start is Start.VIRGIN else 2.0
+        for (last, angle), sign in zip(pairwise(angles), signs, strict=True):
+            values.append(value)
+            xi = abs(angle - last) / self.width_deg
+            value = sign * min(sign * value + scale * rise_at(2.0 * xi / scale, self.exponent), 1.0)
+            scale = 2.0
+        first, lengths = turning[0] + 1, np.diff(turning)
+        sense, begun, origin = (np.repeat(each, lengths) for each in (signs, values, angles[:-1]))
+        xi_of = np.abs(motor_deg[first:] - origin) / self.width_deg
+        height = 2.0 * rise(xi_of, self.exponent)
+        if start is Start.VIRGIN and signs:
+            virgin = slice(0, int(lengths[0]))
+            height[virgin] = rise(2.0 * xi_of[virgin], self.exponent)
+        result[first:] = sense * np.minimum(sense * begun + height, 1.0)
         return result
 
 

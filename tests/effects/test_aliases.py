@@ -13,7 +13,8 @@ def test_a_look_alike_looks_alike_from_both_sides():
 def test_the_classic_pairs_are_told():
     for one, other in [
         ("load_order", "compliance"), ("velocity_windup", "channel_skew"), ("ratio_error", "wear"),
-        ("motor_order", "motor_encoder_eccentricity"), ("zero_drift", "count_loss"), ("backlash", "hysteresis"),
+        ("motor_order", "motor_encoder_eccentricity"), ("zero_drift", "count_loss"),
+        ("backlash", "hysteresis"),
         ("load_order", "ratio_error"), ("torque_modulation", "amplitude_drift"),
     ]:  # fmt: skip
         assert other in aliases_of(one)

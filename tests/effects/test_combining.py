@@ -24,9 +24,9 @@ from hdbridge.effects import (
     Start,
     Synchronous,
     compensable,
+    conflicts,
     extended,
     fall_bound,
-    of_another_ratio,
     refreshed,
 )
 from hdbridge.model import TransmissionModel
@@ -91,10 +91,20 @@ def test_a_shrinking_loop_beside_the_models_own_does_not_fall():
     assert fall_bound(BASE) == sum(each.slope_bound_arcsec_per_deg() for each in BASE)
 
 
-def test_effects_of_another_ratio_are_named():
+def test_what_cannot_be_of_one_model_is_told():
     order = LoadOrders.candidate(80.0)
-    assert of_another_ratio([*BASE, order], RATIO) == ("load_order",)
-    assert of_another_ratio([*BASE, order], 80.0) == ()
+    assert conflicts([*BASE, order], 80.0) == ()
+    (told,) = conflicts([*BASE, order], RATIO)
+    assert "load_order" in told
+    assert "80" in told
+    (told,) = conflicts([*BASE, HysteresisMemory.candidate(RATIO, BASE)], RATIO)
+    assert told.startswith("'hysteresis_memory' stands in place of 'hysteresis'")
+
+
+def test_a_scheme_that_asks_for_hysteresis_gets_the_law_that_stands_in_its_place():
+    model = TransmissionModel(ratio=RATIO, effects=extended(BASE, HysteresisMemory.candidate(RATIO, BASE)))
+    assert names(model.only(["hysteresis"]).effects) == ["hysteresis_memory"]
+    assert names(model.only(["synchronous"]).effects) == ["synchronous"]
 
 
 INVERTIBLE = sorted(
