@@ -299,3 +299,25 @@ def test_a_lag_over_a_long_record_keeps_its_digits():
     for i in range(2000):
         on_line = tracker.advance(0.0, Moment(time_s=float(time_s[i]), temperature_c=float(temperature[i])))
         assert error[i] == pytest.approx(on_line, abs=1e-9)
+
+
+STEEP = [
+    LocalDefect(ratio=50, height_arcsec=5, centre_deg=10, half_width_deg=3),
+    LocalDefect(ratio=50, height_arcsec=-5, centre_deg=10, half_width_deg=3),
+    Synchronous(orders=(ORDER_4,)),
+    FlexsplineOrders(orders=(ORDER_4,), ratio=50),
+    LoadOrders(orders=(ORDER_4,), ratio=50),
+    DirectionPhase(orders=(ORDER_4,), shift_deg=3),
+    Backlash(gap_arcsec=10, crossing_deg=2),
+    Wear(growth_arcsec_per_kiloturn=-40, width_deg=2, turns_before=1000, turns_limit=1000),
+    RatioError(ramp_arcsec_per_turn=-30),
+]
+
+
+@pytest.mark.parametrize("effect", STEEP, ids=lambda each: each.name)
+def test_the_slope_bound_is_what_the_steepest_fall_reaches(effect):
+    angle = np.linspace(0, 1000, 200_001)
+    falls = -np.diff(effect.predict(Motion(angle), Start.BACKWARD)) / np.diff(angle)
+    falls = falls[1:]  # in the first step the direction changes, which is the command's doing
+    bound = effect.slope_bound_arcsec_per_deg()
+    assert 0.99 * bound <= falls.max() <= bound * (1 + 1e-6)
