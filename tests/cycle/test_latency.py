@@ -62,6 +62,10 @@ def test_merging_is_recording_both(first: list[int], second: list[int]) -> None:
     assert merged.as_dict() == histogram_of(first + second).as_dict()
 
 
+def test_the_late_ones_can_be_counted() -> None:
+    assert histogram_of([10, 1900, 2500, 9000]).later_than_us(2000) == 2
+
+
 def test_early_and_absurdly_late_wake_ups_have_a_place() -> None:
     histogram = Histogram()
     histogram.record(-0.001)

@@ -1,0 +1,192 @@
+"""A real SocketCAN interface and the simulated drive in a process of its own.
+
+Run by ``tools/socketcan.sh`` where the kernel has no vcan; without an interface these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.clock import MonotonicClock
+from hdbridge.cycle import Cycle, Feedback
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import open_bus
+from hdbridge.drive.objects import Mode
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Supervision
+from hdbridge.errors import HdbridgeError, SafetyStop
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+CHANNEL = "vcan0"
+STEP_COUNTS = 10
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    missing = not Path(f"/sys/class/net/{CHANNEL}").exists()
+    for item in items:
+        if "socketcan" not in str(item.path.parent.name):
+            continue
+        item.add_marker(pytest.mark.socketcan)
+        if missing:
+            item.add_marker(
+                pytest.mark.skip(
+                    reason=f"no interface {CHANNEL}: run tools/socketcan.sh, or make test-socketcan"
+                )
+            )
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+@pytest.fixture
+def interface() -> Iterator[str]:
+    """The interface, put back afterwards whatever a test has done to it."""
+    yield CHANNEL
+    if not Path(f"/sys/class/net/{CHANNEL}").exists():
+        ip("link", "add", "dev", CHANNEL, "type", "vcan")
+    ip("link", "set", "up", CHANNEL)
+
+
+@pytest.fixture
+def may_configure(interface: str) -> Callable[..., None]:
+    """``ip`` for tests that take the interface away; skipped where that is not permitted."""
+    if (
+        shutil.which("ip") is None
+        or subprocess.run(["ip", "link", "set", "up", interface], check=False, capture_output=True).returncode
+    ):
+        pytest.skip("needs the right to configure network interfaces")
+    return ip
+
+
+@contextmanager
+def drive_process(channel: str) -> Iterator[subprocess.Popen[bytes]]:
+    """``hdbridge simulate`` on the interface, ended on the way out."""
+    command = [sys.executable, "-m", "hdbridge", "simulate", str(PROFILE)]
+    process = subprocess.Popen(
+        [*command, "--interface", "socketcan", "--channel", channel],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@dataclass
+class Master:
+    """The master's side on one bus."""
+
+    bus: can.BusABC
+    drive: Drive
+    supervision: Supervision
+    cycle: Cycle
+    target: int = 0
+
+    def boot(self) -> None:
+        """Boot the drive, waiting for its process to come up."""
+        for attempt in range(40):
+            try:
+                self.drive.boot()
+            except HdbridgeError:
+                if attempt == 39:
+                    raise
+                time.sleep(0.5)
+            else:
+                return
+
+    def run(self, cycles: int) -> list[Feedback]:
+        """Enable, move at constant speed; once more from the start when a busy machine has stopped it."""
+        for attempt in range(4):
+            try:
+                if attempt:
+                    self.boot()
+                    self.supervision.reset(verified=True)
+                return self._run(cycles)
+            except SafetyStop:
+                if attempt == 3:
+                    raise
+        raise AssertionError
+
+    def _run(self, cycles: int) -> list[Feedback]:
+        self.drive.enable(Mode.CSP)
+        self.cycle.restart()
+        power = self.drive.image.power
+        while power.state is not State.OPERATION_ENABLED:
+            feedback = self.cycle.tick()
+        self.target = feedback.motor_counts
+        return [self.move() for _ in range(cycles)]
+
+    def move(self) -> Feedback:
+        self.target += STEP_COUNTS
+        return self.cycle.tick(self.target)
+
+    def move_until_stopped(self, cycles: int) -> SafetyStop:
+        for _ in range(cycles):
+            try:
+                self.move()
+            except SafetyStop as stop:
+                return stop
+        raise AssertionError(f"no stop within {cycles} cycles")
+
+
+@contextmanager
+def master_on(channel: str) -> Iterator[Master]:
+    axis = AxisConfig.load(PROFILE)
+    settings = axis.bus.model_copy(update={"interface": "socketcan", "channel": channel})
+    with open_bus(settings) as bus:
+        drive = Drive(bus, axis, MonotonicClock())
+        supervision = Supervision()
+        cycle = Cycle(
+            drive.link,
+            drive.link.clock,
+            drive.image,
+            supervision,
+            axis.drive.cycle_s,
+            monitor=drive.monitor,
+            stop_timeout_s=0.3,
+        )
+        try:
+            yield Master(bus, drive, supervision, cycle)
+        finally:
+            drive.close()
+
+
+@pytest.fixture
+def simulated(interface: str) -> Iterator[subprocess.Popen[bytes]]:
+    with drive_process(interface) as process:
+        yield process
+
+
+@pytest.fixture
+def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Master]:
+    """Booted, on the other side of the interface from the simulated drive."""
+    with master_on(interface) as made:
+        made.boot()
+        yield made
+
+
+@pytest.fixture
+def another_master() -> Callable[[str], AbstractContextManager[Master]]:
+    """Makes a second master, for after the first is gone."""
+    return master_on
+
+
+@pytest.fixture
+def intruder(interface: str) -> Iterator[can.BusABC]:
+    """Another node's end of the bus."""
+    with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as bus:
+        yield bus

@@ -1,0 +1,142 @@
+"""Does the control cycle hold its period on SocketCAN? Master and simulated drive are two processes.
+
+    tools/socketcan.sh .venv/bin/python tools/bench/socketcan_cycle.py [--cycles 5000] [--json FILE]
+
+First an empty loop of as many periods is timed: what it misses, no bus and no drive are to blame for. Then
+`hdbridge simulate` is started, the drive is booted and enabled over the bus, and the axis swings with the
+compensation of the article's model at work in every cycle. Printed are the periods missed (begun more than
+half a period late), the cycles in which a TPDO was missing, and how late the cycles began. Exit status 0 when
+nothing was missed, 1 otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hdbridge.axis import AxisConfig
+from hdbridge.clock import MonotonicClock
+from hdbridge.compensation import Compensation, CompensationLimits
+from hdbridge.cycle import LATE, Cycle, Feedback
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import open_bus
+from hdbridge.drive.objects import Mode
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault, Supervision
+from hdbridge.errors import HdbridgeError, SafetyStop
+from hdbridge.latency import wake_ups
+from hdbridge.model import TransmissionModel
+from hdbridge.realtime import prepare_realtime
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+SWING_DEG = 2.0
+BOOT_ATTEMPTS = 20
+
+
+@contextmanager
+def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
+    """`hdbridge simulate` in a process of its own, ended on the way out."""
+    command = [sys.executable, "-m", "hdbridge", "simulate", str(profile)]
+    process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", channel])
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(20.0)
+
+
+def boot(drive: Drive) -> None:
+    """Boot the drive, waiting for its process to come up."""
+    for attempt in range(BOOT_ATTEMPTS):
+        try:
+            drive.boot()
+        except HdbridgeError:
+            if attempt == BOOT_ATTEMPTS - 1:
+                raise
+            time.sleep(0.5)
+        else:
+            return
+
+
+def measure(drive: Drive, model: TransmissionModel, cycles: int) -> dict[str, object]:
+    """Run so many cycles; what was missed, and how late they began."""
+    axis, image = drive.axis, drive.image
+    clock, supervision = drive.link.clock, Supervision()
+    cycle = Cycle(drive.link, clock, image, supervision, axis.drive.cycle_s, monitor=drive.monitor)
+    drive.enable(Mode.CSP)
+    cycle.restart()
+    while image.power.state is not State.OPERATION_ENABLED:
+        feedback = cycle.tick()
+    compensation = Compensation(model, CompensationLimits(), cycle.period_s)
+    compensation.reset(image.motor_deg(feedback.motor_counts))
+    compensation.engage()
+    start_deg = image.motor_deg(feedback.motor_counts) / axis.gear.ratio
+    step = 2.0 * math.pi * cycle.period_s / 4.0
+    count = 0
+
+    def command(feedback: Feedback) -> int:
+        load_deg = start_deg + SWING_DEG * (1.0 - math.cos(step * count)) / 2.0
+        give = compensation.command if feedback.fresh else compensation.hold
+        return image.target_counts_for(give(load_deg))
+
+    begin_s, missed_before = clock.now(), cycle.skipped
+    stopped = None
+    try:
+        for count in range(cycles):  # noqa: B007 - read by `command`
+            cycle.tick(command)
+    except SafetyStop as stop:
+        stopped = str(stop)
+    return {
+        "cycles": count + 1,
+        "period_ms": 1e3 * cycle.period_s,
+        "took_s": round(clock.now() - begin_s, 3),
+        "missed_periods": cycle.skipped - missed_before,
+        "cycles_without_all_tpdos": supervision.counts[Fault.LOST_TPDO],
+        "stopped": stopped,
+        "lateness": cycle.histogram.as_dict(),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--channel", default="vcan0")
+    parser.add_argument("--cycles", type=int, default=5000)
+    parser.add_argument("--profile", type=Path, default=PROFILE)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    axis = AxisConfig.load(options.profile)
+    bus = axis.bus.model_copy(update={"interface": "socketcan", "channel": options.channel})
+    model = TransmissionModel.load(options.profile / "model.yaml")
+    clock = MonotonicClock()
+    with prepare_realtime():
+        empty = wake_ups(axis.drive.cycle_s, options.cycles * axis.drive.cycle_s, clock)
+    with (
+        simulated_drive(options.profile, options.channel),
+        prepare_realtime() as realtime,
+        open_bus(bus) as opened,
+        Drive(opened, axis, clock) as drive,
+    ):
+        boot(drive)
+        result = measure(drive, model, options.cycles)
+    result["conditions"] = str(realtime)
+    late = empty.histogram.later_than_us(round(1e6 * LATE * axis.drive.cycle_s))
+    result["empty_loop"] = {"begun_late": late, "skipped": empty.skipped, **empty.histogram.as_dict()}
+    for name, value in result.items():
+        print(f"{name:>26}: {value}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    good = not result["missed_periods"] and not result["cycles_without_all_tpdos"] and not result["stopped"]
+    return 0 if good and result["cycles"] == options.cycles else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
