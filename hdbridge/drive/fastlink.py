@@ -64,7 +64,7 @@ class _MessageLink(Link):
         if self._down is not None:
             raise BusError(self._down)
         try:
-            self._send(_DataFrame(arbitration_id=can_id, is_extended_id=False, data=data))
+            self._send(_DataFrame(arbitration_id=can_id, is_extended_id=False, data=data, channel=self._mark))
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 

@@ -8,6 +8,8 @@ dropped and counted, and every deadline is on the monotonic clock that was passe
 from __future__ import annotations
 
 import errno
+import os
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,6 +24,9 @@ _GONE: Final = frozenset(
     {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.ENETUNREACH, errno.EBADF, errno.EIO}
 )
 _DRAIN_AT_MOST: Final = 4096
+_ECHOING: Final = frozenset({"UdpMulticastBus"})
+"""Back ends of python-can that give a bus its own frames back and cannot be told not to."""
+_PROCESS: Final = uuid.uuid4().hex[:12]
 _ERROR_FRAME_BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""
 
@@ -79,7 +84,9 @@ class Link:
     bus. A new link on a newly opened bus is the way back.
     """
 
-    __slots__ = ("_down", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now")
+    __slots__ = (
+        "_down", "_mark", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now",
+    )  # fmt: skip
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         self.bus = bus
@@ -88,6 +95,7 @@ class Link:
         self.name = str(getattr(bus, "channel_info", "") or type(bus).__name__)
         self.dropped = Dropped()
         self._down: str | None = None
+        self._mark = _mark(bus)
         self._send = bus.send
         # BusABC.recv measures its remaining time on the *wall* clock: when that is set back during a wait,
         # recv blocks for as long. Its hook has no such loop, so it is used where a back end relies on it.
@@ -110,7 +118,9 @@ class Link:
         if self._down is not None:
             raise BusError(self._down)
         try:
-            self._send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data))
+            self._send(
+                can.Message(arbitration_id=can_id, is_extended_id=False, data=data, channel=self._mark)
+            )
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 
@@ -139,6 +149,8 @@ class Link:
             if message is None:
                 if timeout_s == 0.0 or now() >= deadline_s:
                     return None
+                continue
+            if self._mark is not None and message.channel == self._mark:
                 continue
             if message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd:
                 self._drop(message)
@@ -183,6 +195,17 @@ class Link:
         return BusError(message)
 
 
+def _mark(bus: can.BusABC) -> str | None:
+    """What frames sent through ``bus`` carry as their channel where the back end echoes them; else None.
+
+    Such a back end transports the channel with the frame, so an echo is known for certain: a frame of another
+    master with the same identifier and data has another mark, or none. All links of a bus share one.
+    """
+    if type(bus).__name__ not in _ECHOING:
+        return None
+    return f"{_PROCESS}-{os.getpid():x}-{id(bus):x}"
+
+
 def _errno(error: BaseException | None) -> int | None:
     """The operating system's error number, wherever python-can left it."""
     while error is not None:
@@ -216,6 +239,8 @@ def open_bus(settings: BusSettings) -> Iterator[can.BusABC]:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             what = f"cannot open it: {reason}; check bus.channel and that the interface is up"
         raise BusError(f"{name}: {what}") from error
+    if bus.channel_info == "unknown":  # python-can's word for it; messages need a name
+        bus.channel_info = name
     try:
         yield bus
     finally:

@@ -1,0 +1,135 @@
+"""Back ends that give a master its own frames back: the echo is dropped, a second master is not."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import can
+import pytest
+
+from hdbridge.axis import BusConfig
+from hdbridge.clock import MonotonicClock
+from hdbridge.drive import Link, open_bus
+from hdbridge.drive.fastlink import fast_link
+
+GROUP = "239.74.163.77"
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def multicast() -> BusConfig:
+    """A multicast channel of this test's own; the test is skipped where the machine carries none."""
+    config = BusConfig(interface="udp_multicast", channel=GROUP, options={"port": free_port()})
+    try:
+        with open_bus(config) as near, open_bus(config) as far:
+            near.send(can.Message(arbitration_id=1, is_extended_id=False))
+            arrived = far.recv(1.0) is not None
+    except Exception as error:
+        pytest.skip(f"no multicast on this machine: {error}")
+    if not arrived:
+        pytest.skip("no multicast on this machine: a frame did not arrive")
+    return config
+
+
+@pytest.fixture
+def links(multicast: BusConfig) -> Iterator[tuple[Link, Link]]:
+    """Two masters on the channel."""
+    with ExitStack() as stack:
+        one, two = (stack.enter_context(open_bus(multicast)) for _ in range(2))
+        yield Link(one, MonotonicClock()), Link(two, MonotonicClock())
+
+
+def heard(link: Link, wait_s: float = 1.0) -> tuple[int, bytes] | None:
+    frame = link.recv(link.now() + wait_s)
+    return None if frame is None else (frame.can_id, frame.data)
+
+
+def test_own_frames_are_not_received(links: tuple[Link, Link]) -> None:
+    near, far = links
+    near.send(0x080, b"")
+    fast_link(near).send(0x201, b"\x0f\x00")
+    assert [heard(far), heard(far)] == [(0x080, b""), (0x201, b"\x0f\x00")]
+    assert near.drain() == []
+    assert fast_link(near).drain() == []
+
+
+def test_the_same_frame_from_another_master_is_received(links: tuple[Link, Link]) -> None:
+    near, far = links
+    near.send(0x080, b"")
+    far.send(0x080, b"")
+    assert heard(near) == (0x080, b"")
+    assert near.drain() == []
+    assert heard(far) == (0x080, b"")
+
+
+def test_a_frame_of_a_node_that_marks_nothing_is_received(
+    links: tuple[Link, Link], multicast: BusConfig
+) -> None:
+    near, _ = links
+    with open_bus(multicast) as node:
+        node.send(can.Message(arbitration_id=0x181, data=b"\x01", is_extended_id=False))
+        assert heard(near) == (0x181, b"\x01")
+
+
+def test_a_bus_without_a_name_is_named_after_the_axis_file(links: tuple[Link, Link]) -> None:
+    assert links[0].name == f"udp_multicast:{GROUP}"
+
+
+def test_other_back_ends_send_unmarked_frames() -> None:
+    with (
+        can.Bus(interface="virtual", channel="unmarked", ignore_config=True) as near,
+        can.Bus(interface="virtual", channel="unmarked", ignore_config=True) as far,
+    ):
+        Link(near, MonotonicClock()).send(0x080, b"")
+        message = far.recv(1.0)
+        assert message is not None
+        assert message.channel in (None, "unmarked")
+
+
+def test_master_and_simulated_drive_in_two_processes(multicast: BusConfig, tmp_path: Path) -> None:
+    """A slow cycle, so that the test says something about echoes and nothing about the machine's load."""
+    folder = tmp_path / "axis"
+    shutil.copytree(PROFILE, folder)
+    file = folder / "axis.yaml"
+    text = file.read_text()
+    for old, new in (
+        ("interface: virtual", "interface: udp_multicast"),
+        ("channel: hdbridge", f"channel: {GROUP}\n  options: {{port: {multicast.options['port']}}}"),
+        ("cycle_ms: 4", "cycle_ms: 50"),
+        ("heartbeat_ms: 50", "heartbeat_ms: 1000"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    file.write_text(text)
+    program = [sys.executable, "-m", "hdbridge"]
+    with subprocess.Popen(
+        [*program, "simulate", str(folder), "--duration", "100"], stderr=subprocess.PIPE, text=True
+    ) as drive:
+        try:
+            assert drive.stderr is not None
+            assert f"node 1 on udp_multicast:{GROUP}" in drive.stderr.readline()
+            done = subprocess.run(
+                [*program, "step", str(folder), "--count", "2", "--scheme", "both"],
+                capture_output=True,
+                text=True,
+                timeout=100,
+                check=False,
+            )
+        finally:
+            drive.send_signal(signal.SIGINT)
+            drive.wait(20)
+    assert done.returncode == 0, done.stderr
+    assert "quantisation floor" in done.stdout
