@@ -33,11 +33,12 @@ def demo(
     """
     files = Profile.find("article")
     axis = load_axis(files, None, None)
+    stepping = Stepping(count=count)
     comparison = run_comparison(
         axis,
         files,
         TransmissionModel.load(files.model),
-        Stepping(count=count),
+        stepping,
         None,
         simulate=True,
         truth=None,
@@ -46,5 +47,5 @@ def demo(
     )
     print_table(axis, comparison)
     write_json(out / "stepping.json", comparison.as_dict())
-    write_page(out / "stepping.html", axis, comparison)
+    write_page(out / "stepping.html", axis, comparison, stepping)
     console.print(f"\nopen {out / 'stepping.html'} for the picture")

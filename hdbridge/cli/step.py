@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from hdbridge.atomic import write_atomically
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Run
 from hdbridge.cli.interrupt import deferred_interrupt
@@ -34,6 +35,8 @@ from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.report.page import render
+from hdbridge.report.stepping import stepping_page
 from hdbridge.stepping import Scheme
 
 
@@ -72,11 +75,12 @@ def step(
     """
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
+    stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     comparison = run_comparison(
         axis,
         files,
         TransmissionModel.load(model or files.model),
-        Stepping(count=count, step_deg=step_deg, start_deg=start_deg),
+        stepping,
         scheme,
         simulate=simulate,
         truth=truth,
@@ -86,7 +90,7 @@ def step(
     print_table(axis, comparison)
     write_json(json_file, comparison.as_dict())
     if html_file is not None:
-        write_page(html_file, axis, comparison)
+        write_page(html_file, axis, comparison, stepping)
 
 
 def run_comparison(
@@ -152,5 +156,22 @@ def print_table(axis: AxisConfig, comparison: Comparison) -> None:
     )
 
 
-def write_page(path: Path, axis: AxisConfig, comparison: Comparison) -> None:
+def write_page(path: Path, axis: AxisConfig, comparison: Comparison, stepping: Stepping) -> None:
     """The result as a self-contained page."""
+    facts = {
+        "axis": f"{axis.name} ({axis.path.name})",
+        "bus": f"{axis.bus.interface}, cycle {axis.drive.cycle_ms:g} ms",
+        "steps": f"{stepping.count} of {stepping.step_deg:g} motor degrees each way",
+        "gear ratio": f"{axis.gear.ratio:g}",
+        "motor encoder": f"{axis.motor_encoder.counts_per_turn:,} counts per turn",
+        "load encoder": f"{axis.load_encoder.counts_per_turn:,} counts per turn",
+    }
+    page = stepping_page(
+        axis.name,
+        comparison.results,
+        comparison.quantisation_floor_arcsec,
+        facts,
+        beside_article=axis.name == "article",
+    )
+    write_atomically(path, render(page))
+    notes.print(f"wrote {path}")
