@@ -35,3 +35,17 @@ class Standstill:
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
         yield Dwell(self.duration_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Stand at a pose that recurs, approached the same way each time: what changes there is drift."""
+
+    load_deg: float = 0.0
+    duration_s: float = 1.5
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Come to rest, then stand."""
+        yield MoveTo(self.load_deg)
+        yield Dwell(0.5, kind="move")
+        yield Dwell(self.duration_s, kind="reference")

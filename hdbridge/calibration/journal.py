@@ -1,0 +1,205 @@
+"""A recording folder that grows: one file per task of a plan, and always a valid recording of what is there.
+
+After each task its samples are written, then ``recording.yaml`` is replaced atomically. Whatever ends the
+measurement (Ctrl-C, a fault, a kill, a power cut), the folder holds all tasks before it; of an interrupted
+task also what had been measured, where there was time to write it. `Journal.open` goes on with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.bench import Leg
+from hdbridge.errors import InputError
+from hdbridge.procedures.plan import Plan
+from hdbridge.record import Record
+from hdbridge.recording import ABOUT_NAME, Recording, RecordingFile, versions_here
+from hdbridge.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
+
+_HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
+PAUSE_S = 1.0
+"""Between two sessions in the recording's time; how long it really was does not matter."""
+
+
+class TaskEntry(BaseModel):
+    """A task of the plan as it was run, in the recording's notes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str = Field(description="its name in the plan")
+    file: str = Field(description="file with its samples")
+    session: int = Field(ge=1, description="the drive stayed enabled from one task of a session to the next")
+    complete: bool = Field(description="false: it was interrupted")
+    start_s: float = Field(description="time of its first sample")
+    end_s: float = Field(description="time of its last sample")
+
+
+class _Notes(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    plan: dict[str, Any]
+    tasks: tuple[TaskEntry, ...] = ()
+
+
+class Journal:
+    """The folder; `add` writes a task into it."""
+
+    def __init__(self, folder: Path, about: RecordingFile, plan: Plan) -> None:
+        self.folder = folder
+        self.plan = plan
+        self._about = about
+        self._tasks = list(_Notes.model_validate(about.notes).tasks)
+        self._session = max((each.session for each in self._tasks), default=0)
+        self._shift_s: float | None = None
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        axis: AxisConfig,
+        plan: Plan,
+        date: datetime,
+        identity: Identity,
+        notes: dict[str, Any],
+    ) -> Self:
+        """A new one; InputError where there is a recording already. The first task writes the first file."""
+        if (folder / ABOUT_NAME).exists():
+            raise InputError(
+                f"{folder}: there is a recording already; expected a new folder, or go on with it: --resume"
+            )
+        about = RecordingFile.model_construct(
+            schema_="hdbridge.recording/1",
+            axis=axis.name,
+            ratio=axis.gear.ratio,
+            drive=identity,
+            date=date.isoformat(timespec="seconds"),
+            versions=versions_here(),
+            notes={"plan": plan.as_dict(), **notes},
+            files=(),
+            segments=(),
+        )
+        return cls(folder, about, plan)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """One that was begun; InputError where the folder is no recording of a calibration."""
+        if not (folder / ABOUT_NAME).exists():
+            raise InputError(f"{folder}: no {ABOUT_NAME} in this folder; expected a calibration's recording")
+        document = read_yaml(folder / ABOUT_NAME)
+        about = document.validate(RecordingFile)
+        if "plan" not in about.notes:
+            raise document.error(
+                ("notes",), "has no plan; expected the recording of a calibration ('hdbridge calibrate')"
+            )
+        plan = document.validate(Plan, ("notes", "plan"))
+        Recording.load(folder)  # files that changed since are noticed before anything moves
+        return cls(folder, about, plan)
+
+    def check_is_of(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Refuse (InputError) to go on with a recording of another axis, gear or drive."""
+        for what, theirs, ours in (
+            ("axis", self._about.axis, axis.name),
+            ("gear ratio", self._about.ratio, axis.gear.ratio),
+            *(
+                (f"drive {name}", getattr(self._about.drive, name, None), getattr(identity, name, None))
+                for name in ("vendor_id", "product_code", "serial")
+            ),
+        ):
+            if theirs is not None and ours is not None and theirs != ours:
+                raise InputError(
+                    f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but here is {ours} "
+                    f"({axis.path}); go on with it on that one, or begin a new one"
+                )
+
+    @property
+    def done(self) -> frozenset[str]:
+        """Names of the tasks that were run to their end."""
+        return frozenset(each.task for each in self._tasks if each.complete)
+
+    @property
+    def date(self) -> str:
+        """When it was begun, ISO 8601."""
+        return self._about.date or ""
+
+    @property
+    def identity(self) -> Identity | None:
+        """The drive that it was measured with."""
+        return self._about.drive
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """What else is known of it."""
+        return dict(self._about.notes)
+
+    def begin_session(self) -> None:
+        """The drive was enabled: time starts anew, and nothing is known of what happened in between."""
+        self._session += 1
+        self._shift_s = None
+
+    def add(self, task: str, record: Record, legs: Sequence[Leg], *, complete: bool) -> None:
+        """Keep what a task has measured; nothing where it has measured nothing."""
+        if not len(record):
+            return
+        if self._shift_s is None:
+            end_s = max((each.end_s for each in self._tasks), default=None)
+            self._shift_s = 0.0 if end_s is None else end_s + PAUSE_S - float(record.time_s[0])
+        shift_s = self._shift_s
+        if shift_s:
+            record = Record({**record.columns, "time_s": record.time_s + shift_s})
+        self.folder.mkdir(parents=True, exist_ok=True)
+        again = sum(each.task == task for each in self._tasks)
+        name = f"{task}{f'-{again + 1}' if again else ''}.csv.gz"
+        record.write_csv(self.folder / name)
+        entry = TaskEntry(
+            task=task,
+            file=name,
+            session=self._session,
+            complete=complete,
+            start_s=float(record.time_s[0]),
+            end_s=float(record.time_s[-1]),
+        )
+        self._tasks.append(entry)
+        segments = [
+            {"kind": each.kind, "start_s": each.start_s + shift_s, "end_s": each.end_s + shift_s}
+            for each in legs
+        ]
+        file = {"name": name, "sha256": _sha256(self.folder / name), "samples": len(record)}
+        self._write(file, segments)
+
+    def recording(self) -> Recording:
+        """All that was measured."""
+        return Recording.load(self.folder)
+
+    def _write(self, file: dict[str, Any], segments: list[dict[str, Any]]) -> None:
+        before = self._about
+        drive = before.drive.model_dump(exclude_none=True) if before.drive else {}
+        data = {
+            "schema": "hdbridge.recording/1",
+            "axis": before.axis,
+            "ratio": before.ratio,
+            "drive": {name: Hex(value) for name, value in drive.items()},
+            "date": before.date,
+            "versions": before.versions,
+            "notes": {**before.notes, "tasks": [each.model_dump() for each in self._tasks]},
+            "files": [*(each.model_dump() for each in before.files), file],
+            "segments": [*(each.model_dump(exclude={"notes"}) for each in before.segments), *segments],
+        }
+        write_atomically(self.folder / ABOUT_NAME, _HEADER + dump_yaml(data))
+        self._about = RecordingFile.model_validate({**data, "drive": before.drive})
+
+
+def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
+    """The tasks of a calibration's recording; none for any other."""
+    return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

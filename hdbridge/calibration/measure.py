@@ -1,0 +1,139 @@
+"""A plan run on a bench, without compensation, into a journal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.bench import Bench, axis_view
+from hdbridge.calibration.journal import Journal
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.procedures.plan import Plan, Task
+from hdbridge.procedures.rehearsal import rehearse
+
+TELL_CYCLES = 50
+"""Cycles between two reports of progress."""
+
+
+class Pace:
+    """How far a measurement is, counted in control cycles: one ask of `interrupted` each."""
+
+    def __init__(
+        self,
+        total_s: float,
+        period_s: float,
+        tell: Callable[[str, float, float], None],
+        interrupted: Callable[[], bool],
+    ) -> None:
+        """``tell`` receives what is going on, seconds done and seconds in all."""
+        self.name = ""
+        self.total_s = total_s
+        self._done_s = 0.0
+        self._period_s = period_s
+        self._tell = tell
+        self._interrupted = interrupted
+        self._cycles = 0
+
+    def begin(self, name: str) -> None:
+        """Another task begins."""
+        self.name = name
+        self._say()
+
+    def interrupted(self) -> bool:
+        """What a bench asks in each cycle."""
+        self._cycles += 1
+        if self._cycles >= TELL_CYCLES:
+            self._say()
+        return self._interrupted()
+
+    def _say(self) -> None:
+        self._done_s += self._cycles * self._period_s
+        self._cycles = 0
+        self._tell(self.name, min(self._done_s, self.total_s), self.total_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What is still to be run."""
+
+    tasks: tuple[Task, ...]
+    duration_s: float
+    """Of the tasks, at an ideal axis."""
+    notes: tuple[str, ...]
+
+
+def outlook(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset[str] = ()) -> Outlook:
+    """What a plan still asks of an axis; InputError where it would leave the limits."""
+    view = axis_view(axis)
+    fitted = plan.tasks(view)
+    left = tuple(each for each in fitted.tasks if each.name not in set(done))
+    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
+    return Outlook(
+        left, sum(rehearse(each.procedure, view, middle).duration_s for each in left), fitted.notes
+    )
+
+
+def start_journal(
+    folder: Path,
+    axis: AxisConfig,
+    plan: Plan,
+    date: datetime,
+    identity: Identity,
+    notes: dict[str, Any] | None = None,
+) -> Journal:
+    """A new journal, with what the plan had to give up on this axis in its notes."""
+    shortened = outlook(plan, axis).notes
+    return Journal.create(
+        folder,
+        axis,
+        plan,
+        date,
+        identity,
+        {**(notes or {}), **({"shortened": list(shortened)} if shortened else {})},
+    )
+
+
+def measure(
+    drive: Drive,
+    journal: Journal,
+    *,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
+    """Run what is left of the journal's plan on a booted drive.
+
+    ``progress`` receives the task's name, the seconds done and those in all. What a task had measured when it
+    was stopped (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`) is kept before that is passed on.
+    """
+    journal.check_is_of(drive.axis, identity_of(drive))
+    left = outlook(journal.plan, drive.axis, journal.done)
+    if not left.tasks:
+        return
+    pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
+    with Bench(drive, interrupted=pace.interrupted) as bench:
+        journal.begin_session()
+        for task in left.tasks:
+            pace.begin(task.name)
+            try:
+                run = bench.run(task.procedure)
+            except InputError:
+                raise  # refused before anything moved
+            except (HdbridgeError, KeyboardInterrupt):
+                with suppress(OSError):
+                    journal.add(task.name, bench.record(), bench.legs, complete=False)
+                raise
+            journal.add(task.name, run.record, run.legs, complete=True)
+    drive.disable()
+
+
+def identity_of(drive: Drive) -> Identity:
+    """What the booted drive answered."""
+    found = drive.report.identity if drive.report else {}
+    known = drive.axis.drive.identity.model_dump(exclude_none=True)
+    return Identity.model_validate({**known, **found})

@@ -1,0 +1,153 @@
+"""The whole calibration, from a booted drive to a pending model; and the same again from its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from hdbridge.atomic import write_atomically
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
+from hdbridge.calibration.journal import Journal
+from hdbridge.calibration.measure import identity_of, measure
+from hdbridge.calibration.result import Calibration, Offer
+from hdbridge.calibration.validation import Validation, floor_of, validate
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.modelstore import propose
+from hdbridge.recording import Recording
+
+RESULT_NAME = "calibration.json"
+MODEL_NAME = "model.yaml"
+ACTIVE_NAME = "active.yaml"
+Progress = Callable[[str, float, float], None]
+
+
+def calibrate(
+    drive: Drive,
+    journal: Journal,
+    profile: Path,
+    date: datetime,
+    *,
+    progress: Progress = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """Measure what is missing, fit, validate, and propose the model to the profile.
+
+    ``profile`` is the folder of axis.yaml; ``tell`` receives a line for each step. A model that does not
+    improve on data that it has not seen, or with which the axis points worse, is kept in the recording's
+    folder but not proposed.
+    """
+    axis = drive.axis
+    measure(drive, journal, progress=progress, interrupted=interrupted)
+    active = active_model(profile, axis, drive, tell)
+    tell("fitting")
+    recording = journal.recording()
+    result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
+    if not result.fit.held_out.improves:
+        result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
+        return _kept(journal.folder, result)
+    tell("stepping test before and after")
+    floor = floor_of(axis, recording)
+    checked = validate(
+        drive,
+        journal.plan,
+        active,
+        result.model,
+        floor,
+        journal.folder,
+        progress=progress,
+        interrupted=interrupted,
+    )
+    result = replace(result, validation=checked)
+    before, after = (each.pooled.three_sigma_arcsec for each in (checked.before, checked.after))
+    if not checked.improves:
+        reason = (
+            f"not offered for commit: stepping is worse, 3 sigma {after:.2f} arcsec after {before:.2f} "
+            f"with {checked.before.model}"
+        )
+        return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
+    reason = f"calibration {journal.folder.name}: stepping 3 sigma {before:.2f} to {after:.2f} arcsec"
+    pending = propose(profile, result.model, reason, date, identity_of(drive))
+    return _kept(journal.folder, replace(result, offer=Offer(True, reason, pending)))
+
+
+def conclude(
+    recordings: Mapping[Path, Recording],
+    ratio: float,
+    active: TransmissionModel | None = None,
+    *,
+    axis: AxisConfig | None = None,
+    independent_zeros: bool = False,
+) -> Calibration:
+    """Fit recordings, by where they come from and in their order; no drive is needed.
+
+    With ``axis`` the model is bound to it.
+    """
+    measured = list(recordings.values())
+    fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
+    model = with_provenance(fit.model, provenance(recordings, measured, fit))
+    first = measured[0]
+    return Calibration(
+        recordings=tuple(map(str, recordings)),
+        fit=fit,
+        model=model.bound_to(axis, first.drive) if axis else model,
+        active=active,
+        axis=axis.name if axis else first.axis,
+        date=first.date,
+        plan=first.notes.get("plan", {}).get("name"),
+        shortened=tuple(first.notes.get("shortened", ())),
+        drift=tuple(standings(first, ratio)) if len(measured) == 1 else (),
+    )
+
+
+def concluded(folder: Path) -> Calibration:
+    """The result of a calibration again, from its folder: refitted, with the validation as it was."""
+    recording = Recording.load(folder)
+    if recording.ratio is None:
+        raise InputError(f"{folder}: the recording names no gear ratio; fit it with 'hdbridge fit --ratio'")
+    before = folder / ACTIVE_NAME
+    active = TransmissionModel.load(before) if before.exists() else None
+    result = conclude({folder: recording}, recording.ratio, active)
+    path = folder / RESULT_NAME
+    if not path.exists():
+        return result
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        validation = Validation.from_dict(data["stepping"]) if data["stepping"] else None
+        offer = Offer(bool(data["offered"]), str(data["reason"]))
+    except (ValueError, KeyError, TypeError, OSError):
+        raise InputError(
+            f"{path}: is not what a calibration has written; restore it, or remove it and report without it"
+        ) from None
+    return replace(result, validation=validation, offer=offer)
+
+
+def active_model(
+    profile: Path, axis: AxisConfig, drive: Drive, tell: Callable[[str], None] = lambda _: None
+) -> TransmissionModel | None:
+    """The profile's active model, where it is this axis's and this drive's."""
+    path = profile / "model.yaml"
+    if not path.exists():
+        return None
+    model = TransmissionModel.load(path)
+    try:
+        model.check_bound_to(axis, identity_of(drive))
+    except InputError as problem:
+        tell(f"not compared with the active model: {problem}")
+        return None
+    return model
+
+
+def _kept(folder: Path, result: Calibration) -> Calibration:
+    """Result, model and what it was compared with, beside the recording that they come from."""
+    result.model.save(folder / MODEL_NAME)
+    if result.active:
+        result.active.save(folder / ACTIVE_NAME)
+    write_atomically(folder / RESULT_NAME, json.dumps(result.as_dict(), indent=1, allow_nan=False) + "\n")
+    return result

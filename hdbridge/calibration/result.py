@@ -1,0 +1,142 @@
+"""What a calibration says: the fit, the validation, and whether the model is offered for commit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hdbridge.calibration.validation import Stepped, Validation
+from hdbridge.identify import FitResult
+from hdbridge.model import TransmissionModel
+from hdbridge.modeldiff import diff
+
+__all__ = ["Calibration", "Offer", "Stepped"]
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """Whether a model is offered for commit, and why."""
+
+    made: bool
+    reason: str
+    pending: Path | None = None
+    """The file that waits to be committed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A calibration, or a fit of somebody's records (then without axis, validation and offer)."""
+
+    recordings: tuple[str, ...]
+    fit: FitResult
+    model: TransmissionModel
+    """With its provenance."""
+    active: TransmissionModel | None
+    """What it is compared with."""
+    axis: str | None = None
+    date: str | None = None
+    """When it was recorded, ISO 8601."""
+    plan: str | None = None
+    shortened: tuple[str, ...] = ()
+    """What the plan had to give up on this axis."""
+    validation: Validation | None = None
+    drift: tuple[tuple[float, float], ...] = ()
+    """Time (s) and error (arcsec, the first is zero) at the reference pose each time."""
+    offer: Offer | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract of ``--json``: schema ``hdbridge.calibration/1``."""
+        fit = self.fit
+        return {
+            "schema": "hdbridge.calibration/1",
+            "axis": self.axis,
+            "recordings": list(self.recordings),
+            "date": self.date,
+            "plan": self.plan,
+            "shortened": list(self.shortened),
+            "ratio": self.model.ratio,
+            "offered": self.offer.made if self.offer else None,
+            "reason": self.offer.reason if self.offer else None,
+            "pending": str(self.offer.pending) if self.offer and self.offer.pending else None,
+            "parameters": [
+                {
+                    "effect": each.effect,
+                    "parameter": each.parameter,
+                    "value": _number(each.value),
+                    "unit": unit_of(each.parameter),
+                    "ci95": [_number(each.value - each.half_width), _number(each.value + each.half_width)],
+                    "identifiable": each.identifiable,
+                }
+                for each in fit.intervals
+            ],
+            "changes": [
+                {
+                    "effect": each.effect,
+                    "parameter": each.parameter,
+                    "before": each.before,
+                    "after": each.after,
+                }
+                for each in (diff(self.active, self.model) if self.active else [])
+                if each.changed
+            ],
+            "orders": [
+                {
+                    "order": str(each.order),
+                    "amplitude_arcsec": each.amplitude_arcsec,
+                    "fall_in_chi_square": each.fall_in_chi_square,
+                    "threshold": each.threshold,
+                }
+                for each in fit.orders
+            ],
+            "beside_the_model": [
+                {
+                    "name": each.name,
+                    "value": each.value,
+                    "half_width": _number(each.half_width),
+                    "unit": each.unit,
+                }
+                for each in fit.nuisances
+            ],
+            "noise": {
+                "standing_arcsec": fit.noise.standing.rms_arcsec if fit.noise.standing else None,
+                "laps_arcsec": fit.noise.laps_arcsec,
+                "residual_arcsec": fit.noise.residual_arcsec,
+                "samples": fit.noise.samples,
+                "effective_samples": fit.noise.effective_samples,
+            },
+            "held_out": {
+                "before_arcsec": _number(fit.held_out.before_arcsec),
+                "after_arcsec": _number(fit.held_out.after_arcsec),
+                "fitted_arcsec": _number(fit.held_out.fitted_arcsec),
+                "over": fit.held_out.over,
+                "folds": fit.held_out.folds,
+                "improves": fit.held_out.improves,
+                "text": fit.held_out.text,
+            },
+            "residual_tests": [
+                {
+                    "name": each.name,
+                    "passed": each.passed,
+                    "size_arcsec": _number(each.size_arcsec),
+                    "text": each.text,
+                }
+                for each in fit.residual_tests
+            ],
+            "outliers": {"samples": fit.outliers.samples, "longest_run": fit.outliers.longest_run},
+            "warnings": list(fit.warnings),
+            "drift": [{"time_s": time_s, "error_arcsec": error} for time_s, error in self.drift],
+            "stepping": self.validation.as_dict() if self.validation else None,
+        }
+
+
+def _number(value: float) -> float | None:
+    """JSON knows no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def unit_of(parameter: str) -> str:
+    """The unit that a parameter's name ends with; empty for a number without one."""
+    unit = parameter.rsplit("_", 1)[-1] if "_" in parameter else ""
+    return unit if unit in {"arcsec", "deg", "s", "ms", "nm", "k", "c"} else ""

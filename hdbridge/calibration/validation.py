@@ -1,0 +1,177 @@
+"""Does the axis point better with the new model? The stepping test with and without it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import Bench, axis_view, compensation_for
+from hdbridge.calibration.identification import resting
+from hdbridge.calibration.measure import Pace
+from hdbridge.drive.drive import Drive
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.procedures.stepping import SteppingOutcome
+from hdbridge.recording import Recording
+from hdbridge.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
+
+WINDOW_S = 0.06
+"""Over which the stepping test takes its mean at rest."""
+WORSE = 1.02
+"""A stepping test that is worse by this factor is worse."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """A stepping test under one model."""
+
+    model: str
+    """Which, in words."""
+    cw: Scatter
+    ccw: Scatter
+    pooled: Scatter
+    errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
+    """Of each step, way there and way back."""
+    targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
+
+    @classmethod
+    def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
+        """From what the procedure gave."""
+        result = SchemeResult.of(outcome)
+        return cls(
+            model,
+            result.cw,
+            result.ccw,
+            result.pooled,
+            (
+                tuple(each.error_arcsec for each in outcome.cw),
+                tuple(each.error_arcsec for each in outcome.ccw),
+            ),
+            (tuple(each.target_deg for each in outcome.cw), tuple(each.target_deg for each in outcome.ccw)),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, which `from_dict` reads back."""
+        return {
+            "model": self.model,
+            **{
+                name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
+                for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
+            },
+            "errors_arcsec": [list(each) for each in self.errors_arcsec],
+            "targets_deg": [list(each) for each in self.targets_deg],
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Stepped:
+        """Read back."""
+        errors, targets = (
+            (tuple(map(float, data[name][0])), tuple(map(float, data[name][1])))
+            for name in ("errors_arcsec", "targets_deg")
+        )
+        cw, ccw, pooled = (
+            Scatter(data[name]["three_sigma_arcsec"], data[name]["mean_arcsec"])
+            for name in ("cw", "ccw", "pooled")
+        )
+        return cls(data["model"], cw, ccw, pooled, errors, targets)
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """The stepping test before and after, and what the axis could do at best."""
+
+    before: Stepped
+    after: Stepped
+    floor: Floor
+
+    @property
+    def improves(self) -> bool:
+        """Whether the axis does not point worse with the new model."""
+        return self.after.pooled.three_sigma_arcsec <= WORSE * self.before.pooled.three_sigma_arcsec
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, which `from_dict` reads back."""
+        return {
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "floor_arcsec": self.floor.three_sigma_arcsec,
+            "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
+            "noise_floor_arcsec": self.floor.noise_arcsec,
+            "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Validation:
+        """Read back."""
+        floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
+        return cls(Stepped.from_dict(data["before"]), Stepped.from_dict(data["after"]), floor)
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """Three sigma of a stepping test on an axis whose gear is perfectly known, arcsec."""
+
+    quantisation_arcsec: float
+    """A motor target is a whole count."""
+    noise_arcsec: float
+    """How the load encoder at rest differs from one settled window to the next, and its count."""
+
+    @property
+    def three_sigma_arcsec(self) -> float:
+        """Both together."""
+        return math.hypot(self.quantisation_arcsec, self.noise_arcsec)
+
+
+def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
+    """The floor, from the axis's counts and its noise at rest as it was recorded."""
+    means = resting(recording, WINDOW_S)
+    count = axis.load_encoder.resolution_arcsec / math.sqrt(12.0)
+    noise = float(np.std(means)) if len(means) else 0.0
+    quantisation = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+    return Floor(quantisation, 3.0 * math.hypot(noise, count))
+
+
+def validate(
+    drive: Drive,
+    plan: Plan,
+    before: TransmissionModel | None,
+    after: TransmissionModel,
+    floor: Floor,
+    folder: Path,
+    *,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Validation:
+    """Step a booted drive's axis with the model before (None: without compensation) and with the new one.
+
+    Each run's samples go to ``folder``, also when it is stopped.
+    """
+    axis = drive.axis
+    stepping = plan.stepping(axis_view(axis))
+    each_s = rehearse(stepping, axis_view(axis), stepping.start_deg).duration_s
+    pace = Pace(2.0 * each_s, axis.drive.cycle_s, progress, interrupted)
+    results: list[Stepped] = []
+    for name, model, words in (
+        ("before", before, "the active model" if before else "no compensation"),
+        ("after", after, "the new model"),
+    ):
+        pace.begin(f"stepping {name}")
+        compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
+        bench = Bench(drive, compensation, interrupted=pace.interrupted)
+        try:
+            with bench:
+                run = bench.run(stepping)
+            drive.disable()
+        finally:
+            if len(bench.record()):
+                folder.mkdir(parents=True, exist_ok=True)
+                bench.record().write_csv(folder / f"stepping-{name}.csv.gz")
+        results.append(Stepped.of(words, run.outcome))
+    return Validation(results[0], results[1], floor)

@@ -1,0 +1,97 @@
+"""What `calibrate`, `fit` and `report` print of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+
+from hdbridge.calibration import Calibration
+from hdbridge.calibration.result import unit_of
+from hdbridge.cli.options import console
+from hdbridge.modeldiff import diff
+
+
+def print_calibration(result: Calibration) -> None:
+    """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
+    fit = result.fit
+    before = (
+        {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
+        if (result.active)
+        else {}
+    )
+    table = Table(title=_title(result), title_justify="left")
+    for name in ("effect", "parameter"):
+        table.add_column(name)
+    for name in ("value", "± 95 %", "unit", *(("was",) if before else ())):
+        table.add_column(name, justify="right" if name != "unit" else "left")
+    for each in fit.intervals:
+        was = before.get((each.effect, each.parameter))
+        cells = [
+            f"{each.value:.3f}" if each.identifiable else f"({each.value:.3f})",
+            f"{each.half_width:.3f}" if each.identifiable else "not known",
+            unit_of(each.parameter),
+        ]
+        table.add_row(
+            each.effect,
+            escape(each.parameter),
+            *cells,
+            *((f"{was:.3f}" if was is not None else "-",) if before else ()),
+        )
+    console.print(table)
+    noise = fit.noise
+    standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
+    console.print(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms")
+    console.print(f"held out: {escape(fit.held_out.text)}", soft_wrap=True)
+    if len(result.drift) > 1:
+        errors = [error for _, error in result.drift]
+        console.print(
+            f"reference pose: {max(errors) - min(errors):.2f} arcsec of drift over {len(errors)} visits",
+            soft_wrap=True,
+        )
+    for test in fit.residual_tests:
+        if not test.passed:
+            console.print(f"residual: {escape(test.text)}", soft_wrap=True)
+    for warning in fit.warnings:
+        console.print(f"note: {escape(warning)}", soft_wrap=True)
+    if result.validation:
+        _print_stepping(result)
+    if result.offer:
+        console.print(
+            escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True
+        )
+
+
+def write_calibration_page(path: Path, result: Calibration) -> bool:
+    """The result as a self-contained page; whether it was written."""
+    return False
+
+
+def _title(result: Calibration) -> str:
+    axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
+    return escape(f"Model of {axis}, ratio {result.model.ratio:g}")
+
+
+def _print_stepping(result: Calibration) -> None:
+    checked = result.validation
+    assert checked is not None
+    table = Table(title="Stepping test: load error at rest, arcsec", title_justify="left")
+    table.add_column("with")
+    for direction in ("CW", "CCW", "pooled"):
+        table.add_column(f"{direction} 3σ", justify="right")
+        table.add_column("mean", justify="right")
+    for each in (checked.before, checked.after):
+        cells = [
+            f"{value:.2f}"
+            for part in (each.cw, each.ccw, each.pooled)
+            for value in (part.three_sigma_arcsec, part.mean_arcsec)
+        ]
+        table.add_row(each.model, *cells)
+    console.print(table)
+    floor = checked.floor
+    console.print(
+        f"floor of this axis's counts and noise: {floor.three_sigma_arcsec:.2f} arcsec; the new model is at "
+        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} of it",
+        soft_wrap=True,
+    )

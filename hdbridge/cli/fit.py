@@ -1,0 +1,91 @@
+"""``hdbridge fit``: a model from recordings alone, hdbridge's own or anybody's CSV files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import conclude
+from hdbridge.cli.findings import print_calibration, write_calibration_page
+from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.recording import Recording
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("fit")(command)
+
+
+def command(
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORD...", help="Recording folders or CSV files, in the order of their time."
+        ),
+    ],
+    ratio: Annotated[
+        float | None,
+        typer.Option("--ratio", min=1, max=1000, help="Motor turns per load turn; else the recording's."),
+    ] = None,
+    axis: Annotated[
+        str | None,
+        typer.Option("--axis", metavar="PROFILE", help="The axis that was recorded: ratio and binding."),
+    ] = None,
+    active: Annotated[
+        Path | None,
+        typer.Option("--model", metavar="ACTIVE.yaml", help="Model to compare with, and to fall back on."),
+    ] = None,
+    independent_zeros: Annotated[
+        bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file.")
+    ] = None,
+    json_file: JsonOption = None,
+    html_file: HtmlOption = None,
+) -> None:
+    """Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.
+
+    A CSV file needs the columns `time_s`, `motor_position_deg`, `load_position_deg` (multi-turn);
+    `motor_target_deg` helps. Nothing is activated: a fit that shall be used goes to a profile by --out.
+    """
+    config = AxisConfig.load(Profile.find(axis).axis) if axis else None
+    recordings = {each: Recording.load(each) for each in records}
+    known = _ratio(ratio, config, recordings)
+    for each in recordings.values():
+        each.record.check_ratio(known)
+    compared = TransmissionModel.load(active) if active else None
+    if compared and config:
+        compared.check_ratio(config)
+    found = conclude(recordings, known, compared, axis=config, independent_zeros=independent_zeros)
+    print_calibration(found)
+    if out is not None:
+        found.model.save(out)
+        console.print(f"model: {out}", soft_wrap=True)
+    write_json(json_file, found.as_dict())
+    if html_file is not None:
+        write_calibration_page(html_file, found)
+
+
+def _ratio(given: float | None, axis: AxisConfig | None, recordings: Mapping[Path, Recording]) -> float:
+    """The gear's ratio, from the option, the axis file or the recordings, which must agree."""
+    said = [("--ratio", given), (f"{axis.path}" if axis else "", axis.gear.ratio if axis else None)]
+    said += [(f"{path}", each.ratio) for path, each in recordings.items()]
+    known = [(where, value) for where, value in said if value is not None]
+    if not known:
+        raise InputError(
+            f"{next(iter(recordings))}: the ratio of the gear is not known; give --ratio N or --axis PROFILE"
+        )
+    for where, value in known[1:]:
+        if value != known[0][1]:
+            raise InputError(
+                f"{where} has a ratio of {value:g}, but {known[0][0]} says {known[0][1]:g}; expected one "
+                "gear: correct the wrong one, or leave out the other gear's record"
+            )
+    return known[0][1]

@@ -1,0 +1,155 @@
+"""``hdbridge model``: the history of an axis's model: look, compare, commit, go back."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from hdbridge import modelstore
+from hdbridge.cli.options import JsonOption, Profile, ProfileArgument, console, write_json
+from hdbridge.modeldiff import diff
+from hdbridge.modelstore import ACTIVE, PENDING, Version
+
+ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(
+        help="The models of an axis: the active one, one that waits, and every one that there was.",
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+    )
+    for command in (log, commit, activate, rollback, discard):
+        group.command()(command)
+    group.command("diff")(compare)
+    app.add_typer(group, name="model")
+
+
+def log(profile: ProfileArgument, json_file: JsonOption = None) -> None:
+    """List every model of the profile, newest first, with dates and reasons."""
+    versions = modelstore.log(_folder(profile))
+    if not versions:
+        console.print("no model yet: calibrate first")
+    for each in versions:
+        mark = "active" if each.active else "pending" if each.number is None else ""
+        name = f"{each.number:4d}" if each.number else "   -"
+        console.print(f"{name}  {mark:<8}{each.date}  {escape(each.reason)}", soft_wrap=True)
+        for step in each.activations:
+            console.print(
+                f"                {step.date}  {step.action}  {escape(step.reason)}", soft_wrap=True
+            )
+    write_json(json_file, {"schema": "hdbridge.model-log/1", "models": [_version(each) for each in versions]})
+
+
+def compare(
+    profile: ProfileArgument,
+    before: Annotated[
+        str | None,
+        typer.Argument(metavar="[BEFORE]", help="Number, `active` or `pending`; else the active one."),
+    ] = None,
+    after: Annotated[
+        str | None, typer.Argument(metavar="[AFTER]", help="The same; else the pending one.")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Show what changed between two models, parameter by parameter."""
+    folder = _folder(profile)
+    names = {name for each in modelstore.log(folder) for name in _names(each)}
+    if before is None and ACTIVE not in names:
+        later = modelstore.find(folder, after or PENDING)
+        earlier_name, model = "no model", later.model.only(())
+    else:
+        earlier = modelstore.find(folder, before or ACTIVE)
+        earlier_name, model = earlier.name, earlier.model
+        later = modelstore.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
+    rows = diff(model, later.model)
+    table = Table(title=f"{earlier_name} → {later.name}", title_justify="left")
+    for name in ("effect", "parameter"):
+        table.add_column(name)
+    for name in ("before", "after", "change", "± 95 %"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        known = isinstance(row.before, int | float) and isinstance(row.after, int | float)
+        change = f"{row.after - row.before:+.3f}" if known and row.changed else ""
+        table.add_row(
+            row.effect or "-",
+            escape(row.parameter),
+            _cell(row.before),
+            _cell(row.after),
+            change,
+            _cell(row.half_width),
+        )
+    console.print(table)
+    write_json(
+        json_file,
+        {
+            "schema": "hdbridge.model-diff/1",
+            "before": earlier_name,
+            "after": later.name,
+            "parameters": [{**row._asdict(), "changed": row.changed} for row in rows],
+        },
+    )
+
+
+def commit(profile: ProfileArgument) -> None:
+    """Make the pending model the active one; the one before stays in the history."""
+    number = modelstore.commit(_folder(profile), _now())
+    console.print(f"model {number} is active")
+
+
+def activate(
+    profile: ProfileArgument,
+    version: Annotated[int, typer.Argument(min=1, help="Its number in the log.")],
+    reason: ReasonOption = "",
+) -> None:
+    """Make a model of the history the active one."""
+    number = modelstore.activate(_folder(profile), version, reason, _now())
+    console.print(f"model {number} is active")
+
+
+def rollback(profile: ProfileArgument, reason: ReasonOption = "") -> None:
+    """Undo the last activation: the model before it is active again."""
+    number = modelstore.rollback(_folder(profile), reason, _now())
+    console.print(f"model {number} is active again")
+
+
+def discard(profile: ProfileArgument) -> None:
+    """Throw the pending model away; the recording that it came from stays."""
+    modelstore.discard(_folder(profile))
+    console.print("the pending model is gone; its recording is kept")
+
+
+def _folder(profile: str) -> Path:
+    return Profile.find(profile).axis.parent
+
+
+def _now() -> datetime:
+    return datetime.now().astimezone()
+
+
+def _names(version: Version) -> set[str]:
+    return {version.name, ACTIVE} if version.active else {version.name}
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else escape(str(value))
+
+
+def _version(each: Version) -> dict[str, Any]:
+    return {
+        "name": each.name,
+        "number": each.number,
+        "active": each.active,
+        "date": each.date,
+        "reason": each.reason,
+        "file": str(each.path),
+        "activations": [step.model_dump() for step in each.activations],
+    }

@@ -1,0 +1,33 @@
+"""``hdbridge report``: the report of a calibration again, from its recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hdbridge.calibration import concluded
+from hdbridge.cli.findings import print_calibration, write_calibration_page
+from hdbridge.cli.options import HtmlOption, JsonOption, console, write_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("report")(command)
+
+
+def command(
+    recording: Annotated[
+        Path, typer.Argument(metavar="RECORDING", help="Folder of a calibration's recording.")
+    ],
+    json_file: JsonOption = None,
+    html_file: HtmlOption = None,
+) -> None:
+    """Fit a recording again and tell its result; no axis is needed, nothing moves."""
+    result = concluded(recording)
+    print_calibration(result)
+    write_json(json_file, result.as_dict())
+    page = html_file or recording / "report.html"
+    if write_calibration_page(page, result):
+        console.print(f"report: {page}", soft_wrap=True)
