@@ -20,13 +20,16 @@ from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.errors import TransitionError
+from hdbridge.effects import Channel, Observer, compensable, unmet
+from hdbridge.errors import InputError, TransitionError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.record import Record
 
 Outcome = TypeVar("Outcome")
+KNOWN_ON_LINE = frozenset(Channel) - {Channel.LOAD_TORQUE, Channel.TEMPERATURE}
+"""What `Bench` can tell the effects in each cycle."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 2.0
 _STANDING = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
@@ -66,7 +69,16 @@ def axis_view(axis: AxisConfig) -> AxisView:
 
 
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
-    """The model's inverse with the caps of the axis file, at the axis's cycle."""
+    """The model's inverse with the caps of the axis file, at the axis's cycle.
+
+    InputError where an effect needs what the control loop does not know.
+    """
+    for name, channels in unmet(compensable(model.effects), KNOWN_ON_LINE).items():
+        lacking = ", ".join(sorted(each.value for each in channels))
+        raise InputError(
+            f"the effect '{name}' needs {lacking}, which the control loop does not have; "
+            "leave it out of the model that compensates"
+        )
     caps = axis.compensation
     limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
     return Compensation(model, limits, axis.drive.cycle_s)
@@ -103,6 +115,7 @@ class Bench:
         self._compensation = compensation or compensation_for(axis, TransmissionModel(axis.gear.ratio))
         self._interrupted = interrupted
         self._torque_nm = axis.drive.rated_torque_nm / 1000.0
+        self._observer = Observer()
         self._place = 0.0
         self._chunks: list[np.ndarray[tuple[int, int], np.dtype[np.float64]]] = []
         self._legs: list[Leg] = []
@@ -124,6 +137,7 @@ class Bench:
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._compensation.reset(motor_deg)
         self._place = motor_deg / self.view.ratio
+        self._observer = Observer()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -181,13 +195,20 @@ class Bench:
         )
         motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._torque_nm
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
+        observe, ratio = self._observer.moment, self.view.ratio
         target_deg = self._place
         # Counted in cycles that were run, not in clock time: a period that was skipped must not make the
         # target jump ahead.
         elapsed_s = 0.0
 
         def answer(feedback: Feedback) -> int:
-            return counts_for(command(target_deg) if feedback.fresh else hold(target_deg))
+            moment = observe(
+                ratio * target_deg,
+                feedback.time_s,
+                motor_torque_nm=feedback.torque_permille * torque_nm,
+                load_deg=target_deg,
+            )
+            return counts_for(command(target_deg, moment) if feedback.fresh else hold(target_deg, moment))
 
         try:
             while True:

@@ -17,9 +17,9 @@ Pure: no clock, no bus.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from hdbridge.effects import Moment, Start, Tracker
+from hdbridge.effects import Moment, Start, Tracker, compensable, fall_bound
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
@@ -47,10 +47,14 @@ class Inverse:
     __slots__ = ("_error", "_fall", "_motor_deg", "_slope", "_timeless", "_tracker")
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
-        """Refuses (InputError) a model whose repeating part is too steep to have one inverse."""
+        """Leaves out what cannot or must not be compensated, such as the load encoder's own errors.
+
+        Refuses (InputError) a model whose repeating part is too steep to have one inverse.
+        """
+        model = replace(model, effects=compensable(model.effects))
         self._tracker: Tracker = model.tracker(start)
         self._slope = ARCSEC_PER_DEG / model.ratio
-        self._fall = sum(each.slope_bound_arcsec_per_deg() for each in model.effects)
+        self._fall = fall_bound(model.effects)
         if self._fall > _STEEPEST_FALL * self._slope:
             raise InputError(
                 f"the model's error can fall by {self._fall:.3g} arcsec per motor degree, "
@@ -60,7 +64,7 @@ class Inverse:
         self._motor_deg = 0.0
         self._error = 0.0
         # Without channels the error at rest is what it was when the command was issued: not asked twice.
-        self._timeless = not any(each.channels for each in model.effects)
+        self._timeless = not any(each.needs() for each in model.effects)
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """The command is issued: move the state on; returns the model's error there, arcsec."""

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity, Teeth
-from hdbridge.effects import CATALOGUE, Effect
+from hdbridge.effects import CATALOGUE, Effect, conflicts
 from hdbridge.expectation import nearest
 from hdbridge.yamlfile import Document, Hex, dump_yaml
 
@@ -79,6 +79,8 @@ def content_of(document: Document) -> Content:
         effects.append(effect)
         if entry.uncertainty:
             uncertainty[effect.name] = entry.uncertainty
+    for conflict in conflicts(effects, file.ratio):
+        raise document.error(("effects",), conflict)
     return Content(file.ratio, tuple(effects), uncertainty, document.data.get("provenance") or {})
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.compensation import Compensation, CompensationLimits, Inverse
-from hdbridge.effects import Hysteresis, Moment, MotorOrder, Start, Synchronous
+from hdbridge.effects import CATALOGUE, Hysteresis, Moment, MotorOrder, Start, Synchronous
 from hdbridge.effects.hysteresis import rise_at
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -189,3 +189,11 @@ def test_reset_begins_without_a_correction_wherever_the_motor_stands():
     compensation.engage()
     first = compensation.command(1234.5 / 50)
     assert abs(first - 1234.5) < 0.05
+
+
+def test_errors_of_the_measurement_are_not_compensated():
+    effect = CATALOGUE["channel_skew"].candidate(50.0)
+    assert not effect.is_compensable()
+    inverse = Inverse(TransmissionModel(50.0, (effect,)))
+    inverse.advance(0.0)
+    assert inverse.solve(1.0, Moment(motor_speed_deg_s=500.0)) == pytest.approx(50.0, abs=1e-9)

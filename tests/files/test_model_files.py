@@ -202,3 +202,15 @@ def test_binding_a_model_keeps_the_rest_of_its_provenance(axis):
     assert bound.provenance["drive"] == {"vendor_id": 1, "product_code": 2, "serial": 3}
     with pytest.raises(InputError, match="vendor_id 0x1"):
         bound.check_bound_to(axis)
+
+
+def test_effects_that_stand_in_each_others_place_are_refused():
+    text = (
+        "schema: hdbridge.model/1\nratio: 50\neffects:\n"
+        "- effect: hysteresis\n  parameters: {offset_arcsec: 40, width_deg: 20, exponent: 1.6}\n"
+        "- effect: hysteresis_memory\n  parameters: {offset_arcsec: 40, width_deg: 20, exponent: 1.6}\n"
+    )
+    with pytest.raises(
+        InputError, match=r"model\.yaml:4:1: .*'hysteresis_memory' stands in place of 'hysteresis'"
+    ):
+        TransmissionModel.from_text(text, "model.yaml")
