@@ -289,7 +289,7 @@ class AxisConfig(_Part):
         default_factory=CompensationConfig, description="how far and how fast the compensation may act"
     )
 
-    _path: Path | None = PrivateAttr(None)
+    _document: Document | None = PrivateAttr(None)
     _eds_path: Path | None = PrivateAttr(None)
 
     @classmethod
@@ -314,7 +314,7 @@ class AxisConfig(_Part):
                 f"there is no '{axis.drive.eds}' in {places[0].parent} nor among the bundled EDS files in "
                 f"{bundled_folder('eds')}; expected an EDS file there, or another name here",
             )
-        axis._path = document.path
+        axis._document = document
         axis._eds_path = found.resolve()
         return axis
 
@@ -350,7 +350,18 @@ class AxisConfig(_Part):
     @property
     def path(self) -> Path:
         """The file that this axis was read from."""
-        return self._path or Path("axis.yaml")
+        return self._document.path if self._document is not None else Path("axis.yaml")
+
+    def where(self, key: str) -> str:
+        """Where a key stands, for a complaint: ``axis.yaml:12:3: drive.node_id``.
+
+        A key that the file leaves to its default has the place of the mapping that it belongs into; an axis
+        that was not read from a file has no line.
+        """
+        if self._document is None:
+            return f"{self.path}: {key}"
+        line, column = self._document.position(tuple(key.split(".")))
+        return f"{self.path}:{line}:{column}: {key}"
 
     @property
     def eds_path(self) -> Path:

@@ -93,6 +93,11 @@ class Document:
         """A complaint about the value (or the key) at a location."""
         return FileError(self._line(at, message, key=key))
 
+    def position(self, at: Location) -> tuple[int, int]:
+        """Line and column of the key at a location, or of the innermost one around it that there is."""
+        node = self._node(at, key=True)
+        return node.line, node.column
+
     def _complaints(self, model: type[BaseModel], at: Location, errors: list[ErrorDetails]) -> list[str]:
         schema = [each for each in errors if each["loc"] == ("schema",)]
         if schema:  # whatever else is wrong follows from it being another kind of file

@@ -6,13 +6,23 @@ read back. The first thing that is not as expected ends the boot-up with an erro
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from fractions import Fraction
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.nameplate import (
+    IDENTITY,
+    Complaint,
+    device_type_complaints,
+    identity_complaints,
+    mode_complaints,
+    scaling_addresses,
+    scaling_complaints,
+    torque_notes,
+)
 from hdbridge.drive.objects import Address, Mode, NmtCommand, NmtState
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
@@ -26,7 +36,6 @@ BOOT_UP_TIMEOUT_S: Final = 2.0
 """How long a node may take from a reset to its boot-up message before it is asked directly."""
 STATE_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.02
-_RATED_TORQUE_TOLERANCE: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +123,11 @@ class BootUp:
         except SdoError as error:
             heard = ", ".join(map(str, sorted(self._others_heard)))
             own = node_id == self._axis.drive.node_id
-            where = "drive.node_id" if own else "load_encoder.source.node"
+            where = self._axis.where("drive.node_id" if own else "load_encoder.source.node")
             raise DriveError(
                 f"node {node_id} on {self._link.name} does not answer"
                 + (f" (heard: node {heard})" if heard else " (no other node was heard either)")
-                + f"; check power, cable, termination, bit rate and {where} in {self._axis.path}"
+                + f"; check power, cable, termination, bit rate and {where}"
             ) from error
 
     def _start(self, node_id: int) -> None:
@@ -132,130 +141,41 @@ class BootUp:
             said = "no heartbeat came" if status.nmt_state is None else f"it says {status.nmt_state:02X}h"
             raise DriveError(
                 f"node {node_id} on {self._link.name} did not become OPERATIONAL ({said}, expected 05h); "
-                "look at its error display and at drive.heartbeat_ms"
+                f"look at its error display and at {self._axis.where('drive.heartbeat_ms')}"
             )
 
     # -- what it is ---------------------------------------------------------------------------------------
 
+    def _refuse(self, complaints: list[Complaint]) -> None:
+        if complaints:
+            raise IdentityError(complaints[0].text)
+
+    def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
+        """The objects that the EDS lists."""
+        return {each: self._sdo.fetch(each) for each in addresses if self._sdo.has(each.index, each.sub)}
+
     def _check_device_type(self) -> None:
-        found = self._sdo.fetch(objects.DEVICE_TYPE)
-        if found & 0xFFFF != objects.DEVICE_PROFILE_402:
-            raise IdentityError(
-                f"{self._name(objects.DEVICE_TYPE)}: is {found:08X}h, device profile {found & 0xFFFF}; "
-                f"expected 402 (drives and motion control); check drive.node_id in {self._axis.path}"
-            )
+        self._refuse(device_type_complaints(self._axis, self._sdo.fetch(objects.DEVICE_TYPE)))
 
     def _check_identity(self) -> dict[str, int]:
-        wanted = self._axis.drive.identity
         found: dict[str, int] = {}
-        for address, key, expected in (
-            (objects.VENDOR_ID, "vendor_id", wanted.vendor_id),
-            (objects.PRODUCT_CODE, "product_code", wanted.product_code),
-            (objects.REVISION, "revision", wanted.revision),
-            (objects.SERIAL, "serial", wanted.serial),
-        ):
-            if expected is None and not self._sdo.has(address.index, address.sub):
-                continue
-            found[key] = self._sdo.fetch(address)
-            if expected is not None and found[key] != expected:
-                raise IdentityError(
-                    f"{self._name(address)}: is {found[key]:X}h, but {self._axis.path} expects "
-                    f"{expected:X}h in "
-                    f"drive.identity.{key}; connect the right drive or correct the file"
-                )
+        for address, name in IDENTITY:
+            wanted = getattr(self._axis.drive.identity, name)
+            if wanted is not None or self._sdo.has(address.index, address.sub):
+                found[name] = self._sdo.fetch(address)
+        self._refuse(identity_complaints(self._axis, found))
         return found
 
     def _check_modes(self) -> tuple[Mode, ...]:
         bits = self._sdo.fetch(objects.SUPPORTED_MODES)
-        modes = tuple(mode for mode in Mode if bits & mode.supported_bit)
-        if Mode.CSP not in modes:
-            raise IdentityError(
-                f"{self._name(objects.SUPPORTED_MODES)}: is {bits:08X}h, without cyclic synchronous "
-                "position (bit 7); "
-                "this drive cannot be used: choose one with that mode, or enable it in the drive"
-            )
-        return modes
+        self._refuse(mode_complaints(self._axis, bits))
+        return tuple(mode for mode in Mode if bits & mode.supported_bit)
 
     def _check_scaling(self) -> list[str]:
         """User units per motor turn, by every object that says something about them."""
-        counts = self._axis.motor_encoder.counts_per_turn
-        increments = self._ratio(objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
-        feed = self._ratio(objects.FEED, objects.FEED_SHAFT)
-        gear = self._ratio(objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
-        if gear not in (1, Fraction(self._axis.gear.ratio)):
-            raise IdentityError(
-                f"{self._name(objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
-                "gear.ratio in "
-                f"{self._axis.path} is {self._axis.gear.ratio:g}; correct the one that is wrong"
-            )
-        for value, objects_used in (
-            (increments, "608Fh:01 / 608Fh:02 (encoder resolution)"),
-            (None if feed is None else feed / gear, "6092h (feed) over 6091h (gear ratio)"),
-        ):
-            if value is not None and value != counts:
-                raise IdentityError(
-                    f"node {self._sdo.node_id}, {objects_used}: the drive counts {float(value):g} per "
-                    "motor turn, but "
-                    f"motor_encoder.counts_per_turn in {self._axis.path} is {counts}; set the drive's "
-                    "scaling to "
-                    "plain encoder counts, or correct the file"
-                )
-        if feed is None and gear != 1:
-            raise IdentityError(
-                f"{self._name(objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "
-                f"{float(gear):g}; "
-                f"set 6091h to 1:1, gear.ratio in {self._axis.path} is the only one"
-            )
-        if self._sdo.has(objects.POLARITY.index):
-            polarity = self._sdo.fetch(objects.POLARITY)
-            if polarity & 0x80:
-                raise IdentityError(
-                    f"{self._name(objects.POLARITY)}: is {polarity:02X}h, the drive reverses positions "
-                    "itself; "
-                    f"set it to 0 and use motor_encoder.direction in {self._axis.path}"
-                )
-        self._check_load_resolution()
-        return self._compare_rated_torque()
-
-    def _check_load_resolution(self) -> None:
-        """60E6h and 60EBh say how an encoder at 60E4h counts, per turn of the load or of the motor."""
-        source, counts = self._axis.load_encoder.source, self._axis.load_encoder.counts_per_turn
-        if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
-            return
-        found = self._ratio(*objects.additional_resolution(source.subindex))
-        if found is not None and found not in (counts, Fraction(counts) / Fraction(self._axis.gear.ratio)):
-            raise IdentityError(
-                f"node {self._sdo.node_id}, 60E6h:{source.subindex:02X} / 60EBh:{source.subindex:02X} "
-                "(additional "
-                f"encoder resolution): the drive counts {float(found):g} per turn, but "
-                f"load_encoder.counts_per_turn in {self._axis.path} is {counts}; correct the one that is "
-                "wrong"
-            )
-
-    def _compare_rated_torque(self) -> list[str]:
-        if not self._sdo.has(objects.RATED_TORQUE.index):
-            return []
-        drive_nm = self._sdo.fetch(objects.RATED_TORQUE) / 1000.0
-        file_nm = self._axis.drive.rated_torque_nm
-        if abs(drive_nm - file_nm) <= _RATED_TORQUE_TOLERANCE * file_nm:
-            return []
-        return [
-            f"{self._name(objects.RATED_TORQUE)}: the drive says {drive_nm:g} Nm, drive.rated_torque_nm is "
-            f"{file_nm:g}; torques are reported with the latter"
-        ]
-
-    def _ratio(self, numerator: Address, denominator: Address) -> Fraction | None:
-        """A ratio of two objects, None where the drive has none; refused when one of them is 0."""
-        if not self._sdo.has(numerator.index, numerator.sub):
-            return None
-        above = self._sdo.fetch(numerator)
-        below = self._sdo.fetch(denominator) if self._sdo.has(denominator.index, denominator.sub) else 1
-        if above == 0 or below == 0:
-            raise IdentityError(
-                f"{self._name(numerator)} is {above}, over {below}: not a ratio; set the drive's scaling "
-                "first"
-            )
-        return Fraction(above, below)
+        self._refuse(scaling_complaints(self._axis, self._readings(scaling_addresses(self._axis))))
+        rated = self._readings((objects.RATED_TORQUE,))
+        return torque_notes(self._axis, rated.get(objects.RATED_TORQUE))
 
     def _names(self) -> dict[str, str]:
         names = {}
@@ -295,7 +215,7 @@ class BootUp:
     def _write(self, row: PlannedWrite) -> None:
         """Write one object and compare what the drive then holds."""
         sdo = self._clients[row.node_id]
-        at = f"; {row.field} in {self._axis.path} decides it" if row.field else ""
+        at = f"; {self._axis.where(row.field)} decides it" if row.field else ""
         value = row.value
         try:
             if row.kept:

@@ -312,8 +312,8 @@ class Drive:
             raise DriveError(
                 f"{self._commander.name}: the axis stands at {at_deg:g} deg by the motor encoder, outside "
                 f"{self.axis.limits.position_min_deg:g} .. {self.axis.limits.position_max_deg:g} deg "
-                "(limits in "
-                f"{self.axis.path}); home it, or turn it back by hand"
+                f"({self.axis.where('limits.position_min_deg')}, position_max_deg); home it, or "
+                "turn it back by hand"
             )
 
 

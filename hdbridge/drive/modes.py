@@ -73,9 +73,9 @@ class ProfileMove:
         limits = axis.limits
         if not limits.contains(load_deg):
             raise InputError(
-                f"target of {load_deg!r} deg is outside limits.position_min_deg .. position_max_deg of "
-                f"{axis.path}, {limits.position_min_deg:g} .. {limits.position_max_deg:g} deg; nothing was "
-                "sent"
+                f"target of {load_deg!r} deg is outside {axis.where('limits.position_min_deg')} .. "
+                f"position_max_deg, {limits.position_min_deg:g} .. {limits.position_max_deg:g} deg; nothing "
+                "was sent"
             )
         return cls(
             load_deg,

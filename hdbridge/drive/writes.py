@@ -93,7 +93,7 @@ def _row(
     kind = address.type
     if not kind.minimum <= value <= kind.maximum:
         raise InputError(
-            f"{axis.path}: {field} gives {value} for object {address}, outside [{kind.minimum}, "
+            f"{axis.where(field)} gives {value} for object {address}, outside [{kind.minimum}, "
             f"{kind.maximum}]; "
             "choose a value that the object can hold"
         )
@@ -270,7 +270,7 @@ def _limits(axis: AxisConfig) -> Iterator[_Row]:
     window = round(abs(axis.motor_encoder.counts(drive.following_error_deg)))
     if window == 0:
         raise InputError(
-            f"{axis.path}: drive.following_error_deg {drive.following_error_deg:g} is less than half a "
+            f"{axis.where('drive.following_error_deg')} {drive.following_error_deg:g} is less than half a "
             "motor count, "
             "and 0 in object 6065h means no supervision; raise it"
         )

@@ -211,3 +211,15 @@ def test_bundled_files_are_found_in_a_wheel_and_in_a_working_copy(tmp_path):
     (copy / "eds").mkdir(parents=True)
     (copy / "pyproject.toml").write_text("")
     assert bundled_folder("eds", copy / "hdbridge") == copy / "eds"
+
+
+def test_where_a_key_stands(tmp_path):
+    path = tmp_path / "axis.yaml"
+    text = (bundled_profile("article") / "axis.yaml").read_text()
+    path.write_text(text)
+    axis = AxisConfig.load(path)
+    line = next(n for n, each in enumerate(text.splitlines(), 1) if each.startswith("  node_id:"))
+    assert axis.where("drive.node_id") == f"{path}:{line}:3: drive.node_id"
+    assert axis.on_bus(channel="other").where("drive.node_id") == axis.where("drive.node_id")
+    source = next(n for n, each in enumerate(text.splitlines(), 1) if each.startswith("  source:"))
+    assert axis.where("load_encoder.source.node") == f"{path}:{source}:3: load_encoder.source.node"

@@ -1,0 +1,231 @@
+"""What a drive says of itself, held against the axis file. Pure: it judges readings, it reads nothing.
+
+Every difference is a `Complaint`: the key of the axis file, what was found there and what the drive says, in
+one line. The boot-up refuses the drive with the first one; the bring-up shows them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from hdbridge.drive import objects
+from hdbridge.drive.objects import Address
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+
+Readings = Mapping[Address, int]
+"""What the drive answered; an object that it lacks is not in it."""
+
+IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
+    (objects.VENDOR_ID, "vendor_id"),
+    (objects.PRODUCT_CODE, "product_code"),
+    (objects.REVISION, "revision"),
+    (objects.SERIAL, "serial"),
+)
+"""The identity object, and the keys of ``drive.identity``."""
+_RATED_TORQUE_TOLERANCE: Final = 0.01
+
+
+class Complaint(NamedTuple):
+    """One difference between the drive and the axis file."""
+
+    key: str
+    """Key of the axis file."""
+    text: str
+    """What is wrong, where, and what to do: one line."""
+
+
+def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
+    """The objects that say how the drive counts; a drive need not have them."""
+    source = axis.load_encoder.source
+    additional = source.node is None and source.index == objects.ADDITIONAL_POSITIONS
+    return (
+        objects.ENCODER_INCREMENTS,
+        objects.ENCODER_REVOLUTIONS,
+        objects.GEAR_MOTOR,
+        objects.GEAR_SHAFT,
+        objects.FEED,
+        objects.FEED_SHAFT,
+        objects.POLARITY,
+        *(objects.additional_resolution(source.subindex) if additional else ()),
+    )
+
+
+def device_type_complaints(axis: AxisConfig, device_type: int) -> list[Complaint]:
+    """Whether 1000h is that of a drive."""
+    if device_type & 0xFFFF == objects.DEVICE_PROFILE_402:
+        return []
+    key = "drive.node_id"
+    return [
+        Complaint(
+            key,
+            f"{_at(axis, objects.DEVICE_TYPE)} is {device_type:08X}h, device profile {device_type & 0xFFFF}; "
+            f"expected 402 (drives and motion control); check {axis.where(key)}",
+        )
+    ]
+
+
+def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Complaint]:
+    """Where the identity (keys of ``drive.identity``) is not the one that the axis file demands."""
+    complaints = []
+    for address, name in IDENTITY:
+        wanted = getattr(axis.drive.identity, name)
+        if wanted is None or found.get(name) == wanted:
+            continue
+        key = f"drive.identity.{name}"
+        complaints.append(
+            Complaint(
+                key,
+                f"{_at(axis, address)} is {found[name]:X}h, but {axis.where(key)} is {wanted:X}h; connect "
+                "the right drive or correct the file",
+            )
+        )
+    return complaints
+
+
+def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
+    """Whether 6502h has the mode that the control cycle needs."""
+    if modes & objects.Mode.CSP.supported_bit:
+        return []
+    return [
+        Complaint(
+            "drive",
+            f"{_at(axis, objects.SUPPORTED_MODES)} is {modes:08X}h, without cyclic synchronous position "
+            "(bit 7); this drive cannot be used: choose one with that mode, or enable it in the drive",
+        )
+    ]
+
+
+def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
+    """Where the drive counts otherwise than the axis file says, by every object that says something."""
+    try:
+        increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
+        feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT)
+        gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
+    except _NotARatioError as problem:
+        return [Complaint(problem.key, str(problem))]
+    return [
+        *_gear(axis, gear, feed),
+        *_motor_counts(axis, increments, None if feed is None else feed / gear),
+        *_polarity(axis, readings),
+        *_load_counts(axis, readings),
+    ]
+
+
+def torque_notes(axis: AxisConfig, rated_mnm: int | None) -> list[str]:
+    """Whether 6076h differs from the axis file: worth knowing, no reason to refuse."""
+    if rated_mnm is None:
+        return []
+    drive_nm, file_nm = rated_mnm / 1000.0, axis.drive.rated_torque_nm
+    if abs(drive_nm - file_nm) <= _RATED_TORQUE_TOLERANCE * file_nm:
+        return []
+    return [
+        f"{_at(axis, objects.RATED_TORQUE)}: the drive says {drive_nm:g} Nm, "
+        f"{axis.where('drive.rated_torque_nm')} is {file_nm:g}; torques are reported with the latter"
+    ]
+
+
+def _gear(axis: AxisConfig, gear: Fraction, feed: Fraction | None) -> list[Complaint]:
+    key, ratio = "gear.ratio", axis.gear.ratio
+    if gear not in (1, Fraction(ratio)):
+        return [
+            Complaint(
+                key,
+                f"{_at(axis, objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
+                f"{axis.where(key)} is {ratio:g}; correct the one that is wrong",
+            )
+        ]
+    if feed is None and gear != 1:
+        return [
+            Complaint(
+                key,
+                f"{_at(axis, objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "
+                f"{float(gear):g}; set 6091h to 1:1, {axis.where(key)} is the only one",
+            )
+        ]
+    return []
+
+
+def _motor_counts(
+    axis: AxisConfig, increments: Fraction | None, per_turn: Fraction | None
+) -> list[Complaint]:
+    key, counts = "motor_encoder.counts_per_turn", axis.motor_encoder.counts_per_turn
+    return [
+        Complaint(
+            key,
+            f"node {axis.drive.node_id}, {used}: the drive counts {float(value):g} per motor turn, but "
+            f"{axis.where(key)} is {counts}; set the drive's scaling to plain encoder counts, or correct the "
+            "file",
+        )
+        for value, used in (
+            (increments, "608Fh:01 / 608Fh:02 (encoder resolution)"),
+            (per_turn, "6092h (feed) over 6091h (gear ratio)"),
+        )
+        if value is not None and value != counts
+    ]
+
+
+def _polarity(axis: AxisConfig, readings: Readings) -> list[Complaint]:
+    polarity = readings.get(objects.POLARITY, 0)
+    if not polarity & 0x80:
+        return []
+    key = "motor_encoder.direction"
+    return [
+        Complaint(
+            key,
+            f"{_at(axis, objects.POLARITY)} is {polarity:02X}h, the drive reverses positions itself; set it "
+            f"to 0 and use {axis.where(key)}",
+        )
+    ]
+
+
+def _load_counts(axis: AxisConfig, readings: Readings) -> list[Complaint]:
+    """60E6h and 60EBh say how an encoder at 60E4h counts, per turn of the load or of the motor."""
+    source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
+    if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
+        return []
+    key, sub = "load_encoder.counts_per_turn", source.subindex
+    try:
+        found = _ratio(axis, readings, *objects.additional_resolution(sub))
+    except _NotARatioError as problem:
+        return [Complaint(key, str(problem))]
+    if found is None or found in (counts, Fraction(counts) / Fraction(axis.gear.ratio)):
+        return []
+    return [
+        Complaint(
+            key,
+            f"node {axis.drive.node_id}, 60E6h:{sub:02X} / 60EBh:{sub:02X} (additional encoder resolution): "
+            f"the drive counts {float(found):g} per turn, but {axis.where(key)} is {counts}; correct the one "
+            "that is wrong",
+        )
+    ]
+
+
+class _NotARatioError(Exception):
+    """One of the two objects of a ratio is 0."""
+
+    def __init__(self, key: str, text: str) -> None:
+        super().__init__(text)
+        self.key = key
+
+
+def _ratio(axis: AxisConfig, readings: Readings, above: Address, below: Address) -> Fraction | None:
+    """A ratio of two objects, None where the drive has none."""
+    if above not in readings:
+        return None
+    numerator, denominator = readings[above], readings.get(below, 1)
+    if numerator == 0 or denominator == 0:
+        key = "gear.ratio" if above is objects.GEAR_MOTOR else "motor_encoder.counts_per_turn"
+        raise _NotARatioError(
+            key,
+            f"{_at(axis, above)} is {numerator}, over {denominator}: not a ratio; set the drive's "
+            "scaling first",
+        )
+    return Fraction(numerator, denominator)
+
+
+def _at(axis: AxisConfig, address: Address) -> str:
+    return f"node {axis.drive.node_id}, object {address.index:04X}h:{address.sub:02X} '{address.name}'"
