@@ -240,6 +240,7 @@ class Cycle:
         if self._rested:
             # Whatever waited is old news.
             self._rested = False
+            self._heartbeat_s = now
             self._heard_s = now
             for _ in range(FLUSH_MAXIMUM):
                 frame = recv(now)

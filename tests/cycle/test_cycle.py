@@ -86,6 +86,15 @@ def test_the_master_sends_its_heartbeat_at_its_period(moving) -> None:
     assert all(data == b"\x05" for _, data in moving.frames(0x77F))
 
 
+def test_the_first_cycle_after_a_rest_sends_the_heartbeat(idle) -> None:
+    idle.cycle.tick()
+    idle.clock.sleep_until(idle.clock.now() + 0.010)
+    idle.cycle.restart()
+    idle.bus.sent.clear()
+    idle.cycle.tick()
+    assert [can_id for _, can_id, _ in idle.bus.sent] == [0x080, 0x201, 0x77F]
+
+
 def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:
     before = moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.007)

@@ -1,6 +1,6 @@
 """What one control cycle costs in CPU time, beside a bare exchange of the same frames and beside canopen.
 
-    python tools/bench/cycle.py [--interface virtual|socketcan] [--channel vcan0] [--json FILE]
+    python tools/bench/cycle.py [--interface virtual|loopback|socketcan]... [--channel vcan0] [--json FILE]
 
 One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
 
@@ -15,7 +15,9 @@ and prints medians over the blocks, and their ratios to the bare exchange.
 Nobody sleeps. On the virtual bus the answering node lives in the same thread; what it costs is measured in
 the same blocks and subtracted from each alike. On SocketCAN the kernel's own gateway (can-gw, set up with
 cangw, as root) turns each SYNC into the two TPDOs, which costs no process any time; there wall time is
-measured, because the CPU clock of user-mode-linux counts in steps of 4 ms.
+measured, because the CPU clock of user-mode-linux counts in steps of 4 ms. `loopback` tells what the
+SocketCAN code costs on a kernel without CAN: python-can's SocketCAN back end on a pair of UDP sockets. Without
+--interface all are measured that this machine has.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import socket
 import statistics
 import struct
 import subprocess
@@ -34,6 +37,9 @@ from pathlib import Path
 
 import can
 import canopen
+from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.socketcan.constants import SO_TIMESTAMPNS
+from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
@@ -51,6 +57,7 @@ STATUS_ENABLED = 0x1237
 ENABLE = 0x0F
 TPDO1, TPDO2, RPDO1 = struct.Struct("<Hih"), struct.Struct("<ii"), struct.Struct("<Hi")
 GOAL = 1.25
+Result = tuple[str, dict[str, float]]
 
 
 class NeverSleeping:
@@ -98,6 +105,60 @@ class AnsweringBus(VirtualBus):
     def shutdown(self) -> None:
         self.listener.shutdown()
         super().shutdown()
+
+
+class LoopbackSocket:
+    """Looks like the CAN socket of a master; a second UDP socket answers its SYNC at once."""
+
+    def __init__(self, node_id: int) -> None:
+        self.master = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.drive = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        for each in (self.master, self.drive):
+            each.bind(("127.0.0.1", 0))
+        self.master.connect(self.drive.getsockname())
+        self.drive.connect(self.master.getsockname())
+        self.master.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.recv, self.recvmsg, self.fileno = self.master.recv, self.master.recvmsg, self.master.fileno
+        self.replies = [build_can_frame(reply) for reply in answers(node_id)]
+        alive = can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
+        self.heartbeat = build_can_frame(alive)
+        self.count = 0
+
+    def send(self, frame: bytes, flags: int = 0) -> int:
+        sent = self.master.send(frame, flags)
+        if frame[:2] == b"\x80\x00":
+            self.answer()
+        return sent
+
+    def answer(self) -> None:
+        self.count += 1
+        if self.count % 12 == 0:
+            self.drive.send(self.heartbeat)
+        for reply in self.replies:
+            self.drive.send(reply)
+        with suppress(BlockingIOError):
+            while True:
+                self.drive.recv(100, socket.MSG_DONTWAIT)
+
+    def answer_nobody(self) -> None:
+        """What answering costs, by itself."""
+        self.answer()
+        with suppress(BlockingIOError):
+            while True:
+                self.master.recv(100, socket.MSG_DONTWAIT)
+
+    def close(self) -> None:
+        self.master.close()
+        self.drive.close()
+
+
+def loopback_bus(sock: LoopbackSocket) -> SocketcanBus:
+    """python-can's SocketCAN bus, without opening an interface."""
+    bus = SocketcanBus.__new__(SocketcanBus)
+    bus.socket, bus.channel, bus.channel_info = sock, "loopback", "SocketCAN code on UDP sockets"
+    bus._is_filtered, bus._filters, bus._tasks, bus._task_id = True, None, {}, 0
+    bus._periodic_tasks, bus._is_shutdown = [], True
+    return bus
 
 
 @contextmanager
@@ -317,40 +378,55 @@ def report(result: dict[str, float], where: str) -> str:
     return "\n".join(lines)
 
 
+def measure(
+    interface: str, options: argparse.Namespace, axis: AxisConfig, model: TransmissionModel
+) -> Result:
+    """Where it was measured, and the median of each variant."""
+    node_id, blocks, cycles = axis.drive.node_id, options.blocks, options.cycles
+    if interface == "virtual":
+        with AnsweringBus(node_id) as bus:
+            result = run(Variants(bus, axis, model), blocks, cycles, bus.answer, time.thread_time)
+            bus.queue.queue.clear()
+        return "the virtual bus", result
+    if interface == "loopback":
+        sock = LoopbackSocket(node_id)
+        variants = Variants(loopback_bus(sock), axis, model)
+        result = run(variants, blocks, cycles, sock.answer_nobody, time.thread_time)
+        sock.close()
+        return "SocketCAN's code over UDP loopback", result
+    channel = options.channel
+    with (
+        answering_kernel(channel, node_id),
+        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
+    ):
+        result = run(Variants(bus, axis, model), blocks, cycles, None, time.perf_counter)
+    return f"SocketCAN ({channel})", result
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--interface", choices=("virtual", "socketcan"), default="virtual")
+    parser.add_argument("--interface", choices=("virtual", "loopback", "socketcan"), action="append")
     parser.add_argument("--channel", default="vcan0", help="of socketcan")
     parser.add_argument("--profile", type=Path, default=PROFILE)
     parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
-    parser.add_argument("--cycles", type=int, default=1000, help="cycles per block")
+    parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     axis = AxisConfig.load(options.profile)
     model = TransmissionModel.load(options.profile / "model.yaml")
-
-    if options.interface == "virtual":
-        with AnsweringBus(axis.drive.node_id) as bus:
-            variants = Variants(bus, axis, model)
-            result = run(variants, options.blocks, options.cycles, bus.answer, time.thread_time)
-            bus.queue.queue.clear()
-        where = "the virtual bus"
-    else:
-        channel = options.channel
-        with (
-            answering_kernel(channel, axis.drive.node_id),
-            can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
-        ):
-            variants = Variants(bus, axis, model)
-            result = run(variants, options.blocks, options.cycles, None, time.perf_counter)
-        where = f"SocketCAN ({channel})"
-
-    print(report(result, where))
+    interfaces = options.interface or ["virtual", "loopback"]
+    if not options.interface and Path(f"/sys/class/net/{options.channel}").exists():
+        interfaces.append("socketcan")
+    results = []
+    for interface in interfaces:
+        where, result = measure(interface, options, axis, model)
+        print(report(result, where), end="\n\n")
+        results.append({"where": where, "unit": "us", **result})
     if options.json is not None:
-        options.json.write_text(json.dumps({"where": where, "unit": "us", **result}, indent=2) + "\n")
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0
 
 
