@@ -52,9 +52,7 @@ def main() -> None:
     for name, shares in (("whole bench", whole), ("plant alone", alone)):
         share = sorted(shares)[len(shares) // 2]
         cycle_us = share * axis.drive.cycle_s * 1e6
-        print(
-            f"{name:>12}: {1 / share:6.1f} x real time, {cycle_us:6.1f} us per cycle"
-        )
+        print(f"{name:>12}: {1 / share:6.1f} x real time, {cycle_us:6.1f} us per cycle")
 
 
 if __name__ == "__main__":
