@@ -16,8 +16,8 @@ Nobody sleeps. On the virtual bus the answering node lives in the same thread; w
 the same blocks and subtracted from each alike. On SocketCAN the kernel's own gateway (can-gw, set up with
 cangw, as root) turns each SYNC into the two TPDOs, which costs no process any time; there wall time is
 measured, because the CPU clock of user-mode-linux counts in steps of 4 ms. `loopback` tells what the
-SocketCAN code costs on a kernel without CAN: python-can's SocketCAN back end on a pair of UDP sockets. Without
---interface all are measured that this machine has.
+SocketCAN code costs on a kernel without CAN: python-can's SocketCAN back end on a pair of UDP sockets.
+Without --interface all are measured that this machine has.
 """
 
 from __future__ import annotations
