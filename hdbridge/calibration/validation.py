@@ -24,8 +24,8 @@ from hdbridge.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
 
 WINDOW_S = 0.06
 """Over which the stepping test takes its mean at rest."""
-WORSE = 1.02
-"""A stepping test that is worse by this factor is worse."""
+CHANCE = 2.0
+"""Standard errors by which a stepping test must be worse to count as worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,11 @@ class Validation:
 
     @property
     def improves(self) -> bool:
-        """Whether the axis does not point worse with the new model."""
-        return self.after.pooled.three_sigma_arcsec <= WORSE * self.before.pooled.three_sigma_arcsec
+        """Whether the axis points no worse with the new model, by more than chance."""
+        # Of n steps a standard deviation is known to 1 / sqrt(2 n) of itself; two are compared.
+        steps = sum(map(len, self.after.errors_arcsec))
+        worse = 1.0 + CHANCE / math.sqrt(steps)
+        return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, which `from_dict` reads back."""

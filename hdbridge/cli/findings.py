@@ -23,7 +23,7 @@ def print_calibration(result: Calibration) -> None:
     )
     table = Table(title=_title(result), title_justify="left")
     for name in ("effect", "parameter"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True, overflow="ignore")
     for name in ("value", "± 95 %", "unit", *(("was",) if before else ())):
         table.add_column(name, justify="right" if name != "unit" else "left")
     for each in fit.intervals:

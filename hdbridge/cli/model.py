@@ -71,7 +71,7 @@ def compare(
     rows = diff(model, later.model)
     table = Table(title=f"{earlier_name} → {later.name}", title_justify="left")
     for name in ("effect", "parameter"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True, overflow="ignore")
     for name in ("before", "after", "change", "± 95 %"):
         table.add_column(name, justify="right")
     for row in rows:

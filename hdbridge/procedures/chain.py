@@ -1,21 +1,40 @@
-"""Several procedures as one."""
+"""Several procedures as one, and gently."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from hdbridge.procedures.moves import AxisView, Procedure, Steps
+from hdbridge.procedures.moves import AxisView, Move, MoveTo, Procedure, Sample, Steps
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """One after the other; the outcome is the last one's."""
+    """One after the other; the outcome is the last one's.
+
+    With ``acceleration_deg_s2`` (at the load) no move accelerates faster: what accelerates winds the gear's
+    spring up, and a calibration wants to see the gear without it.
+    """
 
     parts: tuple[Procedure[object], ...]
+    acceleration_deg_s2: float | None = None
 
     def moves(self, axis: AxisView) -> Steps[object]:
         """The moves of each."""
         outcome: object = None
         for part in self.parts:
-            outcome = yield from part.moves(axis)
+            steps = part.moves(axis)
+            reply: Sequence[Sample] | None = None
+            while True:
+                try:
+                    move = next(steps) if reply is None else steps.send(reply)
+                except StopIteration as end:
+                    outcome = end.value
+                    break
+                reply = yield self._gently(move)
         return outcome
+
+    def _gently(self, move: Move) -> Move:
+        if self.acceleration_deg_s2 is None or not isinstance(move, MoveTo):
+            return move
+        return replace(move, acceleration_deg_s2=self.acceleration_deg_s2)

@@ -93,6 +93,8 @@ class MoveTo:
     load_deg: float
     velocity_deg_s: float | None = None
     kind: str = "move"
+    acceleration_deg_s2: float | None = None
+    """A gentler one winds the gear's spring up less."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Time-optimal within the limits (ruckig)."""
@@ -102,7 +104,7 @@ class MoveTo:
         demand.current_position = [start_deg]
         demand.target_position = [self.load_deg]
         demand.max_velocity = [min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
-        demand.max_acceleration = [limits.acceleration_deg_s2]
+        demand.max_acceleration = [min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)]
         demand.max_jerk = [limits.jerk_deg_s3]
         trajectory = Trajectory(1)
         try:

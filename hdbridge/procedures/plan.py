@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from hdbridge.bundled import bundled_folder
 from hdbridge.errors import InputError
@@ -131,9 +131,33 @@ class SteppingEntry(_Part):
         yield room.stepping(name, self.count, self.step_deg)
 
 
+PROCEDURES = ("standstill", "sweep", "sines", "reversals", "stepping")
+
+
+class _Context(dict[str, Any]):
+    """A dictionary that can be hashed, because whatever annotates a type has to be."""
+
+    __hash__ = object.__hash__  # type: ignore[assignment]
+
+
+def _named(entry: Any) -> str | None:
+    """The procedure that an entry names; None where there is none of that name."""
+    name = entry.get("procedure") if isinstance(entry, dict) else getattr(entry, "procedure", None)
+    return name if name in PROCEDURES else None
+
+
 Entry = Annotated[
-    StandstillEntry | SweepEntry | SinesEntry | ReversalsEntry | SteppingEntry,
-    Field(discriminator="procedure"),
+    Annotated[StandstillEntry, Tag("standstill")]
+    | Annotated[SweepEntry, Tag("sweep")]
+    | Annotated[SinesEntry, Tag("sines")]
+    | Annotated[ReversalsEntry, Tag("reversals")]
+    | Annotated[SteppingEntry, Tag("stepping")],
+    Discriminator(
+        _named,
+        custom_error_type="hdbridge",
+        custom_error_message="no such procedure; expected one of " + ", ".join(PROCEDURES),
+        custom_error_context=_Context(at=("procedure",)),
+    ),
 ]
 
 
@@ -159,6 +183,13 @@ class Plan(_Part):
         description="pre-conditioning move at the motor, more than any hysteresis is wide",
     )
     reference_s: float = Field(1.5, ge=0.2, le=600, description="how long it stands at the reference pose")
+    acceleration_deg_s2: float = Field(
+        5.0,
+        gt=0,
+        le=1e7,
+        description="acceleration of its moves at the load, if the axis file allows it: gentle, so that the "
+        "load does not wind the gear's spring up",
+    )
     procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="what is run, in order")
     validation: ValidationEntry = Field(
         default_factory=ValidationEntry, description="the stepping test of the new model"
@@ -192,8 +223,9 @@ class Plan(_Part):
         tasks = []
         for number, entry in enumerate(self.procedures, 1):
             name = f"{number:02d}-{entry.procedure}"
-            tasks.append(Task(name, Chain((*prelude, *entry.fitted(room, name)))))
-        tasks.append(Task(f"{len(tasks) + 1:02d}-reference", Chain(prelude)))
+            parts: tuple[Procedure[object], ...] = (*prelude, *entry.fitted(room, name))
+            tasks.append(Task(name, Chain(parts, self.acceleration_deg_s2)))
+        tasks.append(Task(f"{len(tasks) + 1:02d}-reference", Chain(prelude, self.acceleration_deg_s2)))
         return Tasks(tuple(tasks), tuple(room.notes))
 
     def stepping(self, axis: AxisView) -> Stepping:

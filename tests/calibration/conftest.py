@@ -1,0 +1,103 @@
+"""A calibrated axis to look at, and the command line as a process."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+SHORT = """\
+schema: hdbridge.plan/1
+name: short
+reference_s: 0.5
+procedures:
+  - {procedure: standstill, duration_s: 1}
+  - {procedure: sweep, motor_turns: 5, motor_turns_per_s: 1.0}
+  - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 1}
+  - {procedure: reversals, depths_deg: [8, 20], reach_deg: 50, motor_deg_per_s: 20}
+validation: {count: 8}
+"""
+
+
+class Cell:
+    """A folder in which somebody calibrates an axis: `axis/` is the profile, `short.yaml` a plan."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.axis = folder / "axis"
+        self.axis.mkdir(parents=True)
+        for name in ("axis.yaml", "truth.yaml"):
+            shutil.copy(DEMO / name, self.axis)
+        (folder / "short.yaml").write_text(SHORT)
+
+    def edit(self, name: str, old: str, new: str) -> None:
+        path = self.axis / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    def start(self, *arguments: object) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "hdbridge", *map(str, arguments)],
+            cwd=self.folder,
+            env={
+                **os.environ,
+                "OPENBLAS_NUM_THREADS": "1",
+            },  # two small threads only get into each other's way
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def run(self, *arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+        process = self.start(*arguments)
+        out, err = process.communicate(timeout=240)
+        assert process.returncode == status, err
+        assert "Traceback" not in err
+        return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+    def calibrate(self, *arguments: object, status: int = 0):
+        return self.run("calibrate", "axis", "--simulate", *arguments, status=status)
+
+    def json(self, name: str):
+        return json.loads((self.folder / name).read_text())
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A cell whose axis has no model yet."""
+    return Cell(tmp_path / "cell")
+
+
+@pytest.fixture(scope="session")
+def calibrated_once(tmp_path_factory):
+    """A calibration that was run once, for everybody to copy; with what the command printed."""
+    cell = Cell(tmp_path_factory.mktemp("calibrated") / "cell")
+    done = cell.calibrate("--plan", "short.yaml", "--out", "rec", "--json", "result.json")
+    return cell, done
+
+
+@pytest.fixture
+def calibrated(calibrated_once, tmp_path):
+    """A cell whose axis has a pending model and a recording, `rec/`."""
+    cell = Cell(tmp_path / "cell")
+    shutil.copytree(calibrated_once[0].folder, cell.folder, dirs_exist_ok=True)
+    return cell
+
+
+def until(condition, timeout_s: float = 60.0):
+    """Wait for something that another process does."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def wait_until():
+    return until

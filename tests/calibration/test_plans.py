@@ -1,0 +1,118 @@
+"""Plans are data; planning keeps to the axis's travel and speed."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.errors import InputError
+from hdbridge.procedures.moves import AxisView, MotionLimits
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.procedures.sweep import Sweep
+from hdbridge.yamlfile import document_from_text
+
+WIDE = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
+
+
+def plan_of(procedures: str, more: str = "") -> Plan:
+    text = f"schema: hdbridge.plan/1\nname: own\n{more}procedures:\n{procedures}"
+    return document_from_text(text, "own.yaml").validate(Plan)
+
+
+def sweeps(tasks):
+    return [part for task in tasks.tasks for part in task.procedure.parts if isinstance(part, Sweep)]
+
+
+@pytest.mark.parametrize("name", ["quick", "full"])
+@pytest.mark.parametrize("ratio", [30.0, 50.0, 160.0])
+def test_the_bundled_plans_have_what_a_calibration_needs(name, ratio):
+    tasks = Plan.load(name).tasks(AxisView(ratio, WIDE))
+    found = sweeps(tasks)
+    assert max(each.high_deg - each.low_deg for each in found) == pytest.approx(720)
+    assert len({each.velocity_deg_s for each in found}) >= 2
+    words = " ".join(task.name for task in tasks.tasks)
+    for procedure in ("standstill", "sweep", "sines", "reversals", "stepping", "reference"):
+        assert procedure in words
+
+
+def test_quick_takes_minutes_and_full_does_not():
+    axis = AxisView(50.0, WIDE)
+    quick, full = (
+        sum(rehearse(each.procedure, axis).duration_s for each in Plan.load(name).tasks(axis).tasks)
+        for name in ("quick", "full")
+    )
+    assert quick < 600 < 1800 < full
+
+
+@given(
+    low=st.floats(-1000, 1000),
+    travel=st.floats(8.0, 2000),
+    speed=st.floats(0.5, 100),
+    ratio=st.floats(30, 160),
+    start=st.floats(0, 1),
+)
+def test_no_plan_leaves_the_limits_wherever_it_begins(low, travel, speed, ratio, start):
+    axis = AxisView(ratio, MotionLimits(low, low + travel, speed, 200.0, 4000.0))
+    plan = Plan.load("quick")
+    try:
+        tasks = plan.tasks(axis).tasks
+    except InputError:
+        assert travel * ratio < 2 * (90 + 1.02 * plan.precondition_deg)
+        return
+    begin = low + start * travel
+    for procedure in (*(task.procedure for task in tasks), plan.stepping(axis)):
+        walked = rehearse(procedure, axis, begin)
+        assert low <= walked.lowest_deg
+        assert walked.highest_deg <= low + travel
+
+
+def test_what_is_shortened_is_said():
+    tasks = Plan.load("quick").tasks(AxisView(50.0, MotionLimits(0.0, 100.0, 2.0, 200.0, 4000.0)))
+    (sweep, _) = sweeps(tasks)
+    assert 90 < sweep.high_deg - sweep.low_deg < 100
+    assert sweep.velocity_deg_s <= 2.0
+    notes = " ".join(tasks.notes)
+    assert "02-sweep" in notes
+    assert "720" in notes
+    assert "slowed" in notes
+
+
+def test_every_task_begins_at_the_same_pose_coming_the_same_way():
+    axis = AxisView(50.0, WIDE)
+    for task in Plan.load("quick").tasks(axis).tasks:
+        moves = task.procedure.moves(axis)
+        first = next(moves)
+        second = moves.send(())
+        assert (first.kind, second.kind) == ("precondition", "precondition")
+        assert first.load_deg < second.load_deg == 0.0
+
+
+@pytest.mark.parametrize(
+    ("procedures", "words"),
+    [
+        ("  - {procedure: sweep, load_turns: 2, speed: 1}", ("own.yaml:4", "speed", "unknown key")),
+        ("  - {procedure: sweeep, load_turns: 2}", ("own.yaml:4:17", "expected one of standstill, sweep,")),
+        ("  - {load_turns: 2}", ("own.yaml:4", "no such procedure", "sines")),
+        ("  - {procedure: sweep}", ("load_turns", "motor_turns")),
+        ("  - {procedure: sweep, load_turns: 1, motor_turns: 1}", ("expected one of",)),
+        ("  - {procedure: sines, amplitudes_deg: []}", ("amplitudes_deg",)),
+        ("  - {procedure: stepping, count: 1}", ("count",)),
+        ("  - {procedure: standstill, duration_s: -1}", ("duration_s",)),
+        ("  []", ("procedures",)),
+    ],
+)
+def test_a_wrong_plan_is_refused_with_the_place(procedures, words):
+    with pytest.raises(InputError) as caught:
+        plan_of(procedures)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_a_plan_that_is_not_there_names_those_that_are():
+    with pytest.raises(InputError, match=r"quik: no such plan; .*full, quick; did you mean 'quick'"):
+        Plan.load("quik")
+
+
+def test_a_plan_survives_being_written_into_a_recording():
+    plan = Plan.load("full")
+    assert Plan.model_validate(plan.as_dict()) == plan
