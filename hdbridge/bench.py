@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, Self, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -21,10 +22,10 @@ from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.effects import Channel, Observer, compensable, unmet
-from hdbridge.errors import InputError, TransitionError
+from hdbridge.errors import HdbridgeError, InputError, SafetyStop, TransitionError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
-from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.record import Record
 
 Outcome = TypeVar("Outcome")
@@ -87,8 +88,9 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
 class Bench:
     """A drive in cyclic position mode, with or without compensation.
 
-    As a context manager it enables the drive on entry and, on every way out, brings it to rest and disables
-    it. The compensation is engaged from the start of the first procedure, ramped in.
+    Power is on only while a procedure runs: `run` enables the drive where it stands, and on every way out
+    brings it to rest and disables it, so that there is time for files between two procedures. The
+    compensation is ramped in from the start of each.
     """
 
     def __init__(
@@ -117,11 +119,52 @@ class Bench:
         self._torque_nm = axis.drive.rated_torque_nm / 1000.0
         self._observer = Observer()
         self._place = 0.0
-        self._chunks: list[np.ndarray[tuple[int, int], np.dtype[np.float64]]] = []
+        self._measured: list[list[Sample]] = []
         self._legs: list[Leg] = []
 
-    def __enter__(self) -> Self:
-        """Enable the drive by PDO, standing still."""
+    def run(
+        self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None
+    ) -> Run[Outcome]:
+        """Run one procedure to its end; ``progress`` receives the share done, about ten times a second.
+
+        Refused with InputError, before anything moves, where the procedure would leave the axis's limits.
+        Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
+        record up to then is `record`.
+        """
+        standing_deg = self._drive.read_positions().motor_deg / self.view.ratio
+        rehearsal = rehearse(procedure, self.view, standing_deg)
+        self._measured.clear()
+        self._legs.clear()
+        self._enable()
+        try:
+            outcome = self._walk(procedure, rehearsal, progress)
+        except SafetyStop:
+            raise  # the drive stands, or stops by itself; the latch stays
+        except BaseException:
+            with suppress(HdbridgeError):
+                self._image.power.quick_stop()
+                self._rest()
+            raise
+        self._image.power.go(State.SWITCH_ON_DISABLED)
+        self._rest()
+        return Run(outcome, self.record(), tuple(self._legs))
+
+    def record(self) -> Record:
+        """What the present procedure has measured so far."""
+        # Made into arrays only here: between two legs there is no time for it on a real bus.
+        rows = [sample for samples in self._measured for sample in samples]
+        table = np.array(rows, dtype=np.float64).reshape(-1, len(Sample._fields))
+        columns = dict(zip(Sample._fields, table.T, strict=True))
+        columns.pop("load_target_deg")
+        return Record(columns)
+
+    @property
+    def legs(self) -> tuple[Leg, ...]:
+        """The moves that the present procedure has run so far."""
+        return tuple(self._legs)
+
+    def _enable(self) -> None:
+        """Enable the drive by PDO, standing still, and begin from where it stands."""
         self._drive.enable(Mode.CSP)
         power = self._image.power
         self.cycle.restart()
@@ -135,54 +178,28 @@ class Bench:
                 f"'{power.state.value}'; look at its enable input, its supply and its fault history"
             )
         motor_deg = self._image.motor_deg(feedback.motor_counts)
-        self._compensation.reset(motor_deg)
         self._place = motor_deg / self.view.ratio
         self._observer = Observer()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Bring the axis to rest; what cannot be done here, the drive's own exit sees to."""
-        if self.supervision.stop is None and self._image.power.state is State.OPERATION_ENABLED:
-            self._stop()
-
-    def run(
-        self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None
-    ) -> Run[Outcome]:
-        """Run one procedure to its end; ``progress`` receives the share done, about ten times a second.
-
-        Refused with InputError, before anything moves, where the procedure would leave the axis's limits.
-        Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
-        record up to then is `record`.
-        """
-        rehearsal = rehearse(procedure, self.view, self._place)
-        self._chunks.clear()
-        self._legs.clear()
+        self._compensation.reset(motor_deg)
         self._compensation.engage()
+
+    def _walk(
+        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
+    ) -> Outcome:
+        """The procedure's legs, one after the other; between two there is no time to lose."""
         done_s = 0.0
         steps = procedure.moves(self.view)
-        reply: Sequence[Sample] = ()
         try:
             move = next(steps)
             while True:
                 path = move.path(self._place, self.view.limits)
-                reply = self._leg(move, path)
+                samples = self._leg(move, path)
                 done_s += path.duration_s
                 progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
-                move = steps.send(reply)
+                move = steps.send(samples)
         except StopIteration as end:
-            return Run(end.value, self.record(), tuple(self._legs))
-
-    def record(self) -> Record:
-        """What the present procedure has measured so far."""
-        rows = np.concatenate(self._chunks) if self._chunks else np.empty((0, len(Sample._fields)))
-        columns = dict(zip(Sample._fields, rows.T, strict=True))
-        columns.pop("load_target_deg")
-        return Record(columns)
-
-    @property
-    def legs(self) -> tuple[Leg, ...]:
-        """The moves that the present procedure has run so far."""
-        return tuple(self._legs)
+            outcome: Outcome = end.value
+            return outcome
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
         """One move, cycle by cycle, from where the load target stands."""
@@ -226,22 +243,21 @@ class Bench:
                 )
                 self._place = target_deg
                 if interrupted():
-                    self._stop()
                     raise KeyboardInterrupt
                 if elapsed_s >= duration_s and move.ended(samples):
                     return samples
                 elapsed_s += period_s
         finally:
             if samples:
-                self._chunks.append(np.array(samples, dtype=np.float64))
+                self._measured.append(samples)
                 self._legs.append(Leg(move.kind, samples[0].time_s, samples[-1].time_s))
 
-    def _stop(self) -> None:
-        """Quick stop and wait for the drive to stand, as well as the bus allows."""
+    def _rest(self) -> None:
+        """Wait for the drive to stand with power off or in quick stop, then disable it."""
         power = self._image.power
-        power.quick_stop()
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
             before = self._image.motor_counts
             self.cycle.tick()
             if power.state in _STANDING and abs(self._image.motor_counts - before) <= 1:
-                return
+                break
+        self._drive.disable()

@@ -49,9 +49,8 @@ def compare_schemes(
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme in schemes:
         compensation = compensation_for(drive.axis, scheme.of(model))
-        with Bench(drive, compensation, interrupted=interrupted) as bench:
-            runs[scheme] = bench.run(stepping, partial(progress, scheme))
-        drive.disable()
+        bench = Bench(drive, compensation, interrupted=interrupted)
+        runs[scheme] = bench.run(stepping, partial(progress, scheme))
         finished(scheme, runs[scheme])
     floor = quantisation_floor_arcsec(drive.axis.motor_encoder.counts_per_turn, drive.axis.gear.ratio)
     return Comparison({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)

@@ -52,7 +52,7 @@ class TransitionError(DriveError):
     """A CiA-402 transition is not allowed in the present state, or did not come about in time."""
 
 
-class SafetyStop(HdbridgeError):
+class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
     """The supervision stopped the axis while it ran; the stop is latched until an explicit reset."""
 
     exit_status = 5

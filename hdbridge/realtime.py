@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from typing import Final
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PRIORITY: Final = 50
 """SCHED_FIFO priority: above ordinary work, below the kernel's own interrupt threads (50 on PREEMPT_RT)."""
+
+SWITCH_INTERVAL_S: Final = 0.0002
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,9 @@ def prepare_realtime(priority: int = PRIORITY) -> Iterator[Realtime]:
     take a whole processor from everything else.
     """
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
-    collecting = gc.isenabled()
+    collecting, switching_s = gc.isenabled(), sys.getswitchinterval()
+    # Another thread (a progress bar's) gives the interpreter back within this time when the loop wakes up.
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         scheduling = None
@@ -65,6 +70,7 @@ def prepare_realtime(priority: int = PRIORITY) -> Iterator[Realtime]:
     try:
         yield Realtime(scheduling, memory)
     finally:
+        sys.setswitchinterval(switching_s)
         gc.unfreeze()
         if collecting:
             gc.enable()

@@ -116,20 +116,19 @@ def measure(
     if not left.tasks:
         return
     pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
-    with Bench(drive, interrupted=pace.interrupted) as bench:
-        journal.begin_session()
-        for task in left.tasks:
-            pace.begin(task.name)
-            try:
-                run = bench.run(task.procedure)
-            except InputError:
-                raise  # refused before anything moved
-            except (HdbridgeError, KeyboardInterrupt):
-                with suppress(OSError):
-                    journal.add(task.name, bench.record(), bench.legs, complete=False)
-                raise
-            journal.add(task.name, run.record, run.legs, complete=True)
-    drive.disable()
+    bench = Bench(drive, interrupted=pace.interrupted)
+    journal.begin_session()
+    for task in left.tasks:
+        pace.begin(task.name)
+        try:
+            run = bench.run(task.procedure)
+        except InputError:
+            raise  # refused before anything moved
+        except (HdbridgeError, KeyboardInterrupt):
+            with suppress(OSError):
+                journal.add(task.name, bench.record(), bench.legs, complete=False)
+            raise
+        journal.add(task.name, run.record, run.legs, complete=True)
 
 
 def identity_of(drive: Drive) -> Identity:

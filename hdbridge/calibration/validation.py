@@ -169,9 +169,7 @@ def validate(
         compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
         bench = Bench(drive, compensation, interrupted=pace.interrupted)
         try:
-            with bench:
-                run = bench.run(stepping)
-            drive.disable()
+            run = bench.run(stepping)
         finally:
             if len(bench.record()):
                 folder.mkdir(parents=True, exist_ok=True)

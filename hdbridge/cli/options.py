@@ -20,6 +20,7 @@ from hdbridge.bundled import bundled_profile
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
+from hdbridge.realtime import prepare_realtime
 from hdbridge.sim.lockstep import simulated_bench
 
 console = Console(highlight=False)
@@ -95,7 +96,8 @@ def connected(
     if not simulate:
         if truth is not None:
             raise InputError("--truth says what a simulated axis is like: give --simulate with it")
-        with open_bus(axis.bus) as bus:
+        with prepare_realtime() as conditions, open_bus(axis.bus) as bus:
+            notes.print(f"{conditions}")
             yield bus, MonotonicClock()
         return
     with simulated_bench(truth or profile.truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
@@ -113,7 +115,7 @@ def progress_bar() -> Iterator[Progress]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=notes) as progress:
+    with Progress(*columns, console=notes, refresh_per_second=4) as progress:
         yield progress
 
 

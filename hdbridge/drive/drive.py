@@ -25,6 +25,7 @@ from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient, load_eds
 from hdbridge.drive.states import Command, State, decode, row_for
+from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, TransitionError
 
 if TYPE_CHECKING:
@@ -116,6 +117,7 @@ class Drive:
         if mode is not Mode.HM:
             # Homing is the way back from there, so it is not refused.
             self._check_within_limits(positions)
+        self._expect_master(True)
         self._commander.set_mode(mode)
         self._mode = mode
         motor_counts = self._commander.preload_target()
@@ -135,6 +137,7 @@ class Drive:
             self._commander.wait_for_standstill()
         if self._commander.state() not in _OFF:
             self._commander.walk(State.SWITCH_ON_DISABLED)
+        self._expect_master(False)
         self._mode = None
 
     def fault_reset(self) -> None:
@@ -264,6 +267,15 @@ class Drive:
         if error is None:
             raise DriveError(warning)
         error.add_note(warning)
+
+    def _expect_master(self, expected: bool) -> None:
+        """Have the drive watch the master's heartbeat while power may be on, and only then.
+
+        Without power nothing can move, and the master may be busy with files. A drive begins to watch with
+        the first heartbeat that it hears after this object was written.
+        """
+        if self.sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
+            self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)
 
     def _power_off(self) -> None:
         quick = SdoClient(

@@ -100,6 +100,11 @@ def _row(
     return PlannedWrite(axis.drive.node_id, address.index, address.sub, value, why, field), optional
 
 
+def master_heartbeat(axis: AxisConfig) -> int:
+    """Value of 1016h: whose heartbeat the drive watches, and for how long it may stay away."""
+    return axis.drive.master_node_id << 16 | axis.drive.heartbeat_ms
+
+
 def _heartbeats(axis: AxisConfig) -> Iterator[_Row]:
     ms = axis.drive.heartbeat_ms
     field = "drive.heartbeat_ms"
@@ -107,7 +112,7 @@ def _heartbeats(axis: AxisConfig) -> Iterator[_Row]:
     yield _row(
         axis,
         objects.HEARTBEAT_CONSUMER,
-        axis.drive.master_node_id << 16 | ms,
+        master_heartbeat(axis),
         f"the drive stops by itself when node {axis.drive.master_node_id}, the master, is silent for {ms} ms",
         field,
         optional=True,

@@ -29,6 +29,8 @@ PDO_COUNT: Final = 4
 LONGEST_CATCH_UP_S: Final = 1.0
 """A node that was not polled for longer than this does not make up for it."""
 
+FRAMES_PER_POLL: Final = 64
+
 _NEVER: Final = float("inf")
 _HEARTBEAT: Final = 0x700
 
@@ -149,12 +151,16 @@ class SimulatedDrive:
     # ---------------------------------------------------------------- the outside
 
     def poll(self, now_s: float) -> None:
-        """Take in all frames that have come, answer them, and do what is due until ``now_s``."""
+        """Take in the frames that have come, answer them, and do what is due until ``now_s``."""
         self._now_s = now_s
         if self.nmt is Nmt.INITIALISING:
             self._boot()
         receive = self.bus.recv
-        while (message := receive(0)) is not None:
+        # Bounded, because `now_s` stands still meanwhile: under a flood of frames the heartbeat must go on.
+        for _ in range(FRAMES_PER_POLL):
+            message = receive(0)
+            if message is None:
+                break
             self.handle(message, now_s)
         self.run_until(now_s)
 

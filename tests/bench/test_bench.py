@@ -76,19 +76,38 @@ def test_with_both_parts_the_axis_points_to_within_the_floor(axis, model, bench_
     assert none.ccw.mean_arcsec == pytest.approx(-40, abs=4)
 
 
-def test_enabling_moves_nothing_and_leaving_disables(axis, bench_on):
+def test_power_is_on_only_while_a_procedure_runs_and_switching_moves_nothing(axis, bench_on):
     drive, node = bench_on
-    with Bench(drive):
-        assert drive.image.power.state is State.OPERATION_ENABLED
-        assert abs(motor_deg(node, axis)) < 0.01
-    drive.close()
+    states = []
+
+    class Watched(Moves):
+        def moves(self, axis):
+            yield from super().moves(axis)
+            states.append(drive.image.power.state)
+
+    run = Bench(drive).run(Watched(Dwell(0.2)))
+    assert states[-1] is State.OPERATION_ENABLED
     assert node.firmware.statusword() & 0x6F == 0x40
+    assert np.ptp(run.record.columns["motor_position_deg"]) < 0.01
+    assert abs(motor_deg(node, axis)) < 0.01
+
+
+def test_there_is_time_between_two_procedures(axis, bench_on):
+    """A pause without heartbeats (files are written, say) is no fault while power is off."""
+    drive, _ = bench_on
+    bench = Bench(drive)
+    bench.run(Moves(MoveTo(1.0)))
+    drive.link.clock.sleep_until(drive.link.clock.now() + 5.0)
+    assert bench.run(Moves(MoveTo(2.0), Dwell(0.1))).record.columns["motor_target_deg"][-1] == pytest.approx(
+        100.0, abs=0.05
+    )
+    assert not any(bench.supervision.counts.values())
 
 
 def test_the_record_has_what_was_commanded_and_measured(axis, bench_on):
     drive, _ = bench_on
-    with Bench(drive) as bench:
-        run = bench.run(Moves(MoveTo(1.0), Dwell(0.2), MoveTo(0.0), Dwell(0.2)))
+    bench = Bench(drive)
+    run = bench.run(Moves(MoveTo(1.0), Dwell(0.2), MoveTo(0.0), Dwell(0.2)))
     record = run.record
     assert [leg.kind for leg in run.legs] == ["move", "standstill", "move", "standstill"]
     assert np.allclose(np.diff(record.columns["time_s"]), axis.drive.cycle_s)
@@ -101,8 +120,8 @@ def test_the_record_has_what_was_commanded_and_measured(axis, bench_on):
 
 def test_a_procedure_outside_the_limits_moves_nothing(axis, bench_on):
     drive, node = bench_on
-    with Bench(drive) as bench, pytest.raises(InputError, match="nothing was moved"):
-        bench.run(Moves(MoveTo(1.0), MoveTo(401.0)))
+    with pytest.raises(InputError, match="nothing was moved"):
+        Bench(drive).run(Moves(MoveTo(1.0), MoveTo(401.0)))
     assert abs(motor_deg(node, axis)) < 0.01
 
 
@@ -115,7 +134,8 @@ def test_an_interrupt_stops_the_axis_and_keeps_the_record(axis, bench_on):
         cycles += 1
         return cycles == 100
 
-    with pytest.raises(KeyboardInterrupt), Bench(drive, interrupted=interrupted) as bench:
+    bench = Bench(drive, interrupted=interrupted)
+    with pytest.raises(KeyboardInterrupt):
         bench.run(Moves(MoveTo(10.0)))
     assert len(bench.record()) == 100
     there = motor_deg(node, axis)
@@ -126,21 +146,21 @@ def test_an_interrupt_stops_the_axis_and_keeps_the_record(axis, bench_on):
 
 def test_one_lost_tpdo_freezes_the_correction_and_two_stop_the_axis(axis, model, bench_on):
     drive, node = bench_on
-    with Bench(drive, compensation_for(axis, model)) as bench:
-        bench.run(Moves(MoveTo(1.0)))
-        node.faults.drop_tpdos = 1
-        bench.run(Moves(Dwell(0.1)))
-        assert bench.supervision.counts[Fault.LOST_TPDO] == 1
-        node.faults.drop_tpdos = 4
-        with pytest.raises(SafetyStop, match="a TPDO is missing"):
-            bench.run(Moves(MoveTo(5.0)))
+    bench = Bench(drive, compensation_for(axis, model))
+    bench.run(Moves(MoveTo(1.0)))
+    node.faults.drop_tpdos = 1
+    bench.run(Moves(Dwell(0.1)))
+    assert bench.supervision.counts[Fault.LOST_TPDO] == 1
+    node.faults.drop_tpdos = 4
+    with pytest.raises(SafetyStop, match="a TPDO is missing"):
+        bench.run(Moves(MoveTo(5.0)))
     assert motor_deg(node, axis) < 100
 
 
 def test_switching_the_compensation_on_does_not_jump(axis, model, bench_on):
     drive, _ = bench_on
-    with Bench(drive, compensation_for(axis, model)) as bench:
-        run = bench.run(Moves(Dwell(1.0)))
+    bench = Bench(drive, compensation_for(axis, model))
+    run = bench.run(Moves(Dwell(1.0)))
     demand = run.record.columns["motor_target_deg"]
     # The ramp takes 0.5 s to bring in a correction of about a dozen arcseconds at the load.
     assert np.abs(np.diff(demand)).max() < 0.1
@@ -153,8 +173,8 @@ def test_sines_run_and_repeat_bit_for_bit(axis, model):
             Drive(bus, axis, clock) as drive,
         ):
             drive.boot()
-            with Bench(drive, compensation_for(axis, model)) as bench:
-                return bench.run(Sines(amplitudes_deg=(5.0,), frequency_hz=1.0)).record
+            bench = Bench(drive, compensation_for(axis, model))
+            return bench.run(Sines(amplitudes_deg=(5.0,), frequency_hz=1.0)).record
 
     first, second = once(), once()
     for name, column in first.columns.items():

@@ -37,10 +37,10 @@ def main() -> None:
             Drive(bus, axis, clock) as drive,
         ):
             drive.boot()
-            with Bench(drive, compensation_for(axis, model)) as bench:
-                began, axis_began = time.perf_counter(), clock.now()
-                run = bench.run(Stepping(count=options.count))
-                wall, axis_time = time.perf_counter() - began, clock.now() - axis_began
+            bench = Bench(drive, compensation_for(axis, model))
+            began, axis_began = time.perf_counter(), clock.now()
+            run = bench.run(Stepping(count=options.count))
+            wall, axis_time = time.perf_counter() - began, clock.now() - axis_began
         whole.append(wall / axis_time)
         targets = (run.record.columns["motor_target_deg"] * axis.motor_encoder.counts_per_turn / 360).tolist()
         machine = Machine(truth, block)

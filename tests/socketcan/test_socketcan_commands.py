@@ -1,0 +1,34 @@
+"""The stepping test as a person runs it: two commands, two processes, one real CAN interface."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+
+
+def test_step_masters_the_simulated_drive_in_another_process(interface, tmp_path):
+    bus = ("--interface", "socketcan", "--channel", interface)
+    result = tmp_path / "stepping.json"
+    simulate = [sys.executable, "-m", "hdbridge", "simulate", str(PROFILE), *bus]
+    step = [sys.executable, "-m", "hdbridge", "step", str(PROFILE), *bus, "--json", str(result)]
+    with subprocess.Popen(simulate, stderr=subprocess.PIPE, text=True) as drive:
+        try:
+            assert "simulated drive: node 1" in drive.stderr.readline()
+            done = subprocess.run(
+                [*step, "--count", "4", "--scheme", "none", "--scheme", "both"],
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+        finally:
+            drive.terminate()
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(result.read_text())
+    assert figures["none"]["cw"]["mean_arcsec"] > 30
+    assert figures["none"]["ccw"]["mean_arcsec"] < -30
+    assert abs(figures["both"]["cw"]["mean_arcsec"]) < 3
+    assert abs(figures["both"]["ccw"]["mean_arcsec"]) < 3
+    assert figures["both"]["pooled"]["three_sigma_arcsec"] < 5
