@@ -1,0 +1,239 @@
+"""The checks under power: enable at rest, a nudge, a motor turn each way, and the ways in which it stops."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from hdbridge.bringup.checks import Verdict, failed, not_possible, passed
+from hdbridge.bringup.judge import (
+    judge_following,
+    judge_hold,
+    judge_nudge,
+    judge_settling,
+    judge_stop,
+    judge_torque,
+)
+from hdbridge.bringup.patient import Patient
+from hdbridge.bringup.scale import Turned, judge_turn
+from hdbridge.bringup.slow import Silence, SlowAxis, TravelPlan, plan_travel
+from hdbridge.drive import objects
+from hdbridge.drive.states import State, decode
+from hdbridge.drive.supervision import Fault
+from hdbridge.errors import InputError
+
+NUDGE_DEG: Final = 2.0
+HOLD_S: Final = 0.5
+BACK_FROM_DEG: Final = 60.0
+SETTLE_S: Final = 0.8
+_NOT_MOVED: Final = "the motor turn was not finished"
+_OFF: Final = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON)
+_DRIVES_DOING: Final = frozenset(
+    {Fault.DROPPED_OUT, Fault.DRIVE_FAULT, Fault.NMT_CHANGE, Fault.LOST_TPDO, Fault.EMERGENCY}
+)
+"""What a drive that stops by itself looks like to the master's supervision."""
+
+
+def hold(patient: Patient) -> Verdict:
+    """Power comes, the axis stays where it is."""
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        positions = patient.drive.read_positions()
+        with slow.enabled() as first:
+            seen = [first, *slow.sit(HOLD_S)]
+    return judge_hold(
+        patient.axis,
+        Turned(positions.motor_counts, positions.load_counts),
+        [Turned(each.motor_counts, each.load_counts) for each in seen],
+    )
+
+
+def nudge(patient: Patient) -> Verdict:
+    """Two degrees of the motor, forth and back."""
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        with slow.enabled():
+            way = _plan(patient, slow)
+            patient.began_deg = slow.place_deg
+            step = NUDGE_DEG if way.span_deg > 0 else -NUDGE_DEG
+            begin, start_deg = slow.stand(), slow.place_deg
+            slow.travel(start_deg + step)
+            there = slow.stand()
+            slow.travel(start_deg)
+            back = slow.stand()
+    return judge_nudge(
+        patient.axis,
+        patient.axis.motor_encoder.counts(step),
+        there.motor_counts - begin.motor_counts,
+        back.motor_counts - there.motor_counts,
+    )
+
+
+def turn(patient: Patient) -> Verdict:
+    """A turn of the motor each way: which way and how far both encoders go."""
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        with slow.enabled():
+            way, start_deg = _plan(patient, slow), slow.place_deg
+            slow.travel(start_deg + way.lead_deg)
+            near = slow.stand()
+            patient.out = slow.travel(start_deg + way.lead_deg + way.span_deg)
+            patient.rest_begins = len(patient.out)
+            patient.out += slow.sit(SETTLE_S)
+            far = slow.stand()
+            slow.travel(start_deg + way.span_deg)
+            turned_back = slow.stand()
+            slow.travel(start_deg)
+            home = slow.stand()
+    return judge_turn(
+        patient.axis, _between(near, far), _between(turned_back, home), frozenset(patient.confirmed)
+    )
+
+
+def following(patient: Patient) -> Verdict:
+    """The following error of that move."""
+    if not patient.out:
+        return not_possible(_NOT_MOVED)
+    return judge_following(patient.axis, [each.demand_counts - each.motor_counts for each in patient.out])
+
+
+def torque(patient: Patient) -> Verdict:
+    """The torque of that move."""
+    if not patient.out:
+        return not_possible(_NOT_MOVED)
+    limit = min(patient.torque_percent, patient.axis.limits.torque_percent)
+    return judge_torque(patient.axis, [each.torque_permille for each in patient.out], limit)
+
+
+def settling(patient: Patient) -> Verdict:
+    """How the load came to rest after it."""
+    if len(patient.out) <= patient.rest_begins:
+        return not_possible(_NOT_MOVED)
+    resting = [each.load_counts for each in patient.out[patient.rest_begins :]]
+    return judge_settling(patient.axis, resting, patient.axis.drive.cycle_s, patient.noise_arcsec)
+
+
+def quick_stop(patient: Patient) -> Verdict:
+    """A quick stop in slow motion: way, time, and the state after it."""
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        with slow.enabled():
+            speed, distance, time_s = slow.stop_on_the_way(_far_from(patient, slow))
+            state = slow.image.power.state
+    axis = patient.axis
+    verdict = judge_stop(axis, speed, distance, time_s, f"'{state.value}'", 0.0)
+    option = axis.drive.quick_stop_option
+    expected = State.QUICK_STOP_ACTIVE if option >= 5 else State.SWITCH_ON_DISABLED
+    if state is not expected:
+        return failed(
+            verdict.measured,
+            f"{axis.where('drive.quick_stop_option')}: found {option}, after which '{expected.value}' is "
+            f"expected, but the drive is in '{state.value}'; see its manual for 605Ah",
+            **verdict.figures,
+        )
+    return verdict
+
+
+def heartbeat(patient: Patient) -> Verdict:
+    """The master's heartbeat stays away in slow motion: the drive has to stop by itself."""
+    axis, sdo = patient.axis, patient.drive.sdo
+    has_timer = sdo.has(objects.RPDO_COMMUNICATION, 5)
+    if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
+        if has_timer:
+            return not_possible("the drive watches no heartbeat (no 1016h); its RPDO event timer has to do")
+        return failed(
+            "the drive has neither a heartbeat consumer (1016h) nor an RPDO event timer (1400h:05)",
+            f"nothing stops this axis when its master dies; if the drive does have them, "
+            f"{axis.where('drive.eds')} is not its EDS",
+        )
+    beat_s = axis.drive.heartbeat_ms / 1000.0
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        with slow.enabled():
+            speed, silence = slow.lose_heartbeat(_far_from(patient, slow), 3.0 * beat_s + 0.2)
+    if silence.event is not None and silence.event.fault not in _DRIVES_DOING:
+        return failed(f"disturbed: {silence.event}", "remove the cause and check again")
+    return _judge_silence(
+        patient,
+        silence,
+        speed,
+        "heartbeat",
+        beat_s,
+        f"the drive ignores that its master is silent: {axis.where('drive.heartbeat_ms')} "
+        f"({axis.drive.heartbeat_ms} ms) was written to 1016h; check 6007h and 1029h in the drive's manual, "
+        "and that the drive has no other setting that disables the reaction",
+    )
+
+
+def set_points(patient: Patient) -> Verdict:
+    """SYNC and set-points stay away in slow motion while the heartbeat goes on: the drive has to stop."""
+    axis, sdo = patient.axis, patient.drive.sdo
+    if not sdo.has(objects.RPDO_COMMUNICATION, 5):
+        return not_possible("the drive has no RPDO event timer (1400h:05); its heartbeat consumer has to do")
+    timer_s = sdo.read(objects.RPDO_COMMUNICATION, 5) / 1000.0
+    with patient.interruptible() as interrupted:
+        slow = patient.slow(interrupted)
+        with slow.enabled():
+            speed, silence = slow.lose_set_points(_far_from(patient, slow), 3.0 * timer_s + 0.2)
+    return _judge_silence(
+        patient,
+        silence,
+        speed,
+        "SYNC and set-points",
+        timer_s,
+        f"the drive ignores that no set-point comes: {axis.where('drive.cycle_ms')} decides its RPDO event "
+        "timer (1400h:05); check it and 6007h in the drive's manual",
+    )
+
+
+def switched_off(patient: Patient) -> Verdict:
+    """It boots again after all that, and is left switched off."""
+    drive = patient.boot()
+    word = drive.sdo.fetch(objects.STATUSWORD)
+    state = decode(word)
+    text = f"boots again; '{state.value}' (statusword {word:04X}h)"
+    if state in _OFF:
+        return passed(text)
+    return failed(text, "switch the drive off by its enable input and look at its error display")
+
+
+def _plan(patient: Patient, slow: SlowAxis) -> TravelPlan:
+    way = plan_travel(patient.axis, slow.place_deg)
+    if way is None:
+        where = patient.axis.where("limits.position_min_deg")
+        raise InputError(
+            f"the axis stands at {slow.place_deg / patient.axis.gear.ratio:.4g} deg and has no room to move "
+            f"within {where} and position_max_deg; turn it away from its limits, or home it"
+        )
+    return way
+
+
+def _far_from(patient: Patient, slow: SlowAxis) -> float:
+    """Where to move to for a stop on the way: back to where the axis stood at first, or away from there."""
+    if abs(slow.place_deg - patient.began_deg) > BACK_FROM_DEG:
+        return patient.began_deg
+    return slow.place_deg + _plan(patient, slow).span_deg
+
+
+def _between(start: Turned, end: Turned) -> Turned:
+    return Turned(end.motor_counts - start.motor_counts, end.load_counts - start.load_counts)
+
+
+def _judge_silence(
+    patient: Patient, silence: Silence, speed: float, what: str, after_s: float, remedy: str
+) -> Verdict:
+    state = decode(silence.statusword)
+    still_on = state is State.OPERATION_ENABLED
+    if silence.noticed_after_s is None or still_on or not silence.stands:
+        return failed(
+            f"no {what} in motion at {speed:.3g} motor deg/s: the drive goes on, '{state.value}'",
+            remedy,
+            reacted=False,
+        )
+    return judge_stop(
+        patient.axis,
+        speed,
+        silence.distance_deg,
+        silence.noticed_after_s,
+        f"no {what}: '{state.value}' by itself",
+        2.0 * after_s + 0.05,
+    )

@@ -1,0 +1,103 @@
+"""What the checks of a bring-up work on: the axis file, the bus, the drive, and what was found so far."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+from hdbridge.bringup.slow import SlowAxis
+from hdbridge.clock import Clock
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.states import State
+
+if TYPE_CHECKING:
+    import can
+    from canopen.objectdictionary import ObjectDictionary
+
+    from hdbridge.axis import AxisConfig
+    from hdbridge.cycle import Feedback
+
+Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]
+"""Opens an axis's bus and gives the clock that goes with it."""
+Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
+"""A block in which an interrupt is only a wish, which the yielded function tells."""
+
+TORQUE_PERCENT: Final = 50.0
+
+
+class Patient:
+    """One axis under examination; a context manager that leaves the drive off and the bus closed.
+
+    ``load`` reads the axis file, ``connect`` opens its bus: both are checks, so they come as functions.
+    ``torque_percent`` limits every motion, of the rated torque, besides the axis file's own limit.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[], AxisConfig],
+        connect: Connect,
+        *,
+        torque_percent: float = TORQUE_PERCENT,
+        interruptible: Interruptible = lambda: nullcontext(lambda: False),
+    ) -> None:
+        self.load = load
+        self.torque_percent = torque_percent
+        self.interruptible = interruptible
+        self.began_deg = 0.0
+        """Motor angle at which the axis stood before it was moved."""
+        self.noise_arcsec = 0.0
+        """Of the load encoder at rest."""
+        self.confirmed: set[str] = set()
+        """Keys of the axis file that the drive's own objects confirm."""
+        self.out: list[Feedback] = []
+        """Feedback of the long move forth, and of the stand at its end."""
+        self.rest_begins = 0
+        self._connect = connect
+        self._stack = ExitStack()
+        self._axis: AxisConfig | None = None
+        self._od: ObjectDictionary | None = None
+        self._drive: Drive | None = None
+
+    def __enter__(self) -> Self:
+        """Nothing is opened yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the drive switched off, close the bus."""
+        self._stack.__exit__(kind, error, trace)
+
+    def admit(self, axis: AxisConfig, od: ObjectDictionary) -> None:
+        """The axis file and the EDS have been read."""
+        self._axis, self._od = axis, od
+
+    def connect(self) -> None:
+        """Open the bus. Raises `BusError`."""
+        bus, clock = self._stack.enter_context(self._connect(self.axis))
+        self._drive = self._stack.enter_context(Drive(bus, self.axis, clock, self._od))
+
+    @property
+    def axis(self) -> AxisConfig:
+        """The axis file."""
+        assert self._axis is not None, "checks that need the files come after them"
+        return self._axis
+
+    @property
+    def drive(self) -> Drive:
+        """The drive, not necessarily booted."""
+        assert self._drive is not None, "checks that need the bus come after it"
+        return self._drive
+
+    def boot(self) -> Drive:
+        """The drive, booted anew and switched off, a fault of an earlier check reset."""
+        report = self.drive.boot()
+        if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            self.drive.fault_reset()
+        return self.drive
+
+    def slow(self, interrupted: Callable[[], bool]) -> SlowAxis:
+        """The axis for slow motion, freshly booted and still switched off."""
+        return SlowAxis(self.boot(), self.torque_percent, interrupted)

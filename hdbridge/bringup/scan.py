@@ -1,0 +1,237 @@
+"""What answers on a CAN bus. It listens first, then asks each node id, and writes nothing.
+
+Only SDO read requests are sent (and an SDO abort where one was not answered). A node that somebody else is
+talking to by SDO is left alone: a second client on the same channel would spoil the other's transfer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from hdbridge.drive import objects
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.nameplate import IDENTITY
+from hdbridge.drive.objects import Address, IntegerType, Mode, NmtState
+from hdbridge.drive.sdo import SdoAbortError, SdoClient
+from hdbridge.errors import SdoError
+
+LISTEN_S: Final = 1.0
+ASK_TIMEOUT_S: Final = 0.02
+"""Time for the first answer; a node that has answered once gets `DETAIL_TIMEOUT_S` for the rest."""
+DETAIL_TIMEOUT_S: Final = 0.3
+NODE_IDS: Final = range(1, 128)
+
+PROFILES: Final[dict[int, str]] = {
+    401: "input/output module",
+    402: "drive",
+    404: "measuring device or controller",
+    406: "encoder",
+    408: "hydraulic drive",
+    410: "inclinometer",
+    418: "battery",
+    419: "battery charger",
+}
+"""Device profiles of CiA, as the low half of object 1000h names them."""
+MODES: Final[dict[int, str]] = {
+    0: "PP", 1: "VL", 2: "PV", 3: "TQ", 5: "HM", 6: "IP", 7: "CSP", 8: "CSV", 9: "CST",
+}  # fmt: skip
+"""Bits of 6502h and the modes of operation that they stand for."""
+_NAMES: Final = ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software"))
+_SCALING: Final = (
+    objects.ENCODER_INCREMENTS,
+    objects.ENCODER_REVOLUTIONS,
+    objects.GEAR_MOTOR,
+    objects.GEAR_SHAFT,
+    objects.RATED_TORQUE,
+    *objects.additional_resolution(1),
+)
+ENCODER_UNITS_PER_TURN: Final = Address(0x6001, 0, IntegerType.UINT32, "measuring units per revolution")
+"""CiA 406."""
+
+
+@dataclass(slots=True)
+class Node:
+    """One node as far as it showed itself."""
+
+    node_id: int
+    nmt_state: int | None = None
+    """Byte of its last heartbeat; None where it sends none."""
+    answers: bool = False
+    """Whether it answered an SDO request."""
+    busy: bool = False
+    """Another SDO client was talking to it, so it was not asked."""
+    device_type: int | None = None
+    identity: dict[str, int] = field(default_factory=dict)
+    """Keys of ``drive.identity``; what the node lacks is left out."""
+    names: dict[str, str] = field(default_factory=dict)
+    """Device name, hardware and software version."""
+    modes: int | None = None
+    """Object 6502h of a drive."""
+    values: dict[Address, int] = field(default_factory=dict)
+    """Objects that help to write an axis file: resolutions, gear ratio, rated torque."""
+
+    @property
+    def profile(self) -> int | None:
+        """Device profile, 402 for a drive; None where it is not known."""
+        return None if self.device_type is None else self.device_type & 0xFFFF
+
+    @property
+    def kind(self) -> str:
+        """What it is, in words."""
+        if self.profile is None:
+            return "not asked: another SDO client is talking to it" if self.busy else "unknown"
+        return (
+            f"{PROFILES.get(self.profile, 'device')} (CiA {self.profile})" if self.profile else "no profile"
+        )
+
+    @property
+    def state(self) -> str:
+        """NMT state in words."""
+        if self.nmt_state is None:
+            return "no heartbeat; it answers, so it is not stopped" if self.answers else "no heartbeat"
+        try:
+            return NmtState(self.nmt_state).name.lower().replace("_", "-")
+        except ValueError:
+            return f"unknown state {self.nmt_state:02X}h"
+
+    @property
+    def mode_names(self) -> list[str]:
+        """Supported modes of operation of a drive."""
+        return [name for bit, name in MODES.items() if (self.modes or 0) >> bit & 1]
+
+    @property
+    def usable(self) -> bool:
+        """A CiA-402 drive with cyclic synchronous position."""
+        return self.profile == objects.DEVICE_PROFILE_402 and bool((self.modes or 0) & Mode.CSP.supported_bit)
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """What a scan found."""
+
+    nodes: tuple[Node, ...]
+    remarks: tuple[str, ...] = ()
+    """What else was heard that matters: other masters, other SDO clients."""
+
+    def node(self, node_id: int) -> Node | None:
+        """The node with that id, where one was seen."""
+        return next((each for each in self.nodes if each.node_id == node_id), None)
+
+
+class _Ear:
+    """Takes every frame that comes and notes whose it is."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.monitor = NetworkMonitor(*NODE_IDS)
+        self.spoken: set[int] = set()
+        """Nodes of which any frame was heard."""
+        self.busy: set[int] = set()
+        self.syncs = 0
+        self.commands = 0
+
+    def take(self, frame: Frame) -> None:
+        can_id, node_id = frame.can_id, frame.can_id & 0x7F
+        function = can_id - node_id
+        if self.monitor.dispatch(frame):
+            self.spoken.add(node_id)
+        elif can_id == objects.COB_SYNC:
+            self.syncs += 1
+        elif can_id == objects.COB_NMT:
+            self.commands += 1
+        elif function in (objects.COB_SDO_REQUEST, objects.COB_SDO_ANSWER) and node_id:
+            self.busy.add(node_id)
+
+    def listen(self, duration_s: float) -> None:
+        end_s = self.link.now() + duration_s
+        while (frame := self.link.recv(end_s)) is not None:
+            self.take(frame)
+            if frame.time_s >= end_s:
+                return
+
+    def remarks(self) -> list[str]:
+        remarks = []
+        if self.syncs:
+            remarks.append(
+                f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
+                "master an axis here"
+            )
+        if self.commands:
+            remarks.append(f"{self.commands} NMT commands of another master were heard")
+        if self.busy:
+            who = ", ".join(map(str, sorted(self.busy)))
+            remarks.append(
+                f"another SDO client is talking to node {who}; it was not asked: stop that client, scan again"
+            )
+        return remarks
+
+
+def scan_bus(
+    link: Link,
+    *,
+    listen_s: float = LISTEN_S,
+    timeout_s: float = ASK_TIMEOUT_S,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Scan:
+    """Listen for ``listen_s``, then ask every node id for its device type, and those that answer for more.
+
+    ``progress`` receives the share done. Raises `BusError` when the interface fails.
+    """
+    ear = _Ear(link)
+    ear.listen(listen_s)
+    nodes: dict[int, Node] = {}
+    for place, node_id in enumerate(NODE_IDS):
+        if node_id in ear.busy:
+            nodes[node_id] = Node(node_id, busy=True)
+        else:
+            node = _ask(ear, node_id, timeout_s)
+            if node.answers:
+                nodes[node_id] = node
+        progress((place + 1) / len(NODE_IDS))
+    for node_id, status in ear.monitor.nodes.items():
+        if status.heartbeat_s is not None or status.emergency_count:
+            nodes.setdefault(node_id, Node(node_id)).nmt_state = status.nmt_state
+    return Scan(tuple(nodes[each] for each in sorted(nodes)), tuple(ear.remarks()))
+
+
+def _ask(ear: _Ear, node_id: int, timeout_s: float) -> Node:
+    node = Node(node_id)
+    sdo = SdoClient(ear.link, ear.monitor, node_id, None, timeout_s, attempts=1)
+    try:
+        node.device_type = sdo.fetch(objects.DEVICE_TYPE)
+    except SdoAbortError:
+        pass  # it is there and refuses the one object that every node has
+    except SdoError:
+        return node
+    node.answers = True
+    sdo = SdoClient(ear.link, ear.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
+    for address, name in IDENTITY:
+        value = _fetch(sdo, address)
+        if value is not None:
+            node.identity[name] = value
+    for index, name in _NAMES:
+        try:
+            node.names[name] = sdo.read_text(index)
+        except SdoError:
+            continue
+    wanted: tuple[Address, ...] = ()
+    if node.profile == objects.DEVICE_PROFILE_402:
+        node.modes = _fetch(sdo, objects.SUPPORTED_MODES)
+        wanted = _SCALING
+    elif node.profile == 406:
+        wanted = (ENCODER_UNITS_PER_TURN,)
+    for address in wanted:
+        value = _fetch(sdo, address)
+        if value is not None:
+            node.values[address] = value
+    return node
+
+
+def _fetch(sdo: SdoClient, address: Address) -> int | None:
+    try:
+        return sdo.read(address.index, address.sub, address.type)
+    except SdoError:
+        return None  # not every node has it

@@ -1,0 +1,336 @@
+"""Slow, short, torque-limited motion of an axis that is not trusted yet, in raw encoder counts.
+
+Each `enabled` block switches power on at rest and, on every way out, brings the axis to rest and switches it
+off again. Everything runs in the control cycle with all its supervision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from statistics import fmean
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from hdbridge.bringup.scale import Turned
+from hdbridge.clock import Clock
+from hdbridge.cycle import Cycle, Feedback
+from hdbridge.drive import objects
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import Link
+from hdbridge.drive.objects import Mode
+from hdbridge.drive.states import State, decode
+from hdbridge.drive.supervision import Event, Supervision
+from hdbridge.drive.unwrap import wrap_int32
+from hdbridge.errors import HdbridgeError, SafetyStop, TransitionError
+from hdbridge.procedures.moves import MotionLimits, MoveTo, Path
+
+if TYPE_CHECKING:
+    import can
+
+    from hdbridge.axis import AxisConfig
+
+MOTOR_SPEED_DEG_S: Final = 120.0
+"""Speed of the moves, degrees of the motor per second, where the limits allow four times as much."""
+LEAD_DEG: Final = 45.0
+"""Motor travel before a stand that is measured, so that the gear's hysteresis is on the same side."""
+MARGIN_DEG: Final = 1.0
+"""Motor travel that is left to the limits of the axis."""
+LEAST_TRAVEL_DEG: Final = 20.0
+ENABLE_TIMEOUT_S: Final = 2.0
+STOP_TIMEOUT_S: Final = 2.0
+STILL_CYCLES: Final = 3
+_STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
+
+
+class TravelPlan(NamedTuple):
+    """Where the axis goes from where it stands, in degrees of the motor, with sign."""
+
+    lead_deg: float
+    span_deg: float
+    """Whole turns of the motor where there is room: what repeats with them then cancels out."""
+
+
+def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
+    """The travel from a motor angle, to the side with more room; None where there is too little.
+
+    One motor turn, and more where the ratio is so high that one could not tell it from its neighbour.
+    """
+    limits, ratio = axis.limits, axis.gear.ratio
+    ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG
+    behind = here_deg - limits.position_min_deg * ratio - MARGIN_DEG
+    wanted = 360.0 * max(1, round(ratio / 50.0))
+    sign = 1.0 if ahead >= min(wanted + LEAD_DEG, behind) else -1.0
+    room = max(ahead, behind) if sign < 0 else ahead
+    if room < LEAST_TRAVEL_DEG:
+        return None
+    lead = min(LEAD_DEG, room / 8.0)
+    span = min(wanted, room - lead)
+    if span >= 360.0:
+        span = 360.0 * math.floor(span / 360.0)
+    return TravelPlan(sign * lead, sign * span)
+
+
+class QuietLink(Link):
+    """A link that can be told to keep some of its identifiers to itself, as a master that has died would."""
+
+    __slots__ = ("muted", "sent_s")
+
+    def __init__(self, bus: can.BusABC, clock: Clock) -> None:
+        super().__init__(bus, clock)
+        self.muted: set[int] = set()
+        self.sent_s: dict[int, float] = {}
+        """When each identifier was last really sent."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send, unless the identifier is muted."""
+        if can_id not in self.muted:
+            super().send(can_id, data)
+            self.sent_s[can_id] = self.now()
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """What the drive did when something of the master went silent."""
+
+    noticed_after_s: float | None
+    """From the last frame to the drive's reaction; None where there was none in the time it had."""
+    event: Event | None
+    """What the master's supervision saw first, where it ran on."""
+    statusword: int
+    """Of the drive, when it stood."""
+    stands: bool
+    distance_deg: float
+    """Motor travel from the last frame until it stood."""
+
+
+class SlowAxis:
+    """An axis in slow motion. ``interrupted`` is asked in each cycle; a yes stops the axis."""
+
+    def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
+        self.axis = drive.axis
+        self.image = drive.image
+        self.supervision = Supervision()
+        self.link = QuietLink(drive.link.bus, drive.link.clock)
+        self.cycle = Cycle(
+            self.link,
+            drive.link.clock,
+            drive.image,
+            self.supervision,
+            drive.axis.drive.cycle_s,
+            monitor=drive.monitor,
+        )
+        self.torque_percent = min(torque_percent, drive.axis.limits.torque_percent)
+        self._drive = drive
+        self._interrupted = interrupted
+        self._place_deg = 0.0
+
+    # -- power --------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def enabled(self) -> Iterator[Feedback]:
+        """Power on at rest, off again at the end; gives the first feedback under power."""
+        drive, power = self._drive, self.image.power
+        drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
+        drive.enable(Mode.CSP)
+        self.cycle.restart()
+        try:
+            for _ in range(math.ceil(ENABLE_TIMEOUT_S / self.cycle.period_s)):
+                feedback = self._tick(None)
+                if power.state is State.OPERATION_ENABLED:
+                    break
+            else:
+                raise TransitionError(
+                    f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
+                    f"'{power.state.value}'; look at its enable input, its supply and its fault history"
+                )
+            self._place_deg = self.image.motor_deg(feedback.motor_counts)
+            yield feedback
+            self._rest()
+        except BaseException:
+            # Whatever went wrong, Ctrl-C included: first the axis stops, then the error goes on its way.
+            with suppress(HdbridgeError):
+                self._rest()
+            with suppress(HdbridgeError):
+                drive.disable()
+            raise
+        drive.disable()
+
+    def _rest(self) -> None:
+        if self.supervision.stop is None and self.image.power.state is State.OPERATION_ENABLED:
+            self.stop()
+
+    def stop(self) -> list[Feedback]:
+        """Quick stop, cycle by cycle, until the motor stands; the feedback of these cycles."""
+        power = self.image.power
+        power.quick_stop()
+        seen: list[Feedback] = []
+        still = 0
+        for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
+            before = self.image.motor_counts
+            seen.append(self.cycle.tick())
+            rests = power.state in _STANDING and abs(self.image.motor_counts - before) <= 1
+            still = still + 1 if rests else 0
+            if still >= STILL_CYCLES:
+                break
+        return seen
+
+    # -- motion -------------------------------------------------------------------------------------------
+
+    @property
+    def place_deg(self) -> float:
+        """The motor angle that is aimed at."""
+        return self._place_deg
+
+    def sit(self, duration_s: float) -> list[Feedback]:
+        """Let cycles pass where the axis is, with or without power."""
+        return [self._tick(None) for _ in range(math.ceil(duration_s / self.cycle.period_s))]
+
+    def travel(self, motor_deg: float, least_s: float = 0.0) -> list[Feedback]:
+        """Move to a motor angle, slowly; the feedback of each cycle."""
+        return list(self._follow(motor_deg, least_s))
+
+    def stand(self, duration_s: float = 0.4) -> Turned:
+        """Stand, and give where both encoders are: the mean over the last quarter."""
+        seen = self.sit(duration_s)
+        tail = seen[-max(len(seen) // 4, 1) :]
+        return Turned(
+            fmean(each.motor_counts for each in tail), fmean(float(each.load_counts) for each in tail)
+        )
+
+    def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
+        """Speed of a move over ``way_deg`` of the motor, that is to last at least ``least_s``."""
+        limits = self.axis.limits
+        speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
+        return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
+
+    def _path(self, motor_deg: float, least_s: float) -> Path:
+        ratio, limits = self.axis.gear.ratio, self.axis.limits
+        speed = self.speed_deg_s(motor_deg - self._place_deg, least_s) / ratio
+        slow = MotionLimits(
+            limits.position_min_deg,
+            limits.position_max_deg,
+            speed,
+            0.5 * limits.acceleration_deg_s2,
+            limits.jerk_deg_s3,
+        )
+        return MoveTo(motor_deg / ratio).path(self._place_deg / ratio, slow)
+
+    def _follow(self, motor_deg: float, least_s: float = 0.0) -> Iterator[Feedback]:
+        path, period_s, ratio = self._path(motor_deg, least_s), self.cycle.period_s, self.axis.gear.ratio
+        elapsed_s = 0.0
+        while True:
+            self._place_deg = path.at(elapsed_s) * ratio
+            yield self._tick(self.image.target_counts_for(self._place_deg))
+            if elapsed_s >= path.duration_s:
+                return
+            elapsed_s += period_s
+
+    def _tick(self, target: int | None) -> Feedback:
+        feedback = self.cycle.tick(target)
+        if self._interrupted():
+            if self.image.power.state is State.OPERATION_ENABLED:
+                self.stop()
+            raise KeyboardInterrupt
+        return feedback
+
+    # -- stops --------------------------------------------------------------------------------------------
+
+    def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
+        """Move, and quick stop half-way: the speed then, the way and the time it took (motor degrees, s)."""
+        moved = self._half_way(self._follow(motor_deg), motor_deg)
+        speed = self._measured_speed(moved)
+        stopping = self.stop()
+        start, end = moved[-1].motor_counts, stopping[-1].motor_counts
+        rest = next(place for place, each in enumerate(stopping) if abs(each.motor_counts - end) <= 1)
+        way = abs(self.axis.motor_encoder.degrees(end - start))
+        return speed, way, (rest + 1) * self.cycle.period_s
+
+    def lose_heartbeat(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
+        """Move, and half-way keep the master's heartbeat back while all else goes on: speed and what came."""
+        moving = self._follow(motor_deg, 2.0 * patience_s + 1.0)
+        moved = self._half_way(moving, motor_deg)
+        speed = self._measured_speed(moved)
+        start = moved[-1]
+        identifier = self.image.heartbeat_id
+        last_s = self.link.sent_s.get(identifier, self.link.now())
+        muted_s = self.link.now()
+        self.link.muted.add(identifier)
+        noticed_s: float | None = None
+        try:
+            for _ in moving:
+                if self.link.now() - muted_s > patience_s:
+                    break
+        except SafetyStop:
+            pass  # what it was, `supervision.stop` says
+        finally:
+            self.link.muted.discard(identifier)
+        event = self.supervision.stop
+        if event is not None:
+            noticed_s = muted_s - last_s + (event.cycle - start.cycle) * self.cycle.period_s
+            return speed, self._after_silence(start.motor_counts, noticed_s, event, self._pause)
+        self.stop()
+        return speed, self._after_silence(start.motor_counts, None, None, self._pause)
+
+    def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
+        """Move, and half-way send neither SYNC nor set-points any more; the heartbeat goes on."""
+        moved = self._half_way(self._follow(motor_deg), motor_deg)
+        speed, start, drive = self._measured_speed(moved), moved[-1], self._drive
+        last_s = self.link.now()
+        noticed_s: float | None = None
+        while self.link.now() - last_s <= patience_s:
+            if self._interrupted():
+                raise KeyboardInterrupt  # leaving `enabled` and the drive's own exit stop it
+            drive.wait(0.002)
+            if decode(drive.sdo.fetch(objects.STATUSWORD)) is not State.OPERATION_ENABLED:
+                noticed_s = self.link.now() - last_s
+                break
+        if noticed_s is None:
+            drive.quick_stop()
+        result = self._after_silence(start.motor_counts, noticed_s, None, drive.wait)
+        self.image.power.observe(result.statusword)
+        return speed, result
+
+    def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
+        """Move as far as half of the way, at full speed then; ``moving`` has more to give."""
+        begin = self._place_deg
+        seen: list[Feedback] = []
+        for feedback in moving:
+            seen.append(feedback)
+            if abs(self._place_deg - begin) >= 0.5 * abs(motor_deg - begin):
+                break
+        return seen
+
+    def _measured_speed(self, seen: Sequence[Feedback]) -> float:
+        late = seen[-min(len(seen), 6) :]
+        counts, time_s = late[-1].motor_counts - late[0].motor_counts, late[-1].time_s - late[0].time_s
+        return abs(self.axis.motor_encoder.degrees(counts)) / time_s if time_s else 0.0
+
+    def _pause(self, duration_s: float) -> None:
+        self.link.clock.sleep_until(self.link.now() + duration_s)
+
+    def _after_silence(
+        self,
+        start_counts: int,
+        noticed_s: float | None,
+        event: Event | None,
+        pause: Callable[[float], None],
+    ) -> Silence:
+        """By SDO, as the drive may send no PDOs any more: where it is, and whether it stands."""
+        sdo, clock = self._drive.sdo, self.link.clock
+        last = sdo.fetch(objects.POSITION_ACTUAL)
+        stands = False
+        end_s = clock.now() + STOP_TIMEOUT_S
+        while not stands and clock.now() < end_s:
+            pause(0.05)
+            position = sdo.fetch(objects.POSITION_ACTUAL)
+            stands, last = abs(wrap_int32(position - last)) <= 2, position
+        way = wrap_int32(last - wrap_int32(start_counts))
+        return Silence(
+            noticed_s,
+            event,
+            sdo.fetch(objects.STATUSWORD),
+            stands,
+            abs(self.axis.motor_encoder.degrees(way)),
+        )

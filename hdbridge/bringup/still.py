@@ -1,0 +1,216 @@
+"""The checks that need no power: files, bus, node, identity, EDS, scaling, boot-up, encoders at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from hdbridge.bringup.checks import Verdict, failed, passed
+from hdbridge.bringup.judge import judge_rest
+from hdbridge.bringup.match import compare
+from hdbridge.bringup.patient import Patient
+from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO
+from hdbridge.bringup.scan import scan_bus
+from hdbridge.bringup.slow import SlowAxis
+from hdbridge.drive import objects
+from hdbridge.drive.nameplate import (
+    IDENTITY,
+    device_type_complaints,
+    identity_complaints,
+    mode_complaints,
+    scaling_addresses,
+    scaling_complaints,
+    torque_notes,
+)
+from hdbridge.drive.objects import Address, IntegerType
+from hdbridge.drive.sdo import SdoAbortError, load_eds
+from hdbridge.drive.writes import plan
+from hdbridge.errors import SdoError
+
+REST_S: Final = 1.0
+_REQUIRED: Final = (
+    objects.CONTROLWORD,
+    objects.STATUSWORD,
+    objects.MODE,
+    objects.MODE_DISPLAY,
+    objects.POSITION_ACTUAL,
+    objects.TARGET_POSITION,
+    objects.POSITION_DEMAND,
+    objects.TORQUE_ACTUAL,
+    objects.CYCLE_MANTISSA,
+    objects.CYCLE_EXPONENT,
+    objects.SUPPORTED_MODES,
+)
+"""What the control cycle cannot do without."""
+_ABSENT: Final = (0x0602_0000, 0x0609_0011)
+"""Abort codes: no such object, no such sub-index."""
+
+
+def files(patient: Patient) -> Verdict:
+    """The axis file and the EDS can be read, and every value of the boot-up fits its object."""
+    axis = patient.load()
+    od = load_eds(axis.eds_path, axis.drive.node_id)
+    rows = plan(axis, od)
+    patient.admit(axis, od)
+    return passed(
+        f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to write",
+        axis_file=str(axis.path),
+        eds=str(axis.eds_path),
+        writes=len(rows),
+    )
+
+
+def bus(patient: Patient) -> Verdict:
+    """The bus opens."""
+    patient.connect()
+    link = patient.drive.link
+    return passed(f"{link.name} is open", bus=link.name)
+
+
+def answers(patient: Patient) -> Verdict:
+    """The node answers; where it does not, whoever else does."""
+    axis, drive = patient.axis, patient.drive
+    try:
+        device_type = drive.sdo.fetch(objects.DEVICE_TYPE)
+    except SdoAbortError:
+        raise
+    except SdoError:
+        found = scan_bus(drive.link, listen_s=0.3)
+        _, lines = compare(axis, found)
+        others = ", ".join(f"node {each.node_id} ({each.kind})" for each in found.nodes) or "nobody"
+        wiring = "check power, cable, termination (60 ohm between CAN_H and CAN_L) and bit rate"
+        if axis.bus.interface == "virtual":
+            wiring = (
+                f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
+                "expected the interface of the bus (socketcan), or give --simulate"
+            )
+        return failed(
+            f"node {axis.drive.node_id} does not answer; on the bus: {others}",
+            *(lines if found.nodes else (wiring, *lines)),
+        )
+    complaints = device_type_complaints(axis, device_type)
+    if complaints:
+        return failed(
+            f"device type {device_type:08X}h is no CiA-402 drive", *(each.text for each in complaints)
+        )
+    return passed(f"node {axis.drive.node_id}, device type {device_type:08X}h (CiA 402)")
+
+
+def identity(patient: Patient) -> Verdict:
+    """It is the drive that the axis file means, and has the mode that is needed."""
+    axis, sdo = patient.axis, patient.drive.sdo
+    found = {
+        name: sdo.fetch(address)
+        for address, name in IDENTITY
+        if sdo.has(address.index, address.sub) or getattr(axis.drive.identity, name) is not None
+    }
+    complaints = identity_complaints(axis, found) + mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
+    text = ", ".join(f"{name.replace('_', ' ')} {value:#x}" for name, value in found.items())
+    return failed(text, *(each.text for each in complaints), **found) if complaints else passed(text, **found)
+
+
+def eds(patient: Patient) -> Verdict:
+    """The EDS describes this drive: the objects that are used exist, with the type that it says."""
+    axis, drive = patient.axis, patient.drive
+    where = axis.where("drive.eds")
+    wrong = [
+        f"the EDS does not list {each}, which the control cycle needs"
+        for each in _REQUIRED
+        if not drive.sdo.has(each.index, each.sub)
+    ]
+    looked_at = 0
+    for index, sub in dict.fromkeys(_listed(patient)):
+        looked_at += 1
+        try:
+            drive.sdo.read(index, sub)
+        except SdoAbortError as error:
+            if error.code in _ABSENT:  # other codes refuse the access, not the object
+                wrong.append(str(error).split(";", 1)[0])
+        except SdoError as error:
+            if "answered" not in str(error):
+                raise
+            wrong.append(str(error).split(";", 1)[0])
+    information = drive.sdo.od.device_information
+    for name, address in (
+        ("vendor_number", objects.VENDOR_ID),
+        ("product_number", objects.PRODUCT_CODE),
+    ):
+        stated = getattr(information, name, None)
+        found = drive.sdo.fetch(address)
+        if isinstance(stated, int) and stated and stated != found:
+            wrong.append(f"the EDS is for {name.replace('_', ' ')} {stated:#x}, the drive says {found:#x}")
+    if wrong:
+        return failed(
+            f"{len(wrong)} of {looked_at} objects are not as {axis.drive.eds} says",
+            f"{where}: found {axis.drive.eds}, expected the EDS file of this drive and firmware",
+            *wrong,
+            objects=looked_at,
+        )
+    return passed(f"{looked_at} objects answer as {axis.drive.eds} says", objects=looked_at)
+
+
+def _listed(patient: Patient) -> Iterator[tuple[int, int]]:
+    """The objects to look at: those that are used, as far as the EDS lists them."""
+    axis, sdo = patient.axis, patient.drive.sdo
+    for address in (*_REQUIRED, objects.RATED_TORQUE, objects.ERROR_CODE, *scaling_addresses(axis)):
+        if sdo.has(address.index, address.sub):
+            yield address.index, address.sub
+    for row in plan(axis, sdo.od):
+        if row.node_id == axis.drive.node_id and sdo.has(row.index, row.sub):
+            yield row.index, row.sub
+    source = axis.load_encoder.source
+    if source.node is None and sdo.has(source.index, source.subindex):
+        yield source.index, source.subindex
+
+
+def units(patient: Patient) -> Verdict:
+    """The drive counts as the axis file says, by every object that says something about it."""
+    axis, sdo = patient.axis, patient.drive.sdo
+
+    def read(*addresses: Address) -> dict[Address, int]:
+        return {each: sdo.fetch(each) for each in addresses if sdo.has(each.index, each.sub)}
+
+    readings = read(*scaling_addresses(axis))
+    complaints = scaling_complaints(axis, readings)
+    said = ", ".join(f"{each.index:04X}h:{each.sub:02X} {value}" for each, value in readings.items())
+    text = said or "the drive has no object that says how it counts"
+    if complaints:
+        return failed(text, *(each.text for each in complaints))
+    gear = readings.get(objects.GEAR_MOTOR, 1) / readings.get(objects.GEAR_SHAFT, 1)
+    for key, known in (
+        (MOTOR_COUNTS, objects.ENCODER_INCREMENTS in readings),
+        (RATIO, gear != 1.0),
+        (LOAD_COUNTS, any(each.index == 0x60E6 for each in readings)),
+    ):
+        if known:
+            patient.confirmed.add(key)
+    notes = torque_notes(axis, read(objects.RATED_TORQUE).get(objects.RATED_TORQUE))
+    return passed("; ".join((text, *notes)))
+
+
+def boot(patient: Patient) -> Verdict:
+    """The boot-up writes its plan and reads every object back."""
+    drive = patient.boot()
+    report = drive.report
+    assert report is not None
+    return passed(
+        f"{len(report.written)} objects written and read back; OPERATIONAL, '{report.state.value}'",
+        written=len(report.written),
+    )
+
+
+def rest(patient: Patient) -> Verdict:
+    """Both encoders come with every SYNC, and rest while the power is off."""
+    drive = patient.drive
+    with patient.interruptible() as interrupted:
+        positions = drive.read_positions()
+        drive.image.seed(
+            positions.motor_counts, positions.load_counts, drive.sdo.read(0x6041, 0, IntegerType.UINT16)
+        )
+        seen = SlowAxis(drive, patient.torque_percent, interrupted).sit(REST_S)
+    fresh = [each for each in seen if each.fresh]
+    verdict = judge_rest(
+        patient.axis, [each.motor_counts for each in fresh], [each.load_counts for each in fresh]
+    )
+    patient.noise_arcsec = float(verdict.figures["load_noise_arcsec"] or 0.0)
+    return verdict

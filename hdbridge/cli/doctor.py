@@ -1,0 +1,131 @@
+"""``hdbridge doctor``: is the axis what its file says, and does it stop?"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hdbridge.bringup.checks import Outcome, Row, run_checks
+from hdbridge.bringup.doctor import CHECKS
+from hdbridge.bringup.patient import TORQUE_PERCENT, Patient
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    JsonOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    connected,
+    console,
+    load_axis,
+    notes,
+    write_json,
+)
+from hdbridge.errors import DriveError
+
+_MARKS = {
+    Outcome.PASS: "[green]pass[/green]        ",
+    Outcome.FAIL: "[bold red]FAIL[/bold red]        ",
+    Outcome.NOT_POSSIBLE: "[yellow]not possible[/yellow]",
+}
+_WARNING = (
+    "The next checks switch the drive on and move the axis: up to a motor turn and an eighth each way (more "
+    "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the way clear and a "
+    "hardware emergency stop at hand. Move now?"
+)
+DECLINED = "motion was not confirmed (on a terminal: answer y; in a script: --yes)"
+LEFT_OUT = "left out by --no-motion"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("doctor")(doctor)
+
+
+def doctor(
+    profile: ProfileArgument,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    torque_percent: Annotated[
+        float,
+        typer.Option(
+            "--torque-percent",
+            min=1.0,
+            max=500.0,
+            help="Most motor torque, of the rated one; never above limits.torque_percent.",
+        ),
+    ] = TORQUE_PERCENT,
+    yes: Annotated[bool, typer.Option("--yes", help="Move the axis without asking.")] = False,
+    motion: Annotated[
+        bool, typer.Option("--motion/--no-motion", help="Without: only what can be checked unpowered.")
+    ] = True,
+    json_file: JsonOption = None,
+) -> None:
+    """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
+
+    Each line is one check. Where one fails, the line of the axis file to change stands under it, or what to
+    do.
+
+    Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed. This is no safety
+    function: an emergency stop stays in hardware.
+    """
+    files = Profile.find(profile)
+    refused: list[str] = []
+
+    def permitted() -> str | None:
+        if not motion:
+            return LEFT_OUT
+        if simulate or yes or _confirm(torque_percent):
+            return None
+        refused.append(DECLINED)
+        return DECLINED
+
+    with Patient(
+        lambda: load_axis(files, interface, channel),
+        lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed),
+        torque_percent=torque_percent,
+        interruptible=deferred_interrupt,
+    ) as patient:
+        rows = run_checks(patient, CHECKS, permitted=permitted, tell=_tell)
+    failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
+    write_json(
+        json_file,
+        {
+            "schema": "hdbridge.doctor/1",
+            "axis_file": str(files.axis),
+            "simulated": simulate,
+            "passed": not failures and not refused,
+            "checks": [row.as_dict() for row in rows],
+        },
+    )
+    if failures:
+        first = failures[0]
+        raise DriveError(
+            f"{files.axis}: {len(failures)} of {len(rows)} checks failed, first '{first.check.title}'; "
+            "the lines under each say what to change"
+        )
+    if refused:
+        raise DriveError(f"{files.axis}: {DECLINED}")
+    console.print("all right" if motion else "all right, as far as it can be checked without motion")
+
+
+def _confirm(torque_percent: float) -> bool:
+    try:
+        return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
+    except typer.Abort:  # no terminal, end of input
+        notes.print("")
+        return False
+
+
+def _tell(row: Row[Patient]) -> None:
+    console.print(f"{_MARKS[row.verdict.outcome]}  {row.check.title:<25}", end=" ")
+    console.print(row.verdict.measured, markup=False, soft_wrap=True)
+    for remedy in row.verdict.remedies:
+        console.print(f"              -> {remedy}", markup=False, soft_wrap=True)

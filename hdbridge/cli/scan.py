@@ -1,0 +1,177 @@
+"""``hdbridge scan``: what answers on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import can
+import typer
+
+from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.bringup.match import axis_lines, compare
+from hdbridge.bringup.scan import ASK_TIMEOUT_S, LISTEN_S, Node, Scan, scan_bus
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    JsonOption,
+    Profile,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    connected,
+    console,
+    load_axis,
+    notes,
+    progress_bar,
+    write_json,
+)
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.drive.link import Link, open_bus
+from hdbridge.errors import DriveError, InputError
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("scan")(scan)
+
+
+def scan(
+    profile: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[PROFILE]",
+            help="Whose bus, and which drive is expected there; else give --interface and --channel.",
+        ),
+    ] = None,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    bitrate_bps: Annotated[
+        int | None,
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+    ] = None,
+    listen_s: Annotated[
+        float, typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking.")
+    ] = LISTEN_S,
+    timeout_ms: Annotated[
+        float, typer.Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
+    ] = 1000.0 * ASK_TIMEOUT_S,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    json_file: JsonOption = None,
+) -> None:
+    """List the nodes on a CAN bus: what they are, their identity, their state, and lines for an axis file.
+
+    It listens, then reads a few objects of every node id from 1 to 127. It writes no object, sends no NMT
+    command and enables nothing; a node that another SDO client is talking to is left alone.
+
+    Exit status 4 when no node was found, or when PROFILE's drive is not among them.
+    """
+    axis = None
+    if profile is not None:
+        files = Profile.find(profile)
+        axis = load_axis(files, interface, channel)
+        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed)
+    elif simulate or interface is None or channel is None:
+        raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
+    else:
+        opened = _opened(BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps))
+    with opened as (bus, clock), progress_bar() as bar:
+        link = Link(bus, clock)
+        task = bar.add_task("asking nodes", total=1.0)
+        found = scan_bus(
+            link,
+            listen_s=listen_s,
+            timeout_s=timeout_ms / 1000.0,
+            progress=lambda share: bar.update(task, completed=share),
+        )
+    matches, lines = (False, []) if axis is None else compare(axis, found)
+    _print(link.name, found)
+    if axis is not None:
+        _print_match(axis, matches, lines)
+    result = _as_dict(link.name, found)
+    if axis is not None:
+        result["axis"] = {"name": axis.name, "matches": matches, "differences": lines}
+    write_json(json_file, result)
+    _judge(link.name, found, axis, matches)
+
+
+@contextmanager
+def _opened(settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
+    with open_bus(settings) as bus:
+        yield bus, MonotonicClock()
+
+
+def _print(name: str, found: Scan) -> None:
+    count = len(found.nodes)
+    console.print(f"{name}: {count} node{'' if count == 1 else 's'}", soft_wrap=True)
+    for node in found.nodes:
+        console.print(f"\nnode {node.node_id}: {node.kind}", style="bold")
+        for label, value in _facts(node).items():
+            console.print(f"{label:>12}  {value}", markup=False)
+        if node.usable or node.profile == 406:
+            console.print("  for the axis file:")
+            for line in axis_lines(node):
+                console.print(f"    {line}", markup=False, soft_wrap=True)
+    for remark in found.remarks:
+        notes.print(f"note: {remark}", markup=False, soft_wrap=True)
+
+
+def _facts(node: Node) -> dict[str, str]:
+    facts = {"NMT state": node.state}
+    if node.device_type is not None:
+        facts["device type"] = f"{node.device_type:08X}h"
+    if node.identity:
+        facts["identity"] = ", ".join(
+            f"{name.replace('_', ' ')} {value:#x}" for name, value in node.identity.items()
+        )
+    facts |= {name: text for name, text in node.names.items() if text}
+    if node.modes is not None:
+        facts["modes"] = ", ".join(node.mode_names) or "none"
+    return facts
+
+
+def _print_match(axis: AxisConfig, matches: bool, lines: list[str]) -> None:
+    if matches:
+        console.print(
+            f"\nnode {axis.drive.node_id} is the drive of {axis.path}", markup=False, soft_wrap=True
+        )
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> None:
+    if not found.nodes:
+        raise DriveError(
+            f"{name}: no node answers; check power, wiring, the termination at both ends (60 ohm between "
+            "CAN_H and CAN_L) and that every node has the same bit rate"
+        )
+    if axis is not None and not matches:
+        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; the lines above say why")
+
+
+def _as_dict(name: str, found: Scan) -> dict[str, Any]:
+    return {
+        "schema": "hdbridge.scan/1",
+        "bus": name,
+        "nodes": [
+            {
+                "node_id": node.node_id,
+                "answers": node.answers,
+                "kind": node.kind,
+                "device_type": node.device_type,
+                "profile": node.profile,
+                "nmt_state": node.nmt_state,
+                "state": node.state,
+                "identity": node.identity,
+                "names": node.names,
+                "modes": node.mode_names,
+                "usable": node.usable,
+                "axis_file": axis_lines(node) if node.usable or node.profile == 406 else [],
+            }
+            for node in found.nodes
+        ],
+        "remarks": list(found.remarks),
+    }

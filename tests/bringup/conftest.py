@@ -1,0 +1,89 @@
+"""Shared by the tests of the bring-up: the article's axis with one thing wrong, and what is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bringup.checks import Row, Verdict, run_checks
+from hdbridge.bringup.doctor import CHECKS
+from hdbridge.bringup.patient import Patient
+from hdbridge.bundled import bundled_profile
+from hdbridge.clock import Clock
+from hdbridge.sim.lockstep import lockstep_bench, nameplate_of
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+
+ARTICLE = bundled_profile("article")
+
+
+def edited(text: str, changes: dict[str, str]) -> str:
+    for old, new in changes.items():
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+@dataclass
+class Case:
+    """One examination, and the parts that a test may have changed."""
+
+    folder: Path
+    axis: dict[str, str] = field(default_factory=dict)
+    truth: dict[str, str] = field(default_factory=dict)
+    eds: dict[str, str] = field(default_factory=dict)
+    """Edits of the EDS that the axis file names; the drive has the original."""
+    honest: bool = False
+    """Whether the drive's own objects say what the plant really is, rather than what the axis file says."""
+    node_id: int = 1
+    spoil: Callable[[SimulatedDrive], None] = lambda node: None
+    rows: dict[str, Row[Patient]] = field(default_factory=dict)
+    node: SimulatedDrive | None = None
+    motor_counts_seen: set[int] = field(default_factory=set)
+
+    def prepare(self) -> AxisConfig:
+        text = edited((ARTICLE / "axis.yaml").read_text(), self.axis)
+        if self.eds:
+            original = (ARTICLE.parents[1] / "eds" / "hdbridge-402.eds").read_text()
+            (self.folder / "changed.eds").write_text(edited(original, self.eds))
+            text = edited(text, {"eds: hdbridge-402.eds": "eds: changed.eds"})
+        path = self.folder / "axis.yaml"
+        path.write_text(text)
+        return AxisConfig.load(path)
+
+    @contextmanager
+    def connect(self, axis: AxisConfig) -> Iterator[tuple[can.BusABC, Clock]]:
+        plain = (ARTICLE / "truth.yaml").read_text()
+        truth = Truth.from_text(edited(plain, self.truth))
+        nameplate = nameplate_of(truth if self.honest else Truth.from_text(plain))
+        eds = ARTICLE.parents[1] / "eds" / "hdbridge-402.eds"
+        with lockstep_bench(Machine(truth, 0), eds, self.node_id, nameplate=nameplate) as (bus, clock, node):
+            self.node = node
+            self.spoil(node)
+            yield bus, clock
+
+    def run(self, **options: Any) -> dict[str, Verdict]:
+        """The verdicts by the name of the check."""
+        permitted = options.pop("permitted", lambda: None)
+        with Patient(self.prepare, self.connect, **options) as patient:
+            rows = run_checks(patient, CHECKS, permitted=permitted)
+        self.rows = {row.check.name: row for row in rows}
+        return {name: row.verdict for name, row in self.rows.items()}
+
+
+@pytest.fixture
+def case(tmp_path: Path) -> Callable[..., Case]:
+    """Makes a case in a folder of its own."""
+
+    def make(**parts: Any) -> Case:
+        return Case(tmp_path, **parts)
+
+    return make

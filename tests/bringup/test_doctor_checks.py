@@ -1,0 +1,256 @@
+"""The doctor's list on a simulated drive with one thing wrong: each is found, and its key named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from hdbridge.bringup.checks import Outcome, Verdict
+from hdbridge.bringup.doctor import CHECKS
+from hdbridge.drive.states import State, decode
+from hdbridge.sim.node import SimulatedDrive
+
+PASS, FAIL, NOT_POSSIBLE = Outcome.PASS, Outcome.FAIL, Outcome.NOT_POSSIBLE
+
+
+def failures(verdicts: dict[str, Verdict]) -> list[str]:
+    return [name for name, verdict in verdicts.items() if verdict.outcome is FAIL]
+
+
+def test_a_sound_axis_passes_every_check(case: Callable[..., Any]) -> None:
+    examined = case()
+    verdicts = examined.run()
+    assert {name: each.measured for name, each in verdicts.items() if each.outcome is not PASS} == {}
+    assert list(verdicts) == [check.name for check in CHECKS]
+    turn = verdicts["turn"].figures
+    assert turn["forward_motor_counts"] == pytest.approx(8000, abs=1)
+    assert turn["backward_load_counts"] == pytest.approx(-57600, abs=10)
+    assert turn["ratio_measured"] == pytest.approx(50, rel=1e-3)
+    assert verdicts["quick_stop"].figures["distance_motor_deg"] > 0.5
+    assert 0.025 < verdicts["heartbeat"].figures["time_s"] < 0.1
+    assert 0.016 <= verdicts["set_points"].figures["time_s"] < 0.05
+    assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
+    assert abs(examined.node.firmware.motion.motor_counts) < 4000  # it came back, but for the last stop
+
+
+def test_the_axis_turns_to_the_side_that_has_room(case: Callable[..., Any]) -> None:
+    verdicts = case(axis={"position_max_deg: 400": "position_max_deg: 0.5"}).run()
+    assert failures(verdicts) == []
+    assert verdicts["turn"].figures["forward_motor_counts"] == pytest.approx(-8000, abs=1)
+
+
+def test_an_axis_without_room_is_not_moved_far(case: Callable[..., Any]) -> None:
+    limits = {
+        "position_min_deg: -400": "position_min_deg: -0.2",
+        "position_max_deg: 400": "position_max_deg: 0.2",
+    }
+    examined = case(axis=limits)
+    verdicts = examined.run()
+    assert verdicts["nudge"].outcome is FAIL
+    assert "axis.yaml:43:3: limits.position_min_deg" in verdicts["nudge"].measured
+    assert verdicts["turn"].outcome is NOT_POSSIBLE
+    assert abs(examined.node.firmware.motion.motor_counts) < 10
+
+
+WRONG: list[tuple[str, dict[str, Any], str, str]] = [
+    (
+        "load direction",
+        {"truth": {"2880000\n    direction: 1": "2880000\n    direction: -1"}},
+        "turn",
+        r"axis.yaml:33:3: load_encoder.direction: found 1, expected -1",
+    ),
+    (
+        "motor direction",
+        {"truth": {"{counts_per_turn: 8000, direction: 1,": "{counts_per_turn: 8000, direction: -1,"}},
+        "turn",
+        r"motor_encoder.direction: found 1, expected -1",
+    ),
+    (
+        "lines instead of counts at the load",
+        {"truth": {"    counts_per_turn: 2880000": "    counts_per_turn: 11520000"}},
+        "turn",
+        "axis.yaml:32:3: load_encoder.counts_per_turn: found 2880000, expected 11520000 (lines",
+    ),
+    (
+        "the other output of the gear",
+        {"truth": {"gear:\n  ratio: 50": "gear:\n  ratio: 51"}},
+        "turn",
+        "axis.yaml:37:3: gear.ratio: found 50, expected 51 (the output is the other one",
+    ),
+    (
+        "another gear, and the drive says so",
+        {"truth": {"gear:\n  ratio: 50": "gear:\n  ratio: 80"}, "honest": True},
+        "units",
+        "a gear of 80, but",
+    ),
+    (
+        "motor counts, and the drive says so",
+        {"truth": {"{counts_per_turn: 8000,": "{counts_per_turn: 10000,"}, "honest": True},
+        "units",
+        "axis.yaml:28:3: motor_encoder.counts_per_turn is 8000",
+    ),
+    (
+        "load counts, and the drive says so",
+        {"truth": {"    counts_per_turn: 2880000": "    counts_per_turn: 720000"}, "honest": True},
+        "units",
+        "axis.yaml:32:3: load_encoder.counts_per_turn is 2880000",
+    ),
+    (
+        "another drive",
+        {"axis": {"product_code: 0x402": "product_code: 0x403"}},
+        "identity",
+        "axis.yaml:16:5: drive.identity.product_code is 403h",
+    ),
+]
+
+
+def _without(*keys: tuple[int, int]) -> Callable[[SimulatedDrive], None]:
+    def spoil(node: SimulatedDrive) -> None:
+        for key in keys:
+            del node.dictionary._entries[key]
+
+    return spoil
+
+
+@pytest.mark.parametrize(("name", "parts", "check", "text"), WRONG, ids=[row[0] for row in WRONG])
+def test_what_is_wrong_is_named(
+    case: Callable[..., Any], name: str, parts: dict[str, Any], check: str, text: str
+) -> None:
+    verdicts = case(**parts).run()
+    assert failures(verdicts)[0] == check
+    assert text in verdicts[check].remedies[0]
+    assert all("\n" not in each for each in (verdicts[check].measured, *verdicts[check].remedies))
+
+
+def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:
+    def unplug(node: SimulatedDrive) -> None:
+        node.dictionary[0x60E4, 1].bind(lambda: 17)
+
+    verdicts = case(spoil=unplug).run()
+    assert failures(verdicts) == ["turn"]
+    assert "load encoder does not move" in verdicts["turn"].measured
+    assert "axis.yaml:34:3: load_encoder.source: object 60E4h:01" in verdicts["turn"].remedies[0]
+
+
+def test_an_object_that_repeats_the_motor_encoder(case: Callable[..., Any]) -> None:
+    def repeat(node: SimulatedDrive) -> None:
+        node.dictionary[0x60E4, 1].bind(lambda: node.firmware.motion.motor_counts)
+
+    verdicts = case(spoil=repeat).run()
+    assert "reads the motor's encoder" in verdicts["turn"].remedies[0]
+
+
+def test_a_load_encoder_that_jitters_at_rest(case: Callable[..., Any]) -> None:
+    verdicts = case(
+        truth={"    direction: 1\n    coupling": "    direction: 1\n    noise_arcsec: 60\n    coupling"}
+    ).run()
+    assert failures(verdicts) == ["rest"]
+    assert "load_encoder.source" in verdicts["rest"].remedies[0]
+    assert verdicts["hold"].outcome is NOT_POSSIBLE
+
+
+def test_the_eds_of_another_drive(case: Callable[..., Any]) -> None:
+    verdicts = case(spoil=_without((0x6085, 0), (0x6007, 0))).run()
+    assert failures(verdicts) == ["eds"]
+    assert "axis.yaml:13:3: drive.eds: found hdbridge-402.eds" in verdicts["eds"].remedies[0]
+    assert {"6085h", "6007h"} <= {
+        word.strip(":").split(":")[0] for each in verdicts["eds"].remedies for word in each.split()
+    }
+
+
+def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
+    verdicts = case(node_id=5).run()
+    assert failures(verdicts) == ["node"]
+    told = "\n".join(verdicts["node"].remedies)
+    assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in told
+
+
+def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None:
+    def deaf(node: SimulatedDrive) -> None:
+        node._lose_heartbeat = lambda: setattr(node, "_watch_due_s", float("inf"))  # type: ignore[method-assign]
+
+    examined = case(spoil=deaf)
+    verdicts = examined.run()
+    assert failures(verdicts) == ["heartbeat"]
+    assert "the drive goes on" in verdicts["heartbeat"].measured
+    assert "drive.heartbeat_ms (50 ms) was written to 1016h" in verdicts["heartbeat"].remedies[0]
+    assert verdicts["set_points"].outcome is PASS
+    assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
+
+
+def test_a_drive_that_ignores_missing_set_points(case: Callable[..., Any]) -> None:
+    def deaf(node: SimulatedDrive) -> None:
+        def ignore(now_s: float) -> None:
+            node._rpdo_due_s = float("inf")
+
+        node._miss_rpdo = ignore  # type: ignore[method-assign]
+
+    verdicts = case(spoil=deaf).run()
+    assert failures(verdicts) == ["set_points"]
+    assert "drive.cycle_ms" in verdicts["set_points"].remedies[0]
+    assert verdicts["off"].outcome is PASS
+
+
+def test_a_drive_that_hardly_brakes(case: Callable[..., Any]) -> None:
+    def coast(node: SimulatedDrive) -> None:
+        node.dictionary[0x6085, 0].guard = lambda value: None
+        brake = node.firmware._brake
+
+        def weakly(option: int, then: Any) -> None:
+            entry = node.dictionary[0x6085, 0]
+            kept, entry.value = entry.value, 2_000
+            try:
+                brake(option, then)
+            finally:
+                entry.value = kept
+
+        node.firmware._brake = weakly  # type: ignore[method-assign]
+
+    verdicts = case(spoil=coast).run()
+    assert "quick_stop" in failures(verdicts)
+    assert "drive.quick_stop_option" in verdicts["quick_stop"].remedies[0]
+
+
+def test_a_blocked_axis_is_stopped_by_its_torque_limit(case: Callable[..., Any]) -> None:
+    verdicts = case(truth={"coulomb_nm: 0.03": "coulomb_nm: 0.3"}).run()
+    assert failures(verdicts)[0] == "nudge"
+    assert (
+        "--torque-percent" in "".join(verdicts["nudge"].remedies) or "following" in verdicts["nudge"].measured
+    )
+    assert verdicts["off"].outcome is PASS
+
+
+def test_without_permission_nothing_moves(case: Callable[..., Any]) -> None:
+    examined = case()
+    verdicts = examined.run(permitted=lambda: "not now")
+    assert failures(verdicts) == []
+    assert (verdicts["hold"].outcome, verdicts["hold"].measured) == (NOT_POSSIBLE, "not now")
+    assert verdicts["off"].outcome is PASS
+    assert examined.node.firmware.motion.motor_counts == 0
+
+
+def test_an_interrupt_stops_the_axis(case: Callable[..., Any]) -> None:
+    asked = 0
+
+    @contextmanager
+    def impatient() -> Iterator[Callable[[], bool]]:
+        def wish() -> bool:
+            nonlocal asked
+            asked += 1
+            return asked > 900  # in the middle of the motor turn
+
+        yield wish
+
+    examined = case()
+    with pytest.raises(KeyboardInterrupt):
+        examined.run(interruptible=impatient)
+    assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
+    assert abs(examined.node.firmware.motion.machine.velocity_counts_s) < 50
+
+
+def test_a_drive_in_fault_is_reset_and_checked(case: Callable[..., Any]) -> None:
+    verdicts = case(spoil=lambda node: node.faults.raise_error(0x3210)).run()
+    assert failures(verdicts) == []
