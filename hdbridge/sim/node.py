@@ -89,6 +89,7 @@ class SimulatedDrive:
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
         self._rpdos = [ReceivePdo(self.dictionary, number, self._route) for number in numbers]
         self._guard()
+        self._clock = clock
         self._now_s = clock.now()
         self._begin()
 
@@ -155,12 +156,14 @@ class SimulatedDrive:
         self._now_s = now_s
         if self.nmt is Nmt.INITIALISING:
             self._boot()
-        receive = self.bus.recv
-        # Bounded, because `now_s` stands still meanwhile: under a flood of frames the heartbeat must go on.
+        receive, now = self.bus.recv, self._clock.now
+        # Bounded, and each frame at its own time: a master that answers at once (as in an SDO transfer) can
+        # keep this loop busy for long, and the watchdogs must not be behind then.
         for _ in range(FRAMES_PER_POLL):
             message = receive(0)
             if message is None:
                 break
+            now_s = now()
             self.handle(message, now_s)
         self.run_until(now_s)
 
