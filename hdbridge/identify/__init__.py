@@ -1,1 +1,26 @@
-"""From records to parameters with uncertainties."""
+"""From records to parameters with uncertainties.
+
+`fit` takes stretches of a measurement (`Segment`) and returns a `FitResult`: the model, 95 % intervals that allow for
+noise that is not white, held-out figures, residual tests, and in words what the data cannot say.
+"""
+
+from hdbridge.identify.fit import fit
+from hdbridge.identify.intervals import Interval
+from hdbridge.identify.options import FitOptions
+from hdbridge.identify.orders import Family, Order
+from hdbridge.identify.result import FitResult
+from hdbridge.identify.segment import Kind, Segment
+from hdbridge.identify.spectrum import Spectrum, spectrum
+
+__all__ = [
+    "Family",
+    "FitOptions",
+    "FitResult",
+    "Interval",
+    "Kind",
+    "Order",
+    "Segment",
+    "Spectrum",
+    "fit",
+    "spectrum",
+]

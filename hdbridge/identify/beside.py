@@ -1,0 +1,145 @@
+"""What is fitted beside the model so that it does not bend it: zeros, and faults of the measurement.
+
+A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole counts
+reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a count *in the
+direction of motion*: that looks like hysteresis too, and the fraction changes with speed. Each turn is known to
+within a count only, and a hysteresis that is narrow or steep cannot be known better than its turns. Each has a
+column; a fraction of a count it cannot exceed. With fine encoders these columns vanish by themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hdbridge.effects import Effect, FloatArray
+from hdbridge.identify.design import Design
+from hdbridge.identify.linear import solve_symmetric
+from hdbridge.identify.samples import IntArray
+from hdbridge.units import ARCSEC_PER_DEG
+
+DELAY = "delay_ms"
+ROUNDING = "rounding"
+TURNS = "turns"
+TEXTS = {
+    DELAY: "the load encoder is read later than the motor's by",
+    ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
+}
+UNITS = {DELAY: "ms", ROUNDING: "counts"}
+MOST_TURNS = 120
+COUNTS = 0.29
+"""Standard deviation that an unknown place within a count has."""
+SPEEDS_COUNTS_S = (0.0, 50.0, 200.0, 800.0, 3200.0, np.inf)
+"""Edges of the classes of speed that round alike; at rest is a class of its own."""
+AVERAGED_COUNTS_S = 200.0
+"""Faster than this a servo passes several counts in the time that it takes to answer, and rounding averages out."""
+SHARE = 0.1
+"""A nuisance of whose column less than this is left by what else is fitted stays out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beside:
+    """Columns that are no effect's."""
+
+    columns: FloatArray
+    """Shape (b, q)."""
+    names: tuple[str, ...]
+    prior: FloatArray
+    """One over the variance that each coefficient is known with beforehand, about zero; 0 where nothing is."""
+
+    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Beside:
+        """With further columns of which nothing is known."""
+        return Beside(
+            np.concatenate([self.columns, columns], axis=1),
+            (*self.names, *names),
+            np.concatenate([self.prior, np.zeros(columns.shape[1])]),
+        )
+
+    def rows(self, index: IntArray) -> Beside:
+        """For some of the blocks."""
+        return Beside(self.columns[index], self.names, self.prior)
+
+
+def zeros(design: Design) -> FloatArray:
+    """One column per absolute zero."""
+    which = design.blocks.zero[:, np.newaxis] == np.arange(design.samples.zeros)
+    return np.asarray(which, dtype=np.float64)
+
+
+def delay_column(design: Design) -> FloatArray:
+    """What a load encoder read one millisecond late would show, shape (b, 1), arcsec."""
+    blocks, samples = design.blocks, design.samples
+    column = -blocks.speed_deg_s * blocks.moving / samples.ratio * ARCSEC_PER_DEG / 1000.0
+    return np.asarray(column)[:, np.newaxis]
+
+
+def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
+    """A count in the direction of motion, arcsec, for rest and each class of speed: (b, classes), and how much of it
+    there may be (standard deviation in counts)."""
+    blocks, samples = design.blocks, design.samples
+    count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
+    rate = np.abs(blocks.speed_deg_s) / max(samples.count_deg, 1e-12)
+    columns = [-blocks.heading * ~blocks.moving * count_arcsec]
+    sizes = [COUNTS]
+    for low, high in pairwise(SPEEDS_COUNTS_S):
+        inside = blocks.moving & (rate >= low) & (rate < high)
+        if inside.any():
+            columns.append(-blocks.heading * inside * count_arcsec)
+            sizes.append(COUNTS * min(1.0, AVERAGED_COUNTS_S / max(float(np.median(rate[inside])), 1.0)))
+    return np.stack(columns, axis=1), np.array(sizes)
+
+
+def turn_columns(design: Design, effects: Sequence[Effect]) -> FloatArray:
+    """A column for each turn that matters, shape (b, turns): what it would change to lie one count further out."""
+    change, turn = design.turn_effects(effects)
+    weight = np.bincount(turn, design.blocks.count * change**2)
+    most = np.argsort(weight)[::-1][:MOST_TURNS]
+    chosen = np.sort(most[weight[most] > 0])
+    return np.asarray((turn[:, np.newaxis] == chosen) * change[:, np.newaxis])
+
+
+def is_turn(name: str) -> bool:
+    """Whether a column of this name is one turn's."""
+    return name.startswith("turn ")
+
+
+def is_rounding(name: str) -> bool:
+    """Whether a column of this name is there for what a count leaves open."""
+    return is_turn(name) or name.startswith(ROUNDING)
+
+
+def beside(design: Design, nuisances: Sequence[str], effects: Sequence[Effect]) -> Beside:
+    """Zeros and the nuisances named."""
+    count = design.samples.zeros
+    columns = [zeros(design)]
+    names = [f"zero {number}" for number in range(count)]
+    prior = [0.0] * count
+    if DELAY in nuisances:
+        columns.append(delay_column(design))
+        names.append(DELAY)
+        prior.append(0.0)
+    if ROUNDING in nuisances:
+        column, sizes = rounding_columns(design)
+        columns.append(column)
+        names += [ROUNDING, *(f"{ROUNDING} {number}" for number in range(1, len(sizes)))]
+        prior += (sizes**-2.0).tolist()
+    if TURNS in nuisances:
+        column = turn_columns(design, effects)
+        columns.append(column)
+        names += [f"turn {number}" for number in range(column.shape[1])]
+        prior += [COUNTS**-2] * column.shape[1]
+    return Beside(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
+
+
+def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:
+    """Smallest share of any column's weighted squares that the others do not explain."""
+    both = np.concatenate([others, columns], axis=1)
+    gram = both.T @ (weight[:, np.newaxis] * both)
+    split = others.shape[1]
+    cross = gram[:split, split:]
+    left = np.diag(gram[split:, split:] - cross.T @ solve_symmetric(gram[:split, :split], cross))
+    own = np.maximum(np.diag(gram)[split:], 1e-12)
+    return float(np.min(left / own))

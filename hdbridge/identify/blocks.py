@@ -1,0 +1,178 @@
+"""Samples averaged over short stretches: a million rows become some ten thousand, exactly.
+
+Columns are averaged like the observations, so a linear model of the samples is the same linear model of the
+blocks; what is lost is only what varies inside a block. Blocks are short just after a reversal, where the
+hysteresis is steep, and never reach across a turn, a gap, or samples that cannot be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from hdbridge.effects import FloatArray
+from hdbridge.effects.hysteresis import branches
+from hdbridge.identify.samples import BoolArray, IntArray, Samples
+
+TARGET_BLOCKS = 30_000
+LONGEST_S = 0.25
+FINE_DEG = 0.4
+"""Just after a reversal blocks are a twentieth of this angle plus of the angle since the reversal."""
+REST_DEG_S = 0.05
+"""Motor speed below which an axis stands."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Blocks of samples; arrays of shape (b,) but for those named otherwise."""
+
+    index: IntArray
+    """Usable samples, shape (u,)."""
+    first: IntArray
+    """Where each block begins in ``index``."""
+    weight: FloatArray
+    """Weight of each usable sample, shape (u,): 1, or 0 for an outlier."""
+    count: FloatArray
+    """Sum of the weights in a block."""
+    time_s: FloatArray
+    duration_s: FloatArray
+    motor_deg: FloatArray
+    travel_deg: FloatArray
+    """Way of the motor since the first sample, both directions counted positive."""
+    extent_deg: FloatArray
+    """Way inside the block."""
+    speed_deg_s: FloatArray
+    moving: BoolArray
+    heading: FloatArray
+    """1 or -1: the direction of motion, at rest the last one; 0 before the first."""
+    kind: IntArray
+    zero: IntArray
+    chain: IntArray
+    middle: IntArray
+    """The sample in the middle of each block."""
+    error_arcsec: FloatArray
+    blur: FloatArray
+    """Variance (arcsec squared) that each block has because the driving angle is not known better than a count."""
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self.first)
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Average of a per-sample quantity (n,) or (n, p) over each block: (b,) or (b, p)."""
+        picked = values[self.index]
+        weighted = picked * (self.weight if picked.ndim == 1 else self.weight[:, np.newaxis])
+        total = np.add.reduceat(weighted, self.first, axis=0)
+        count = np.maximum(self.count, 1e-300)
+        return np.asarray(total / (count if picked.ndim == 1 else count[:, np.newaxis]))
+
+    def picked(self, index: IntArray) -> Blocks:
+        """Some of the blocks, each stood for by its middle sample."""
+        values = {
+            each.name: getattr(self, each.name)[index]
+            for each in fields(self)
+            if each.name not in {"index", "first", "weight"}
+        }
+        middle = np.sort(self.middle[index])
+        return Blocks(index=middle, first=np.arange(len(index)), weight=np.ones(len(index)), **values)
+
+    def parts(self, samples: int) -> Iterator[tuple[slice, IntArray]]:
+        """Runs of whole blocks of about so many samples: the blocks, and the samples in them."""
+        begin = 0
+        while begin < len(self):
+            end = int(np.searchsorted(self.first, self.first[begin] + samples, "right"))
+            stop = int(self.first[end]) if end < len(self) else len(self.index)
+            yield slice(begin, end), self.index[self.first[begin] : stop]
+            begin = end
+
+    def mean_of_part(self, part: slice, values: FloatArray) -> FloatArray:
+        """Like `mean` for the values (m, p) of one part's samples."""
+        begin = int(self.first[part.start])
+        weighted = values * self.weight[begin : begin + len(values), np.newaxis]
+        total = np.add.reduceat(weighted, self.first[part] - begin, axis=0)
+        return np.asarray(total / np.maximum(self.count[part, np.newaxis], 1e-300))
+
+
+def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
+    """Cut the usable samples into blocks; ``weight`` (one per sample, 0 or 1) leaves outliers out."""
+    index = np.flatnonzero(samples.usable)
+    travel = np.concatenate([_travel(samples.motor_deg[chain.rows]) for chain in samples.chains])
+    chain = np.empty(len(samples), dtype=np.intp)
+    key = np.empty(len(samples), dtype=np.int64)
+    coarsest = float(
+        np.clip(sum(float(travel[each.rows][-1]) for each in samples.chains) / TARGET_BLOCKS, 1.0, 6.0)
+    )
+    for number, each in enumerate(samples.chains):
+        chain[each.rows] = number
+        key[each.rows] = _cells(samples.motor_deg[each.rows], coarsest)
+    time = samples.time_s
+    cut = np.ones(len(index), dtype=bool)
+    if len(index) > 1:
+        a, b = index[:-1], index[1:]
+        moving = np.abs(samples.speed_deg_s) > REST_DEG_S
+        cut[1:] = (
+            (b != a + 1)
+            | (key[a] != key[b])
+            | (samples.kind[a] != samples.kind[b])
+            | (chain[a] != chain[b])
+            | (moving[a] != moving[b])
+            | (np.floor(time[a] / LONGEST_S) != np.floor(time[b] / LONGEST_S))
+        )
+    first = np.flatnonzero(cut)
+    last = np.append(first[1:], len(index)) - 1
+    weights = np.ones(len(index)) if weight is None else weight[index]
+    count = np.add.reduceat(weights, first)
+    size = last - first + 1
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(values[index], first) / size)
+
+    weighted_error = np.add.reduceat(samples.error_arcsec[index] * weights, first) / np.maximum(count, 1e-300)
+    middle = index[(first + last) // 2]
+    return Blocks(
+        index=index,
+        first=first,
+        weight=weights,
+        count=count,
+        time_s=mean(time),
+        duration_s=time[index[last]] - time[index[first]],
+        motor_deg=mean(samples.motor_deg),
+        travel_deg=mean(travel),
+        extent_deg=travel[index[last]] - travel[index[first]],
+        speed_deg_s=mean(samples.speed_deg_s),
+        moving=np.abs(samples.speed_deg_s[middle]) > REST_DEG_S,
+        heading=np.concatenate([_heading(samples.motor_deg[each.rows]) for each in samples.chains])[middle],
+        kind=samples.kind[middle],
+        zero=samples.zero[middle],
+        chain=chain[middle],
+        middle=middle,
+        error_arcsec=weighted_error,
+        blur=np.zeros(len(first)),
+    )
+
+
+def _travel(motor_deg: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(motor_deg)))])
+
+
+def _heading(motor_deg: FloatArray) -> FloatArray:
+    steps = np.sign(np.diff(motor_deg, prepend=motor_deg[:1]))
+    last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+    return np.asarray(steps[last])
+
+
+def _cells(motor_deg: FloatArray, coarsest_deg: float) -> IntArray:
+    """A number per sample that changes from cell to cell of the way since the last turn."""
+    turning, _ = branches(motor_deg)
+    cells = np.zeros(len(motor_deg), dtype=np.int64)
+    edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest
+    base = 0
+    for first, last in zip(turning[:-1], turning[1:], strict=True):
+        since = np.abs(motor_deg[first + 1 : last + 1] - motor_deg[first])
+        near = 20.0 * np.log1p(np.minimum(since, edge) / FINE_DEG)
+        number = np.floor(near + np.maximum(since - edge, 0.0) / coarsest_deg).astype(np.int64)
+        cells[first + 1 : last + 1] = base + 1 + number
+        base = int(cells[last]) + 1
+    return cells

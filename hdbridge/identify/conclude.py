@@ -1,0 +1,217 @@
+"""Everything that is derived from the final solution, put together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hdbridge.effects import Effect, FloatArray, Synchronous
+from hdbridge.identify.beside import DELAY, TEXTS, UNITS
+from hdbridge.identify.design import Design
+from hdbridge.identify.figures import laps_arcsec, standing
+from hdbridge.identify.holdout import held_out
+from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths
+from hdbridge.identify.joint import Solution, is_valid
+from hdbridge.identify.linear import solve_symmetric
+from hdbridge.identify.options import FitOptions
+from hdbridge.identify.orders import Family, Selection, threshold
+from hdbridge.identify.residuals import residual_tests
+from hdbridge.identify.result import ChosenOrder, FitResult, NoiseFigures, Nuisance, Outliers, Traces
+from hdbridge.identify.samples import KINDS, Samples
+from hdbridge.identify.spectrum import Curve, Spectrum, assemble, plain_spectrum
+from hdbridge.identify.state import State
+from hdbridge.model import TransmissionModel
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+def conclude(
+    state: State,
+    solution: Solution,
+    cov: FloatArray,
+    selection: Selection,
+    outliers: Outliers,
+    options: FitOptions,
+    warnings: list[str],
+) -> FitResult:
+    """The result of an identification."""
+    design, blocks, samples = state.design, state.design.blocks, state.design.samples
+    problem = state.problem(selection)
+    precision = state.precision()
+    intervals = [
+        each for index in range(len(solution.effects)) for each in effect_intervals(solution, index, cov)
+    ]
+    effects = tuple(each for each in solution.effects if is_valid(each))
+    uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
+    inside = _inside_variance(design, solution, problem.beside.columns @ solution.beside)
+    samples_used = float(np.sum(blocks.count))
+    residual_rms = math.sqrt(float(blocks.count @ solution.residual**2) / samples_used + inside)
+    ones = np.ones(len(blocks))
+    figures = NoiseFigures(
+        standing=standing(samples),
+        laps_arcsec=laps_arcsec(samples),
+        model=state.noise,
+        residual_arcsec=residual_rms,
+        samples=int(samples_used),
+        effective_samples=residual_rms**2 * float(ones @ precision.apply(ones)),
+    )
+    further = _further(solution, cov)
+    zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
+    clean = solution.residual + sum(
+        (_predicted(design, each) for each in solution.effects if isinstance(each, Synchronous)),
+        start=np.zeros(len(blocks)),
+    )
+    lines = _lines(state, selection, clean, options)
+    _describe_limits(selection, lines, outliers, samples, warnings)
+    active = _sum(design, options.active.effects if options.active else ())
+    return FitResult(
+        model=TransmissionModel(samples.ratio, effects, uncertainty),
+        intervals=tuple(intervals),
+        zeros_arcsec=zeros,
+        nuisances=_nuisances(state, further, selection),
+        noise=figures,
+        outliers=outliers,
+        orders=_chosen(lines, selection, len(state.candidates), options),
+        spectrum=lines,
+        residual_tests=residual_tests(
+            solution.residual, blocks, precision, lines, {str(each) for each in selection.chosen}, figures
+        ),
+        held_out=held_out(problem, solution, state.noise, active, inside),
+        traces=Traces(
+            time_s=blocks.time_s,
+            motor_deg=blocks.motor_deg,
+            load_deg=blocks.motor_deg / samples.ratio + blocks.error_arcsec / ARCSEC_PER_DEG,
+            direction=blocks.heading * blocks.moving,
+            kind=tuple(each.value for each in KINDS),
+            kind_index=blocks.kind,
+            error_arcsec=blocks.error_arcsec - np.array(zeros)[blocks.zero],
+            predicted_arcsec=_sum(design, solution.effects),
+            residual_arcsec=solution.residual,
+        ),
+        warnings=tuple(warnings),
+    )
+
+
+def _inside_variance(design: Design, solution: Solution, beside: FloatArray) -> float:
+    """Variance of the residual of samples about the mean of their block."""
+    blocks = design.blocks
+    residual = design.residual(solution.effects, beside)[blocks.index]
+    sizes = np.diff(np.append(blocks.first, len(blocks.index)))
+    mean = np.add.reduceat(blocks.weight * residual, blocks.first) / np.maximum(blocks.count, 1.0)
+    off = residual - np.repeat(mean, sizes)
+    return float(blocks.weight @ off**2) / max(float(np.sum(blocks.count)), 1.0)
+
+
+def _predicted(design: Design, effect: Effect) -> FloatArray:
+    return np.asarray(design.columns(effect) @ effect.coefficients())
+
+
+def _sum(design: Design, effects: tuple[Effect, ...]) -> FloatArray:
+    return sum((_predicted(design, each) for each in effects), start=np.zeros(len(design.blocks)))
+
+
+def _lines(state: State, selection: Selection, clean: FloatArray, options: FitOptions) -> Spectrum:
+    """Each candidate's line with everything else that is in the fit: own coefficients, or what it would add."""
+    information, right = state.information()
+    waves = 2 * len(state.candidates)
+    inside = [
+        2 * index + part
+        for index, each in enumerate(state.candidates)
+        if each in selection.chosen
+        for part in (0, 1)
+    ]
+    always = list(range(waves, len(information)))
+    coefficients, errors = np.zeros(waves), np.zeros(waves)
+    for index in range(len(state.candidates)):
+        own = [2 * index, 2 * index + 1]
+        others = [each for each in inside if each not in own] + always
+        explained = solve_symmetric(information[np.ix_(others, others)], information[np.ix_(others, own)])
+        left = information[np.ix_(own, own)] - information[np.ix_(own, others)] @ explained
+        coefficients[own] = solve_symmetric(left, right[own] - explained.T @ right[others])
+        floor = 1e-9 * np.diag(information)[own]
+        errors[own] = 1.0 / np.sqrt(np.maximum(np.diag(left), floor))
+    blocks = state.design.blocks
+    shown = blocks.moving if np.count_nonzero(blocks.moving) > 0.5 * len(blocks) else blocks.count > 0
+    curve = Curve(*plain_spectrum(blocks.motor_deg[shown], clean[shown], blocks.count[shown]))
+    return assemble(
+        state.candidates,
+        coefficients,
+        errors,
+        information[:waves, :waves],
+        blocks.motor_deg,
+        state.design.samples.ratio,
+        options.family_wise,
+        curve,
+    )
+
+
+def _chosen(
+    lines: Spectrum, selection: Selection, candidates: int, options: FitOptions
+) -> tuple[ChosenOrder, ...]:
+    needed = threshold(candidates, options.family_wise)
+    return tuple(
+        ChosenOrder(
+            each.order,
+            each.amplitude_arcsec,
+            (each.amplitude_arcsec / max(each.standard_error_arcsec, 1e-12)) ** 2,
+            needed,
+        )
+        for each in lines.lines
+        if each.order in selection.chosen and each.order.family is Family.MOTOR
+    )
+
+
+def _further(solution: Solution, cov: FloatArray) -> dict[str, tuple[float, float]]:
+    """Value and half width of every column that is no effect's, by its name."""
+    places = [at for at, each in enumerate(solution.columns) if each.effect < 0]
+    return {
+        solution.columns[at].name: (value, NORMAL_95 * math.sqrt(max(float(cov[at, at]), 0.0)))
+        for at, value in zip(places, solution.beside.tolist(), strict=True)
+    }
+
+
+def _nuisances(
+    state: State, further: dict[str, tuple[float, float]], selection: Selection
+) -> tuple[Nuisance, ...]:
+    found = []
+    for name in state.nuisances:
+        if name not in TEXTS:
+            continue
+        value, half = further[name]
+        found.append(
+            Nuisance(name, TEXTS[name], value + (state.delay_ms if name == DELAY else 0.0), half, UNITS[name])
+        )
+    for order in selection.chosen:
+        if order.family is Family.MOTOR:
+            continue
+        cosine, sine = further[f"{order} cosine"], further[f"{order} sine"]
+        text = f"an error that repeats with {order}, which the model has no part for"
+        size = math.hypot(cosine[0], sine[0])
+        found.append(Nuisance(str(order), text, size, max(cosine[1], sine[1]), "arcsec"))
+    return tuple(found)
+
+
+def _describe_limits(
+    selection: Selection, lines: Spectrum, outliers: Outliers, samples: Samples, warnings: list[str]
+) -> None:
+    """Warnings about what the record's angles cannot tell apart, and about samples left out."""
+    for one, other in selection.twins:
+        warnings.append(f"{one} and {other} cannot be told apart at the angles of this record")
+    for order in selection.unresolved:
+        warnings.append(f"{order} cannot be told from what else was fitted")
+    if lines.resolution.load_turns < 0.95:
+        warnings.append(
+            f"the record spans {lines.resolution.load_turns:.2f} load turns: errors that repeat with the load "
+            "turn cannot be seen and may bend the rest; sweep over two"
+        )
+    if outliers.samples:
+        share = outliers.samples / len(samples)
+        warnings.append(
+            f"{outliers.samples} samples ({share:.2%}, at most {outliers.longest_run} in a row) stand out from "
+            "their neighbours and were given no weight: look for lost counts, plugs, shields"
+        )
+    for order in selection.chosen:
+        if order.family is not Family.MOTOR:
+            warnings.append(
+                f"{order} shows in this record; the model has no part for it, a diagnosis may name it"
+            )

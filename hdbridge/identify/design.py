@@ -1,0 +1,226 @@
+"""Columns of a fit, averaged over blocks, for effects that know nothing of blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hdbridge.effects import Effect, FloatArray, Motion, Start
+from hdbridge.effects.base import Memoryless
+from hdbridge.effects.hysteresis import branches
+from hdbridge.identify.blocks import Blocks
+from hdbridge.identify.samples import IntArray, Samples
+
+PART_SAMPLES = 50_000
+CHANNELS = ("time_s", "load_torque_nm", "motor_torque_nm", "temperature_c")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """Samples, their blocks, and the elastic state in which each chain begins."""
+
+    samples: Samples
+    blocks: Blocks
+    starts: tuple[Start, ...]
+    sketch: tuple[tuple[IntArray, IntArray], ...]
+    """Per chain: samples that stand for all (each block's middle, and the turns), and which of them are middles."""
+
+    memo: dict[Effect, FloatArray] = field(default_factory=dict)
+    """Columns of effects without shape or memory, which are asked for again and again."""
+
+    @classmethod
+    def of(cls, samples: Samples, blocks: Blocks, starts: Sequence[Start]) -> Design:
+        """Prepare columns for these blocks."""
+        return cls(samples, blocks, tuple(starts), tuple(_sketches(samples, blocks)))
+
+    def beginning(self, starts: Sequence[Start]) -> Design:
+        """The same with other states at the start."""
+        return replace(self, starts=tuple(starts))
+
+    def thinned(self, target: int, near_deg: float) -> tuple[Design, IntArray]:
+        """A design of about so many blocks for a search, and which they are; only inexact columns can be had of it.
+
+        All blocks within ``near_deg`` after a reversal stay, of the others a random share that counts for all.
+        """
+        blocks = self.blocks
+        near = np.zeros(len(blocks), dtype=bool)
+        for number, chain in enumerate(self.samples.chains):
+            turning, _ = branches(chain.motion.motor_deg)
+            place = np.array(turning) + chain.rows.start
+            turn = place[np.maximum(np.searchsorted(place, blocks.middle, "left") - 1, 0)]
+            since = np.abs(self.samples.motor_deg[blocks.middle] - self.samples.motor_deg[turn])
+            near |= (blocks.chain == number) & (since < near_deg)
+        far = np.flatnonzero(~near)
+        share = min(max(target - np.count_nonzero(near), target // 2) / max(len(far), 1), 1.0)
+        kept = far[np.random.default_rng(0).random(len(far)) < share]
+        index = np.sort(np.concatenate([np.flatnonzero(near), kept]))
+        part = blocks.picked(index)
+        part = replace(part, count=np.where(near[index], part.count, part.count / share))
+        return Design.of(self.samples, part, self.starts), index
+
+    def columns(self, effect: Effect, exact: bool = True) -> FloatArray:
+        """Columns of an effect, shape (blocks, p); ``exact`` averages all samples, else the middles stand for them."""
+        memoryless = isinstance(effect.tracker(), Memoryless)
+        if memoryless and exact:
+            key = effect.fitted(np.zeros_like(effect.coefficients()))
+            if effect.shape:
+                return self._in_parts(effect)
+            if key not in self.memo:
+                self.memo[key] = self._in_parts(effect)
+            return self.memo[key]
+        width = len(effect.coefficients())
+        result = np.empty((len(self.blocks), width))
+        every = np.empty((len(self.samples), width)) if exact else None
+        for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
+            if every is not None:
+                every[chain.rows] = effect.columns(chain.motion, start)
+            else:
+                picked, middles = self.sketch[number]
+                inside = self.blocks.chain == number
+                result[inside] = effect.columns(_picked(chain.motion, picked), start)[middles]
+        return result if every is None else self.blocks.mean(every)
+
+    def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
+        """What half a count further at the turn before would change, arcsec per count (b,), and which turn that is.
+
+        Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
+        """
+        change = np.zeros(len(self.blocks))
+        turn = np.zeros(len(self.blocks), dtype=np.intp)
+        shift = 0.5 * self.samples.count_deg
+        last = 0
+        for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
+            picked, middles = self.sketch[number]
+            motion = _picked(chain.motion, picked)
+            turning, signs = branches(motion.motor_deg, Start.VIRGIN)
+            inside = self.blocks.chain == number
+            turn[inside] = last + np.searchsorted(turning, middles, "left")
+            last += len(turning) + 1
+            if shift <= 0 or not signs:
+                continue
+            moved_motor = motion.motor_deg.copy()
+            moved_motor[turning[1:-1]] += shift * np.array(signs[:-1])
+            other = replace(motion, motor_deg=moved_motor)
+            for effect in effects:
+                if not isinstance(effect.tracker(), Memoryless):
+                    change[inside] += (effect.predict(other, start) - effect.predict(motion, start))[middles]
+        return change / max(shift, 1e-12) * self.samples.count_deg, turn
+
+    def blurred(self, effects: Sequence[Effect]) -> Design:
+        """The same, each block's variance raised by what a count's rounding of the driving angle does to the effects.
+
+        Just after a turn a hysteresis may rise without bound: what is measured there says little, and should
+        not say much.
+        """
+        change, _ = self.turn_effects(effects)
+        return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
+
+    def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
+        """Observation minus effects for each sample, minus what ``rest`` gives per block; NaN where not usable."""
+        left = self.samples.error_arcsec.copy()
+        for chain, start in zip(self.samples.chains, self.starts, strict=True):
+            for effect in effects:
+                left[chain.rows] -= effect.predict(chain.motion, start)
+        result = np.full(len(left), np.nan)
+        index = self.blocks.index
+        sizes = np.diff(np.append(self.blocks.first, len(index)))
+        result[index] = left[index] - np.repeat(rest, sizes)
+        return result
+
+    def _in_parts(self, effect: Effect) -> FloatArray:
+        """Without memory a sample's columns do not depend on the others, so a part at a time will do."""
+        motion = _joined([chain.motion for chain in self.samples.chains])
+        result = np.empty((len(self.blocks), len(effect.coefficients())))
+        for part, index in self.blocks.parts(PART_SAMPLES):
+            result[part] = self.blocks.mean_of_part(part, effect.columns(_picked(motion, index)))
+        return result
+
+
+def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
+    """Cosine and sine of each order of the motor angle, block averages, shape (blocks, 2 * orders).
+
+    Orders need not be whole numbers: 1 / N is once per load turn, k (1 + 1/N) the flexspline's.
+    """
+    blocks, motor = design.blocks, design.samples.motor_deg
+    result = np.empty((len(blocks), 2 * len(orders)))
+    rate = np.deg2rad(np.asarray(orders, dtype=np.float64))
+    for part, index in blocks.parts(PART_SAMPLES):
+        angles = np.outer(motor[index], rate)
+        both = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(index), -1)
+        result[part] = blocks.mean_of_part(part, both)
+    return result
+
+
+def tangents(
+    design: Design, effect: Effect, coefficients: FloatArray, exact: bool = True
+) -> tuple[list[str], FloatArray]:
+    """Derivatives of an effect's prediction by its shape parameters: their names, and columns (blocks, s).
+
+    Central differences, one-sided at a bound; logarithmic parameters are differentiated by their logarithm.
+    """
+    names: list[str] = []
+    columns: list[FloatArray] = []
+    for shape in effect.shape:
+        here = float(getattr(effect, shape.name))
+        step = 1e-3 * here if shape.logarithmic else 1e-3 * (shape.upper - shape.lower)
+        low, high = max(here - step, shape.lower), min(here + step, shape.upper)
+        span = np.log(high / low) if shape.logarithmic else high - low
+        either = [
+            design.columns(effect.fitted(coefficients, {shape.name: value}), exact) @ coefficients
+            for value in (low, high)
+        ]
+        names.append(shape.name)
+        columns.append((either[1] - either[0]) / span)
+    return names, np.stack(columns, axis=1) if columns else np.empty((len(design.blocks), 0))
+
+
+def moved(effect: Effect, coefficients: FloatArray, steps: Mapping[str, float]) -> Effect:
+    """The effect with its shape parameters moved (logarithmic ones in the logarithm), kept in their ranges."""
+    values: dict[str, float] = {}
+    for shape in effect.shape:
+        here = float(getattr(effect, shape.name))
+        step = steps.get(shape.name, 0.0)
+        there = here * float(np.exp(np.clip(step, -1.0, 1.0))) if shape.logarithmic else here + step
+        values[shape.name] = min(max(there, shape.lower), shape.upper)
+    return effect.fitted(coefficients, values)
+
+
+def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray]]:
+    result = []
+    for number, chain in enumerate(samples.chains):
+        middles = blocks.middle[blocks.chain == number] - chain.rows.start
+        turning, _ = branches(chain.motion.motor_deg, Start.VIRGIN)
+        first_moves = np.flatnonzero(np.diff(chain.motion.motor_deg))[:1]
+        picked = np.union1d(np.concatenate([middles, np.array(turning), first_moves]), []).astype(np.intp)
+        result.append((picked, np.searchsorted(picked, middles)))
+    return result
+
+
+def _picked(motion: Motion, index: IntArray) -> Motion:
+    channels = {name: getattr(motion, name) for name in CHANNELS}
+    return Motion(
+        motion.motor_deg[index],
+        **{name: None if values is None else values[index] for name, values in channels.items()},
+    )
+
+
+def _joined(motions: Sequence[Motion]) -> Motion:
+    if len(motions) == 1:
+        return motions[0]
+    parts = {name: [getattr(each, name) for each in motions] for name in CHANNELS}
+    return Motion(
+        np.concatenate([each.motor_deg for each in motions]),
+        **{
+            name: None if any(each is None for each in values) else np.concatenate(values)
+            for name, values in parts.items()
+        },
+    )
+
+
+def clusters(blocks: Blocks, span_s: float) -> IntArray:
+    """A number per block that changes where a chain does, or after every ``span_s`` of measured time."""
+    gone = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(blocks.time_s), 0.0, 1.0))])
+    cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
+    return np.concatenate([[0], np.cumsum(cut)]).astype(np.intp)

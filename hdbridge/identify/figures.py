@@ -1,0 +1,108 @@
+"""Noise as the axis itself shows it, without any model: at rest, and between one lap and the next."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from hdbridge.effects import FloatArray
+from hdbridge.effects.hysteresis import branches
+from hdbridge.identify.blocks import REST_DEG_S
+from hdbridge.identify.result import Outliers, Standing
+from hdbridge.identify.samples import KINDS, Samples
+from hdbridge.identify.segment import Kind
+
+SHORTEST_REST_S = 1.0
+LAP_BIN_DEG = 30.0
+WINDOW = 51
+"""Samples whose median an outlier is compared with."""
+OUTLYING = 6.0
+"""Robust standard deviations."""
+
+
+def standing(samples: Samples) -> Standing | None:
+    """Noise at rest: rms about the mean of each rest, and how it hangs together in time."""
+    still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    runs = [
+        slice(begin, end)
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        if end - begin >= 20 and samples.time_s[end - 1] - samples.time_s[begin] >= SHORTEST_REST_S
+    ]
+    if not runs:
+        return None
+    parts = [samples.error_arcsec[run] - np.mean(samples.error_arcsec[run]) for run in runs]
+    every = np.concatenate(parts)
+    period = float(np.median(np.concatenate([np.diff(samples.time_s[run]) for run in runs])))
+    time = _integrated_correlation(parts)
+    return Standing(
+        rms_arcsec=float(np.sqrt(np.mean(every**2))),
+        correlation_s=0.5 * (time - 1.0) * period,
+        samples=len(every),
+        effective_samples=len(every) / time,
+    )
+
+
+def laps_arcsec(samples: Samples) -> float | None:
+    """Rms by which two passes of a sweep in the same direction differ, over the root of two; means over `LAP_BIN_DEG`."""
+    passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
+    sweep = samples.usable & (samples.kind == KINDS.index(Kind.SWEEP))
+    for chain in samples.chains:
+        turning, signs = branches(chain.motion.motor_deg)
+        for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
+            rows = np.arange(chain.rows.start + first + 1, chain.rows.start + last + 1)
+            rows = rows[sweep[rows]]
+            if len(rows) < 20:
+                continue
+            cells = np.floor(samples.motor_deg[rows] / LAP_BIN_DEG).astype(np.int64)
+            names, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
+            means = np.bincount(inverse, samples.error_arcsec[rows]) / counts
+            # The first cells of a pass are on the way across the hysteresis.
+            keep = slice(5, None) if sign > 0 else slice(None, -5)
+            passes[sign].append(dict(zip(names[keep].tolist(), means[keep].tolist(), strict=True)))
+    differences = [
+        earlier[cell] - later[cell]
+        for each in passes.values()
+        for earlier, later in zip(each[:-1], each[1:], strict=True)
+        for cell in earlier.keys() & later.keys()
+    ]
+    if len(differences) < 8:
+        return None
+    return float(np.sqrt(np.mean(np.square(differences)) / 2.0))
+
+
+def outlying(residual: FloatArray) -> tuple[FloatArray, Outliers]:
+    """Weights (n,), 0 for samples far from the median of their neighbours; NaN residuals keep 1.
+
+    Compared with neighbours and not with the model, so that what the model lacks is not thrown away, and a
+    step that stays (lost counts) is left in for all to see.
+    """
+    weight = np.ones(len(residual))
+    index = np.flatnonzero(np.isfinite(residual))
+    if len(index) < WINDOW:
+        return weight, Outliers(0, 0)
+    values = residual[index]
+    off = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
+    scale = max(1.4826 * float(np.median(off)), 0.1)
+    out = off > OUTLYING * scale
+    weight[index[out]] = 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
+    runs = edges[1::2] - edges[::2]
+    return weight, Outliers(int(np.count_nonzero(out)), int(np.max(runs, initial=0)))
+
+
+def _integrated_correlation(parts: list[FloatArray]) -> float:
+    """1 + 2 sum of the autocorrelations up to where their sum in pairs is no longer positive (Geyer 1992)."""
+    longest = max(len(each) for each in parts)
+    total = np.zeros(longest)
+    for each in parts:
+        size = 2 * len(each)
+        power = np.abs(np.fft.rfft(each, size)) ** 2
+        total[: len(each)] += np.fft.irfft(power, size)[: len(each)]
+    if total[0] <= 0:
+        return 1.0
+    rho = total / total[0]
+    pairs = rho[: longest // 2 * 2].reshape(-1, 2).sum(axis=1)
+    negative = np.flatnonzero(pairs <= 0)
+    until = int(negative[0]) if len(negative) else len(pairs)
+    return max(2.0 * float(np.sum(pairs[:until])) - 1.0, 1.0)

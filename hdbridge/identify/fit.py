@@ -1,0 +1,187 @@
+"""From records to a model: the steps of an identification, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hdbridge.effects import Channel, Effect, FloatArray, Start
+from hdbridge.errors import InputError
+from hdbridge.identify.beside import DELAY, ROUNDING, SHARE, TURNS, delay_column, share_left, zeros
+from hdbridge.identify.blocks import make_blocks
+from hdbridge.identify.conclude import conclude
+from hdbridge.identify.design import Design, harmonics
+from hdbridge.identify.figures import outlying
+from hdbridge.identify.intervals import covariance, effect_intervals
+from hdbridge.identify.joint import Problem, Solution, is_valid, joint_fit, search
+from hdbridge.identify.noise import NoiseModel, Precision, fit_noise
+from hdbridge.identify.options import FitOptions
+from hdbridge.identify.orders import Selection
+from hdbridge.identify.result import FitResult, Outliers
+from hdbridge.identify.samples import Samples, gather
+from hdbridge.identify.segment import Segment
+from hdbridge.identify.state import State, candidate_orders
+
+MINIMUM_USABLE = 50
+EFFECT_SHARE = 1e-3
+"""An effect of whose columns less than this is left by the zeros and orders is not in the record."""
+SEARCH_BLOCKS = 8_000
+NEAR_DEG = 120.0
+"""The search takes all blocks within this motor angle after a reversal, and some of the others."""
+ROUNDS = 3
+
+
+def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = None) -> FitResult:
+    """Identify an axis of gear ratio ``ratio`` from stretches of a measurement.
+
+    InputError where the record cannot be used at all; what it cannot say stands in the result's ``warnings``.
+    """
+    options = options or FitOptions()
+    warnings: list[str] = []
+    samples = gather(segments, ratio, options.start, options.slow_deg_s, options.independent_zeros)
+    usable = int(np.count_nonzero(samples.usable))
+    if usable < MINIMUM_USABLE:
+        raise InputError(
+            f"{segments[0].name}: only {usable} of {len(samples)} samples are slow enough to be used; expected "
+            f"at least {MINIMUM_USABLE}: record slow sweeps, sines and rests"
+        )
+    state = _prepare(samples, options, warnings)
+    state = _search(state, warnings)
+    state, solution, selection, outliers = _settle(state, options)
+    solution, cov = _hold_what_is_unknown(state, solution, selection, options, warnings)
+    return conclude(state, solution, cov, selection, outliers, options, warnings)
+
+
+def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> State:
+    """Blocks, columns, and which effects and nuisances the record can show at all."""
+    starts = [each.start or Start.FORWARD for each in samples.chains]
+    design = Design.of(samples, make_blocks(samples), starts)
+    candidates = candidate_orders(design, options)
+    waves = harmonics(design, [each.per_motor_turn for each in candidates])
+    always = np.concatenate([zeros(design), waves], axis=1)
+    weight = design.blocks.count
+    effects: list[Effect] = []
+    for effect in options.effects:
+        missing = [each.value for each in effect.channels if not _has(samples, each)]
+        if missing:
+            warnings.append(f"{effect.name}: not fitted, the record has no {', '.join(missing)}")
+            continue
+        prototype = options.prototype(effect)
+        if share_left(design.columns(prototype, exact=False), always, weight) < EFFECT_SHARE:
+            warnings.append(
+                f"{effect.name}: left out, it cannot be told from the zero in this record (no reversal?); "
+                "record both directions"
+            )
+            continue
+        effects.append(prototype)
+    known = np.concatenate([zeros(design), *(design.columns(each, exact=False) for each in effects)], axis=1)
+    nuisances = []
+    delay = delay_column(design)
+    size = float(np.sqrt(weight @ delay[:, 0] ** 2 / np.sum(weight)))
+    if size > 1e-3 and share_left(delay, known, weight) > SHARE:
+        nuisances.append(DELAY)
+    elif effects and size > 0.05:
+        warnings.append(
+            "a delay between the two encoders cannot be told from the hysteresis' offset at one speed: "
+            f"one millisecond would be {size:.2f} arcsec; record a second speed"
+        )
+    if samples.count_deg and effects:
+        nuisances += [ROUNDING, TURNS]
+    return State(design, candidates, waves, tuple(nuisances), tuple(effects), NoiseModel(1.0, 1.0))
+
+
+def _search(state: State, warnings: list[str]) -> State:
+    """Shapes from a grid, the elastic state at the start where it is not known, and a first noise model."""
+    thin, picked = state.design.thinned(SEARCH_BLOCKS, NEAR_DEG)
+    waves = [f"{each} {part}" for each in state.candidates for part in ("cosine", "sine")]
+    simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
+    columns = simple.beside().and_waves(state.waves, waves)
+
+    def found(design: Design, effects: tuple[Effect, ...]) -> tuple[float, tuple[Effect, ...]]:
+        problem = Problem(design, effects, columns.rows(picked))
+        return search(problem, Precision(state.noise, design.blocks))
+
+    cost, effects = found(thin, state.effects)
+    starts = list(state.design.starts)
+    for number, chain in enumerate(thin.samples.chains):
+        if chain.start is not None or not effects:
+            continue
+        tried = [(cost, effects, starts)]
+        for start in (Start.VIRGIN, Start.BACKWARD):
+            others = [*starts[:number], start, *starts[number + 1 :]]
+            tried.append((*found(thin.beginning(others), effects), others))
+        cost, effects, starts = min(tried, key=lambda each: each[0])
+    for each in effects:
+        if not is_valid(each):
+            warnings.append(f"{each.name}: left out, the record shows it only with an impossible sign")
+    effects = tuple(each for each in effects if is_valid(each))
+    design = state.design.beginning(starts).blurred(effects)
+    state = state._replace(design=design, effects=effects)
+    problem = Problem(design, effects, columns)
+    solution = joint_fit(problem, state.precision(), 0, exact=False)
+    return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
+
+
+def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selection, Outliers]:
+    """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
+    selection = state.selected(options)
+    problem = state.problem(selection)
+    solution = joint_fit(problem, state.precision(), exact=False)
+    weight, outliers = outlying(
+        problem.design.residual(solution.effects, problem.beside.columns @ solution.beside)
+    )
+    delay_ms = dict(zip(problem.beside.names, solution.beside.tolist(), strict=True)).get(DELAY, 0.0)
+    if outliers.samples or delay_ms:
+        state = state.after(solution).remade(
+            state.design.samples.delayed(delay_ms / 1000.0), weight, delay_ms
+        )
+    for turn in range(ROUNDS):
+        state = state.after(solution)
+        solution = joint_fit(state.problem(selection), state.precision())
+        noise = fit_noise(solution.residual, state.design.blocks, solution.jacobian.shape[1], state.noise)
+        state = state.after(solution)._replace(noise=noise)
+        again = state.selected(options)
+        if again.chosen == selection.chosen and turn:
+            break
+        selection = again
+    solution = joint_fit(state.problem(selection), state.precision())
+    return state.after(solution), solution, selection, outliers
+
+
+def _hold_what_is_unknown(
+    state: State, solution: Solution, selection: Selection, options: FitOptions, warnings: list[str]
+) -> tuple[Solution, FloatArray]:
+    """Where the data cannot say what shape an effect has, it keeps the one that it came with."""
+    blocks = state.design.blocks
+    cov = covariance(solution, state.precision(), blocks)
+    effects = list(solution.effects)
+    held = False
+    for index, effect in enumerate(effects):
+        unknown = [each for each in effect_intervals(solution, index, cov) if not each.identifiable]
+        edge = [name for owner, name in solution.at_bound if owner == index]
+        if edge and not unknown:
+            warnings.append(
+                f"{effect.name}: {', '.join(edge)} ended on the edge of its range: do not trust its interval, "
+                "or the law is not this gear's"
+            )
+        if unknown:
+            prototype = options.prototype(next(each for each in options.effects if each.name == effect.name))
+            shape = {each.name: float(getattr(prototype, each.name)) for each in effect.shape}
+            effects[index] = effect.fitted(effect.coefficients(), shape)
+            names = [each.parameter for each in unknown]
+            held = True
+            warnings.append(
+                f"{effect.name}: {' and '.join(names)} cannot be identified from this record; its shape is "
+                "kept as it was: record slow sines and nested reversals"
+            )
+    if held:
+        problem = replace(state.problem(selection), effects=tuple(effects))
+        solution = joint_fit(problem, state.precision(), iterations=0)
+        cov = covariance(solution, state.precision(), blocks)
+    return solution, cov
+
+
+def _has(samples: Samples, channel: Channel) -> bool:
+    return all(getattr(chain.motion, channel.value) is not None for chain in samples.chains)

@@ -1,0 +1,211 @@
+"""Noise that is not white, and least squares that know it.
+
+Three parts: white noise (its size may differ between standing and moving), a slow wander in time, and a
+wander over the motor's *way*: an axis rests anywhere within a count of its encoder, the same way as long as
+it stands and another way at the next stop. Both wanders are first-order Markov processes, so the inverse of
+their covariance is banded, and a fit costs no more than one with white noise (Rybicki and Press 1995).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import minimize
+
+from hdbridge.effects import FloatArray
+from hdbridge.identify.blocks import Blocks
+from hdbridge.identify.samples import BoolArray, IntArray
+
+PIECES = 24
+PIECE_BLOCKS = 300
+SMALLEST_ARCSEC = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Standard deviations and correlation lengths."""
+
+    standing_arcsec: float
+    """White, of one sample, at rest."""
+    moving_arcsec: float
+    """White, of one sample, in motion."""
+    slow_arcsec: float = 0.0
+    slow_s: float = 10.0
+    """Wander in time: its size, and the time in which it forgets."""
+    place_arcsec: float = 0.0
+    place_deg: float = 0.1
+    """Wander over the motor's way: its size, and the way over which it forgets."""
+
+    def white_variance(self, blocks: Blocks) -> FloatArray:
+        """Of each block's mean; infinite for blocks without samples."""
+        sample = np.where(blocks.moving, self.moving_arcsec, self.standing_arcsec) ** 2
+        mean = np.divide(sample, blocks.count, out=np.full(len(blocks), np.inf), where=blocks.count > 0)
+        return np.asarray(mean + blocks.blur)
+
+
+class Precision:
+    """The inverse covariance of the noise of some blocks, applied without ever being written out.
+
+    K = W + H S H', W white, S of the wanders. By Woodbury, with P = S^-1 (tridiagonal for each wander),
+    K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
+    """
+
+    def __init__(self, noise: NoiseModel, blocks: Blocks, left_out: BoolArray | None = None) -> None:
+        """Blocks in ``left_out`` count as not observed."""
+        weight = 1.0 / noise.white_variance(blocks)
+        if left_out is not None:
+            weight = np.where(left_out, 0.0, weight)
+        self.weight: FloatArray = weight
+        self._loads: list[FloatArray] = []
+        chains: list[tuple[FloatArray, FloatArray]] = []
+        fresh = np.diff(blocks.chain) != 0
+        self._log_determinant = float(np.sum(np.log(weight[weight > 0])))
+        for size, length, place, extent in (
+            (noise.slow_arcsec, noise.slow_s, blocks.time_s, blocks.duration_s),
+            (noise.place_arcsec, noise.place_deg, blocks.travel_deg, blocks.extent_deg),
+        ):
+            if size <= 0:
+                continue
+            step = np.where(fresh, np.inf, np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length)
+            spread = -np.expm1(-2.0 * step)
+            decay = np.exp(-step)
+            diagonal = np.ones(len(blocks))
+            diagonal[:-1] += decay**2 / spread
+            diagonal[1:] += decay**2 / spread
+            chains.append((diagonal, -decay / spread))
+            self._loads.append(size * np.sqrt(_averaged(extent / length)))
+            self._log_determinant += float(-np.sum(np.log(spread)))
+        self._factor = self._factored(chains) if chains else None
+
+    def _factored(self, chains: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+        """Cholesky factor of the bracket, wanders interleaved."""
+        width, count = len(chains), len(self.weight)
+        band = np.zeros((width + 1, width * count))
+        for number, (diagonal, beside) in enumerate(chains):
+            band[0, number::width] = diagonal + self.weight * self._loads[number] ** 2
+            band[width, number : width * (count - 1) : width] = beside
+        if width == 2:
+            band[1, 0::2] = self.weight * self._loads[0] * self._loads[1]
+        factor: FloatArray = cholesky_banded(band, lower=True, check_finite=False)
+        self._log_determinant -= 2.0 * float(np.sum(np.log(factor[0])))
+        return factor
+
+    def apply(self, columns: FloatArray) -> FloatArray:
+        """K^-1 times columns of shape (b,) or (b, p)."""
+        flat = columns.ndim == 1
+        values = columns[:, np.newaxis] if flat else columns
+        weighted = self.weight[:, np.newaxis] * values
+        if self._factor is not None:
+            width = len(self._loads)
+            right = np.empty((width * len(values), values.shape[1]))
+            for number, load in enumerate(self._loads):
+                right[number::width] = load[:, np.newaxis] * weighted
+            inner = cho_solve_banded((self._factor, True), right, overwrite_b=True, check_finite=False)
+            back = sum(load[:, np.newaxis] * inner[number::width] for number, load in enumerate(self._loads))
+            weighted = weighted - self.weight[:, np.newaxis] * back
+        return weighted[:, 0] if flat else weighted
+
+    def log_likelihood(self, residual: FloatArray) -> float:
+        """Of Gaussian noise, up to a constant; only blocks that were observed count."""
+        return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
+
+
+def _averaged(extent: FloatArray) -> FloatArray:
+    """Variance of a wander's mean over a block, by that of the wander itself; extent in its own lengths."""
+    x = np.maximum(extent, 1e-6)
+    return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
+
+
+def fit_noise(
+    residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel | None = None
+) -> NoiseModel:
+    """The noise model that makes a residual (b,) most likely.
+
+    Pieces of the record, spread over all of it, are enough: a likelihood of ten thousand blocks. ``parameters``
+    that were fitted have taken their share of the white noise out.
+    """
+    pieces = _pieces(blocks)
+    part = blocks.picked(pieces)
+    left = residual[pieces]
+    begin = begin or first_guess(residual, blocks)
+    still = not np.any(part.moving)
+    always = np.all(part.moving)
+
+    def model(x: FloatArray) -> NoiseModel:
+        white = np.exp(x[:2])
+        return NoiseModel(
+            standing_arcsec=float(white[1] if always else white[0]),
+            moving_arcsec=float(white[0] if still else white[1]),
+            slow_arcsec=float(np.exp(x[2])),
+            slow_s=float(np.exp(x[3])),
+            place_arcsec=float(np.exp(x[4])),
+            place_deg=float(np.exp(x[5])),
+        )
+
+    lower = np.log([SMALLEST_ARCSEC, SMALLEST_ARCSEC, SMALLEST_ARCSEC, 0.3, SMALLEST_ARCSEC, 0.01])
+    upper = np.log([1e3, 1e3, 1e3, 600.0, 1e3, 60.0])
+
+    def cost(x: FloatArray) -> float:
+        return -Precision(model(x), part).log_likelihood(left)
+
+    x = np.log(
+        np.maximum(
+            [
+                begin.standing_arcsec, begin.moving_arcsec, begin.slow_arcsec,
+                begin.slow_s, begin.place_arcsec, begin.place_deg,
+            ],
+            SMALLEST_ARCSEC,
+        )
+    )  # fmt: skip
+    found = minimize(
+        cost,
+        np.clip(x, lower, upper),
+        method="L-BFGS-B",
+        bounds=list(zip(lower, upper, strict=True)),
+        options={"maxiter": 40, "ftol": 1e-7},
+    )
+    best = model(found.x)
+    share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
+    return NoiseModel(
+        best.standing_arcsec * share,
+        best.moving_arcsec * share,
+        best.slow_arcsec,
+        best.slow_s,
+        best.place_arcsec,
+        best.place_deg,
+    )
+
+
+def first_guess(residual: FloatArray, blocks: Blocks) -> NoiseModel:
+    """White noise from differences of neighbouring blocks; half of the rest to each wander."""
+    neighbours = (np.diff(blocks.chain) == 0) & (np.diff(blocks.time_s) < 1.0)
+    scaled = np.diff(residual) / np.sqrt(
+        1.0 / np.maximum(blocks.count[1:], 1) + 1.0 / np.maximum(blocks.count[:-1], 1)
+    )
+
+    def white(which: BoolArray) -> float:
+        picked = scaled[neighbours & which[1:] & which[:-1]]
+        if len(picked) < 10:
+            picked = scaled[neighbours]
+        return float(1.4826 * np.median(np.abs(picked))) if len(picked) else 1.0
+
+    rest = max(float(np.median(np.abs(residual)) * 1.4826), SMALLEST_ARCSEC) * np.sqrt(0.5)
+    return NoiseModel(
+        max(white(~blocks.moving), SMALLEST_ARCSEC),
+        max(white(blocks.moving), SMALLEST_ARCSEC),
+        rest,
+        5.0,
+        rest,
+        0.2,
+    )
+
+
+def _pieces(blocks: Blocks) -> IntArray:
+    """Blocks of some pieces spread evenly over the record."""
+    count = len(blocks)
+    if count <= PIECES * PIECE_BLOCKS:
+        return np.arange(count)
+    begins = np.linspace(0, count - PIECE_BLOCKS, PIECES).astype(np.intp)
+    return np.unique(np.concatenate([np.arange(begin, begin + PIECE_BLOCKS) for begin in begins]))

@@ -1,0 +1,88 @@
+"""What is left, questioned: does it hang on the motor angle, the load angle, the direction, the time?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hdbridge.effects import FloatArray
+from hdbridge.identify.blocks import Blocks
+from hdbridge.identify.noise import NoiseModel, Precision
+from hdbridge.identify.orders import Family
+from hdbridge.identify.result import NoiseFigures, ResidualTest
+from hdbridge.identify.spectrum import Spectrum
+
+SURE = 3.0
+"""Standard errors that a difference must have."""
+WORTH_ARCSEC = 0.3
+"""What is smaller than this is not reported as a failure, however sure it is."""
+
+
+def residual_tests(
+    residual: FloatArray,
+    blocks: Blocks,
+    precision: Precision,
+    lines: Spectrum,
+    fitted_orders: set[str],
+    figures: NoiseFigures,
+) -> tuple[ResidualTest, ...]:
+    """All tests; ``fitted_orders`` are names of orders in the fit."""
+    return (
+        _orders("motor_angle", lines, (Family.MOTOR, Family.FLEXSPLINE), fitted_orders),
+        _orders("load_angle", lines, (Family.LOAD,), fitted_orders),
+        _contrast("direction", np.sign(blocks.speed_deg_s) * blocks.moving, residual, precision, 2.0),
+        _contrast("time", _centred(blocks.time_s), residual, precision, 1.0),
+        _whiteness(figures.model),
+        _level(figures),
+    )
+
+
+def _orders(name: str, lines: Spectrum, families: tuple[Family, ...], fitted: set[str]) -> ResidualTest:
+    left = [
+        each
+        for each in lines.lines
+        if each.order.family in families and str(each.order) not in fitted and each.significant
+    ]
+    worst = max(left, key=lambda each: each.amplitude_arcsec, default=None)
+    size = worst.amplitude_arcsec if worst else 0.0
+    text = f"{worst.order} of {size:.2f} arcsec is left" if worst else "no order is left"
+    return ResidualTest(name, size < WORTH_ARCSEC, size, text)
+
+
+def _contrast(
+    name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
+) -> ResidualTest:
+    """Generalised least squares of the residual on one column and the mean; size is that of ``scale`` columns."""
+    columns = np.stack([np.ones(len(column)), column], axis=1)
+    weighted = precision.apply(columns)
+    information = columns.T @ weighted
+    if np.linalg.cond(information) > 1e12:
+        return ResidualTest(name, True, 0.0, f"the record does not vary in {name}")
+    inverse = np.linalg.inv(information)
+    value = float((inverse @ (weighted.T @ residual))[1]) * scale
+    error = math.sqrt(max(inverse[1, 1], 0.0)) * scale
+    passed = abs(value) < max(SURE * error, WORTH_ARCSEC)
+    return ResidualTest(name, passed, abs(value), f"{value:+.2f} arcsec, standard error {error:.2f}")
+
+
+def _centred(time_s: FloatArray) -> FloatArray:
+    span = float(np.ptp(time_s))
+    return (time_s - np.mean(time_s)) / span if span else np.zeros(len(time_s))
+
+
+def _whiteness(noise: NoiseModel) -> ResidualTest:
+    size = math.hypot(noise.slow_arcsec, noise.place_arcsec)
+    text = (
+        f"wanders by {noise.slow_arcsec:.2f} arcsec within {noise.slow_s:.1f} s and by "
+        f"{noise.place_arcsec:.2f} arcsec within {noise.place_deg:.2f} deg of the motor; the intervals allow for it"
+    )
+    return ResidualTest("whiteness", size < WORTH_ARCSEC, size, text)
+
+
+def _level(figures: NoiseFigures) -> ResidualTest:
+    if figures.standing is None:
+        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
+    size = math.sqrt(max(figures.residual_arcsec**2 - figures.standing.rms_arcsec**2, 0.0))
+    text = f"{figures.residual_arcsec:.2f} arcsec is left, at rest the noise is {figures.standing.rms_arcsec:.2f}"
+    return ResidualTest("noise_level", size < max(figures.standing.rms_arcsec, 1.0), size, text)

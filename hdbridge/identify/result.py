@@ -1,0 +1,153 @@
+"""What an identification says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hdbridge.effects import FloatArray
+from hdbridge.identify.intervals import Interval
+from hdbridge.identify.noise import NoiseModel
+from hdbridge.identify.orders import Order
+from hdbridge.identify.spectrum import Spectrum
+from hdbridge.model import TransmissionModel
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """The noise of an axis at rest."""
+
+    rms_arcsec: float
+    """About the mean of each rest."""
+    correlation_s: float
+    """Time over which it is correlated with itself (integrated autocorrelation)."""
+    samples: int
+    effective_samples: float
+    """As many independent samples would tell as much about a mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFigures:
+    """How noisy the record is, and how far the model's residual is above that."""
+
+    standing: Standing | None
+    """None where the axis never stood for long enough."""
+    laps_arcsec: float | None
+    """What two passes over the same angles in the same direction differ by, over the root of two; block means."""
+    model: NoiseModel
+    """White noise and wanders as the intervals use them, from the residual."""
+    residual_arcsec: float
+    """Rms of the residual of a sample."""
+    samples: int
+    """Used by the fit."""
+    effective_samples: float
+    """Independent samples of the residual's size that would fix the zero as well as these do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outliers:
+    """Samples that stand out alone and were given no weight."""
+
+    samples: int
+    longest_run: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualTest:
+    """One question to the residual."""
+
+    name: str
+    """motor_angle, load_angle, direction, time, whiteness, noise_level."""
+    passed: bool
+    size_arcsec: float
+    """How large what was found is."""
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """How well a model fitted to the rest of a record tells the part that was left out."""
+
+    before_arcsec: float
+    """Rms of what the active model (or none) leaves, its zero fitted to the rest too."""
+    after_arcsec: float
+    fitted_arcsec: float
+    """Rms of the new model on what it was fitted to."""
+    folds: int
+    over: str
+    """What was left out at a time: load turns, motor turns or stretches of time."""
+    improves: bool
+    """True only where the squares left out fall by more than chance, by at least one in a hundred."""
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenOrder:
+    """A motor order of the synchronous part, with how sure it is."""
+
+    order: Order
+    amplitude_arcsec: float
+    fall_in_chi_square: float
+    threshold: float
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """Something that was fitted beside the model so that it does not bend it."""
+
+    name: str
+    text: str
+    value: float
+    half_width: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traces:
+    """Block means for plots, all shape (b,)."""
+
+    time_s: FloatArray
+    motor_deg: FloatArray
+    load_deg: FloatArray
+    direction: FloatArray
+    """1, -1, or 0 at rest."""
+    kind: tuple[str, ...]
+    """Names that ``kind_index`` points into."""
+    kind_index: np.ndarray[Any, np.dtype[np.intp]]
+    error_arcsec: FloatArray
+    """Observed, zero taken off."""
+    predicted_arcsec: FloatArray
+    """The model's effects."""
+    residual_arcsec: FloatArray
+    """Observed minus model, zero and nuisances."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitResult:
+    """The model that a record shows, and how far it can be trusted."""
+
+    model: TransmissionModel
+    """With ``uncertainty``: 95 % half widths, nested like the parameters."""
+    intervals: tuple[Interval, ...]
+    zeros_arcsec: tuple[float, ...]
+    """Offset of each absolute zero against the median of its record's error."""
+    nuisances: tuple[Nuisance, ...]
+    noise: NoiseFigures
+    outliers: Outliers
+    orders: tuple[ChosenOrder, ...]
+    spectrum: Spectrum
+    """Of the error without hysteresis, zero and nuisances."""
+    residual_tests: tuple[ResidualTest, ...]
+    held_out: HeldOut
+    traces: Traces
+    warnings: tuple[str, ...]
+    """What the data cannot say, in words."""
+
+    def interval(self, effect: str, parameter: str) -> Interval:
+        """The interval of one parameter; KeyError where it was not fitted."""
+        for each in self.intervals:
+            if (each.effect, each.parameter) == (effect, parameter):
+                return each
+        raise KeyError(f"{effect}: {parameter}")

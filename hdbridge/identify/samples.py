@@ -1,0 +1,203 @@
+"""All segments laid end to end: what was observed, what drove it, and which samples can be used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects import FloatArray, Motion, Start
+from hdbridge.errors import InputError
+from hdbridge.identify.driving import driving_angle, quantum_deg
+from hdbridge.identify.segment import MINIMUM_SAMPLES, Kind, Segment
+from hdbridge.units import ARCSEC_PER_DEG
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+KINDS = tuple(Kind)
+SPEED_WINDOW_S = 0.02
+"""The speed of a sample is taken over this much time on either side."""
+SETTLE_S = 0.1
+"""After a fast move the load is left this much time to come to rest."""
+SLOW = (Kind.SWEEP, Kind.SINE, Kind.REVERSAL)
+"""Kinds whose own speed is what is meant by slow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """Consecutive segments through which the elastic state is carried."""
+
+    rows: slice
+    motion: Motion
+    start: Start | None
+    """None where it has to be found by fit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Segments laid end to end; arrays of shape (n,)."""
+
+    ratio: float
+    time_s: FloatArray
+    motor_deg: FloatArray
+    """The driving angle."""
+    error_arcsec: FloatArray
+    """Observed transmission error, load - motor / N, about an arbitrary zero."""
+    speed_deg_s: FloatArray
+    """Speed of the motor, signed."""
+    usable: BoolArray
+    """False for fast moves and the settling after them."""
+    kind: IntArray
+    """Index into `KINDS`."""
+    zero: IntArray
+    """Index of the absolute zero, 0 .. zeros - 1."""
+    zeros: int
+    count_deg: float
+    """Motor angle of one count of the encoder or the command, 0 where none is seen."""
+    chains: tuple[Chain, ...]
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.time_s)
+
+    def delayed(self, delay_s: float) -> Samples:
+        """The same if the load was read so much later than the motor: the gear as it was then, with that motor angle."""
+        motor = self.motor_deg.copy()
+        chains = []
+        for chain in self.chains:
+            time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
+            motor[chain.rows] = np.interp(time - delay_s, time, angle)
+            chains.append(replace(chain, motion=replace(chain.motion, motor_deg=motor[chain.rows])))
+        error = self.error_arcsec + (self.motor_deg - motor) / self.ratio * ARCSEC_PER_DEG
+        return replace(self, motor_deg=motor, error_arcsec=error, chains=tuple(chains))
+
+
+def gather(
+    segments: Sequence[Segment],
+    ratio: float,
+    start: Start | None = None,
+    slow_deg_s: float | None = None,
+    independent_zeros: bool = False,
+) -> Samples:
+    """Lay segments end to end. InputError where there is too little, or the ratio is not this gear's.
+
+    ``slow_deg_s`` is the load speed up to which samples are used; by default the one of the slow kinds.
+    ``start`` is the elastic state at the very first sample; None leaves it to the fit.
+    """
+    segments = [each for each in segments if len(each)]
+    total = sum(len(each) for each in segments)
+    if total < MINIMUM_SAMPLES:
+        raise InputError(
+            f"{total} samples in {len(segments)} segments; expected at least {MINIMUM_SAMPLES}: record more"
+        )
+    numbers = list(range(len(segments))) if independent_zeros else [each.zero for each in segments]
+    names = {number: index for index, number in enumerate(dict.fromkeys(numbers))}
+    begins = [
+        index
+        for index, each in enumerate(segments)
+        if index == 0 or each.start is not None or numbers[index] != numbers[index - 1]
+    ]
+    sizes = np.cumsum([0, *(len(each) for each in segments)]).tolist()
+    chains: list[Chain] = []
+    for first, last in zip(begins, [*begins[1:], len(segments)], strict=True):
+        known = segments[first].start
+        motion = _motion(segments[first:last])
+        rows = slice(sizes[first], sizes[last])
+        chains.append(Chain(rows, motion, start if known is None and first == 0 else known))
+    time = np.concatenate([each.time_s for each in segments])
+    measured = np.concatenate(
+        [each.motor_deg if each.position_deg is None else each.position_deg for each in segments]
+    )
+    load = np.concatenate([each.load_deg for each in segments])
+    kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
+    speed = np.concatenate([_speed(each.motion) for each in chains])
+    zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
+    _check_ratio(measured, load, zero, ratio, segments[0].name)
+    error = load - measured / ratio
+    for index in range(len(names)):
+        error[zero == index] -= np.median(error[zero == index])
+    return Samples(
+        ratio=ratio,
+        time_s=time,
+        motor_deg=np.concatenate([each.motion.motor_deg for each in chains]),
+        error_arcsec=error * ARCSEC_PER_DEG,
+        speed_deg_s=speed,
+        usable=_usable(time, speed / ratio, kind, slow_deg_s),
+        kind=kind,
+        zero=zero,
+        zeros=len(names),
+        count_deg=max(
+            quantum_deg(each.motor_deg if each.position_deg is None else each.position_deg)
+            for each in segments
+        ),
+        chains=tuple(chains),
+    )
+
+
+def _motion(segments: Sequence[Segment]) -> Motion:
+    """The motion of a chain; channels only where every segment has them."""
+
+    def joined(name: str) -> FloatArray | None:
+        parts = [getattr(each, name) for each in segments]
+        return None if any(part is None for part in parts) else np.concatenate(parts)
+
+    motor = np.concatenate([each.motor_deg for each in segments])
+    commanded = all(each.commanded for each in segments)
+    return Motion(
+        driving_angle(motor, joined("position_deg"), commanded),
+        np.concatenate([each.time_s for each in segments]),
+        joined("load_torque_nm"),
+        joined("motor_torque_nm"),
+        joined("temperature_c"),
+    )
+
+
+def _speed(motion: Motion) -> FloatArray:
+    """Motor speed over a short window about each sample, degrees per second."""
+    time = motion.time_s
+    if time is None or len(time) < 2:
+        return np.zeros(len(motion))
+    later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW_S, "right"), len(time) - 1)
+    earlier = np.maximum(np.searchsorted(time, time - SPEED_WINDOW_S, "left") - 1, 0)
+    span = time[later] - time[earlier]
+    travel = motion.motor_deg[later] - motion.motor_deg[earlier]
+    return np.divide(travel, span, out=np.zeros(len(time)), where=span > 0)
+
+
+def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s: float | None) -> BoolArray:
+    """Samples that are slow, and not within `SETTLE_S` after fast ones."""
+    moving = np.abs(load_speed)
+    slow_kinds = np.isin(kind, [KINDS.index(each) for each in SLOW])
+    if slow_deg_s is None:
+        own = moving[slow_kinds & (moving > 0)]
+        unknown = moving[(kind == KINDS.index(Kind.UNKNOWN)) & (moving > 0)]
+        if len(own):
+            slow_deg_s = 1.2 * float(np.quantile(own, 0.995))
+        elif len(unknown):
+            slow_deg_s = 3.0 * float(np.median(unknown))
+        else:
+            slow_deg_s = 0.05
+    fast = moving > slow_deg_s
+    last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
+    return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))
+
+
+def _check_ratio(motor: FloatArray, load: FloatArray, zero: IntArray, ratio: float, name: str) -> None:
+    """InputError where load against motor has another slope than 1 / ratio by far more than any error of a gear."""
+    inside = zero == zero[0]
+    motor, load = motor[inside] - motor[inside].mean(), load[inside] - load[inside].mean()
+    spread = float(motor @ motor)
+    if not ratio > 0 or spread == 0:
+        if ratio > 0:
+            return
+        raise InputError(f"{name}: the ratio is {ratio:g}; expected more than 0")
+    slope = float(motor @ load) / spread
+    ramp_arcsec = abs(slope - 1.0 / ratio) * float(np.ptp(motor)) * ARCSEC_PER_DEG
+    if ramp_arcsec > 1000.0 and abs(slope * ratio - 1.0) > 2e-3:
+        hint = "turn the encoder's direction round" if slope < 0 else "correct the ratio"
+        found = f"{1.0 / slope:.6g}" if slope else "a load that stands still"
+        raise InputError(
+            f"{name}: the load follows the motor with a ratio of {found}, expected {ratio:g}; {hint}"
+        )

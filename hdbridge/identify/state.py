@@ -1,0 +1,109 @@
+"""What the steps of an identification hand on, and the problems that are made of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hdbridge.effects import Effect, FloatArray, MotorOrder, Synchronous
+from hdbridge.identify.beside import Beside, beside
+from hdbridge.identify.blocks import make_blocks
+from hdbridge.identify.design import Design, harmonics, tangents
+from hdbridge.identify.joint import Problem, Solution, is_valid
+from hdbridge.identify.noise import NoiseModel, Precision
+from hdbridge.identify.options import FitOptions
+from hdbridge.identify.orders import Family, Order, Selection, select
+from hdbridge.identify.samples import Samples
+from hdbridge.units import DEG_PER_TURN
+
+
+class State(NamedTuple):
+    """Where an identification stands."""
+
+    design: Design
+    candidates: tuple[Order, ...]
+    waves: FloatArray
+    """Columns of the candidates, (b, 2 candidates)."""
+    nuisances: tuple[str, ...]
+    effects: tuple[Effect, ...]
+    """All but the synchronous part."""
+    noise: NoiseModel
+    delay_ms: float = 0.0
+    """By which the samples have been put right already."""
+
+    def beside(self) -> Beside:
+        """Zeros and nuisances."""
+        return beside(self.design, self.nuisances, self.effects)
+
+    def precision(self) -> Precision:
+        """Of the present noise model."""
+        return Precision(self.noise, self.design.blocks)
+
+    def information(self) -> tuple[FloatArray, FloatArray]:
+        """J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
+
+        With the tangents in, shapes are refitted with every order that is tried.
+        """
+        extra = self.beside()
+        parts = [self.waves, extra.columns]
+        for effect in self.effects:
+            parts.append(self.design.columns(effect, exact=False))
+            parts.append(tangents(self.design, effect, effect.coefficients(), exact=False)[1])
+        columns = np.concatenate(parts, axis=1)
+        weighted = self.precision().apply(columns)
+        gram = columns.T @ weighted
+        first = self.waves.shape[1]
+        inside = np.arange(first, first + len(extra.prior))
+        gram[inside, inside] += extra.prior
+        return gram, weighted.T @ self.design.blocks.error_arcsec
+
+    def selected(self, options: FitOptions) -> Selection:
+        """The orders that this noise lets one see."""
+        information, right = self.information()
+        return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
+
+    def problem(self, selection: Selection) -> Problem:
+        """Motor orders as the synchronous part, other effects; orders that are not the motor's beside them."""
+        motor = tuple(
+            MotorOrder(order=each.number, amplitude_arcsec=0.0, phase_deg=0.0)
+            for each in selection.chosen
+            if each.family is Family.MOTOR
+        )
+        others = [
+            index
+            for index, each in enumerate(self.candidates)
+            if each in selection.chosen and each.family is not Family.MOTOR
+        ]
+        picked = [2 * index + part for index in others for part in (0, 1)]
+        names = [f"{self.candidates[index]} {part}" for index in others for part in ("cosine", "sine")]
+        effects = ((Synchronous(orders=motor),) if motor else ()) + self.effects
+        return Problem(self.design, effects, self.beside().and_waves(self.waves[:, picked], names))
+
+    def after(self, solution: Solution) -> State:
+        """With a solution's effects, and the blur that they bring."""
+        effects = tuple(
+            each for each in solution.effects if not isinstance(each, Synchronous) and is_valid(each)
+        )
+        return self._replace(effects=effects, design=self.design.blurred(effects))
+
+    def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
+        """With corrected samples and without outliers."""
+        design = Design.of(samples, make_blocks(samples, weight), self.design.starts).blurred(self.effects)
+        waves = harmonics(design, [each.per_motor_turn for each in self.candidates])
+        return self._replace(design=design, waves=waves, delay_ms=delay_ms)
+
+
+def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
+    """Orders to look for: those of the load and the flexspline only where the record spans enough of a load turn."""
+    ratio = design.samples.ratio
+    turns = float(np.ptp(design.blocks.motor_deg)) / DEG_PER_TURN
+    motor = [Order.motor(number) for number in range(1, options.highest_order + 1)]
+    if turns < 0.95 * ratio:
+        return tuple(motor)
+    numbers = range(1, options.load_orders + 1)
+    return (
+        *motor,
+        *(Order.load(number, ratio) for number in numbers if number < ratio),
+        *(Order.flexspline(number, ratio) for number in numbers if number * turns / ratio > 1.5),
+    )
