@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from hdbridge.cli import check, demo, doctor, latency, scan, simulate, step
+from hdbridge.cli import calibrate, check, demo, doctor, fit, latency, model, report, scan, simulate, step
 from hdbridge.errors import HdbridgeError
 
 app = typer.Typer(
@@ -25,7 +25,7 @@ app = typer.Typer(
         "5 stopped by supervision, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
-for command in (demo, check, scan, doctor, simulate, step, latency):
+for command in (demo, check, scan, doctor, simulate, step, calibrate, fit, model, report, latency):
     command.register(app)
 
 
