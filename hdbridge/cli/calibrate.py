@@ -122,8 +122,7 @@ def report(
     console.print(f"\nrecording: {folder}", soft_wrap=True)
     write_json(json_file, result.as_dict())
     page = html_file or folder / "report.html"
-    if write_calibration_page(page, result):
-        console.print(f"report: {page}", soft_wrap=True)
+    write_calibration_page(page, result)
     if result.offer and result.offer.made:
         console.print(
             f"pending: {result.offer.pending}\nreview it: hdbridge model diff {files.axis.parent}\n"

@@ -7,10 +7,13 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
+from hdbridge.atomic import write_atomically
 from hdbridge.calibration import Calibration
 from hdbridge.calibration.result import unit_of
-from hdbridge.cli.options import console
+from hdbridge.cli.options import console, notes
 from hdbridge.modeldiff import diff
+from hdbridge.report.calibration import calibration_page
+from hdbridge.report.page import render
 
 
 def print_calibration(result: Calibration) -> None:
@@ -63,9 +66,10 @@ def print_calibration(result: Calibration) -> None:
         )
 
 
-def write_calibration_page(path: Path, result: Calibration) -> bool:
-    """The result as a self-contained page; whether it was written."""
-    return False
+def write_calibration_page(path: Path, result: Calibration) -> None:
+    """The result as a self-contained page."""
+    write_atomically(path, render(calibration_page(result)))
+    notes.print(f"wrote {path}")
 
 
 def _title(result: Calibration) -> str:
