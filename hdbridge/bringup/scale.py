@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 TOOTH_SHARE: Final = 0.35
 """A ratio is told from its neighbour (N and N + 1 differ by 1/N) when it errs by less than this share."""
+CLOSE_SHARE: Final = 0.001
+"""How true a turn of the motor shows the ratio where nothing is wrong with the gear: 26 arcsec at N = 50."""
 DEAD_SHARE: Final = 0.02
 """A load encoder that moves by less than this share of what is expected does not move."""
 USUAL_RATIOS: Final = frozenset(
@@ -160,13 +162,14 @@ def _counts(key: str, found: int, wanted: float, tolerance: float, weight: float
         multiple = found * 2.0**power
         if power and abs(multiple / wanted - 1.0) <= tolerance:
             if power in (2, -2):
-                why = "lines taken for counts" if power > 0 else "counts taken twice: four per line are in it"
+                why = "lines taken for counts" if power > 0 else "counts taken for lines"
                 return Accusation(key, found, round(multiple), weight + 3.0, why)
-            return Accusation(key, found, round(multiple), weight + 2.0, f"2^{power} times")
-    tidy = _roundest(wanted, tolerance)
+            return Accusation(key, found, round(multiple), weight + 2.0, f"{2.0**power:g} times")
+    tidy = _roundest(wanted)
     digits = len(str(tidy).rstrip("0"))
-    round_number = digits <= 2 or tidy & (tidy - 1) == 0
-    return Accusation(key, found, tidy, weight + (1.5 if round_number else -0.5 * (digits - 2)), "by the way")
+    if digits == 1 or tidy & (tidy - 1) == 0:
+        return Accusation(key, found, tidy, weight + 2.0, "a round number")
+    return Accusation(key, found, tidy, weight + (1.0 if digits == 2 else 0.0), "it would explain it")
 
 
 def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
@@ -178,20 +181,26 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
     whole = round(wanted)
     if whole >= 1 and abs(whole / wanted - 1.0) <= tolerance:
-        usual = whole in USUAL_RATIOS
-        weight = (2.0 if usual else 0.5) - (1.0 if teeth is not None else 0.0)
-        return Accusation(RATIO, found, whole, weight, "a usual ratio" if usual else "a whole number")
-    return Accusation(RATIO, found, float(f"{wanted:.5g}"), -2.0, "no whole number")
+        # Teeth that give the ratio of the file speak for it.
+        less = 1.0 if teeth is not None else 0.0
+        if abs(whole - found) == 1.0:
+            return Accusation(RATIO, found, whole, 3.5 - less, "the other output of the same gear")
+        if whole in USUAL_RATIOS:
+            return Accusation(RATIO, found, whole, 2.0 - less, "a usual ratio")
+        return Accusation(RATIO, found, whole, 1.0 - less, "a whole number")
+    return Accusation(
+        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is no whole number"
+    )
 
 
-def _roundest(value: float, tolerance: float) -> int:
-    """The number with the fewest digits within the tolerance; a power of two where there is one."""
+def _roundest(value: float) -> int:
+    """The number with the fewest digits that is close; a power of two where there is one."""
     power = 2 ** round(math.log2(value)) if value >= 1.0 else 1
-    if abs(power / value - 1.0) <= tolerance:
+    if abs(power / value - 1.0) <= CLOSE_SHARE:
         return power
     for digits in range(1, 12):
         tidy = float(f"{value:.{digits - 1}e}")
-        if abs(tidy / value - 1.0) <= tolerance and tidy >= 1.0:
+        if abs(tidy / value - 1.0) <= CLOSE_SHARE and tidy >= 1.0:
             return round(tidy)
     return max(round(value), 1)
 
