@@ -1,0 +1,242 @@
+"""Calibrate axes drawn at random on the simulated drive, and hold what is found against what they are.
+
+    .venv/bin/python tools/calibrate_random_axes.py --axes 20 --workers 2
+
+Each axis has orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio (30-160),
+encoder resolutions and directions and noise (0.5-3 arcsec) of its own. The calibration is the command's: a plan
+on the bench, the fit, the stepping test before and after. Printed for each axis: the errors of the parameters,
+what share of the 95 % intervals holds the truth, the stepping test over the floor of the axis's counts and
+noise, and how much faster than the axis it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime
+from multiprocessing import Pool
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+
+import numpy as np
+import yaml
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import Calibration, calibrate, start_journal
+from hdbridge.calibration.measure import identity_of
+from hdbridge.drive.drive import Drive
+from hdbridge.procedures.plan import Plan
+from hdbridge.sim.lockstep import simulated_bench
+
+DEMO = Path(__file__).parents[1] / "profiles" / "demo"
+DATE = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+class Outcome(NamedTuple):
+    seed: int
+    ratio: float
+    counts: int
+    noise: float
+    offset: tuple[float, float, bool]
+    """True value, error, whether the interval holds it."""
+    width: tuple[float, float, bool]
+    exponent: tuple[float, float, bool]
+    amplitude: float
+    """Largest error of an amplitude over its tolerance, 0.15 arcsec or 2 %."""
+    missed: int
+    invented: int
+    held: int
+    intervals: int
+    floor: float
+    three_sigma: float
+    before: float
+    offered: bool
+    axis_s: float
+    wall_s: float
+    cpu_s: float
+
+
+def draw(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Axis file and truth file of a random axis; motor and servo are the demo's, so are its frequencies."""
+    rng = np.random.default_rng(seed)
+    axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))
+    ratio = float(rng.integers(60, 321)) / 2.0
+    scale = ratio / 50.0
+    axis["name"] = truth["name"] = f"random-{seed}"
+    axis["gear"] = {"ratio": ratio}
+    for name in ("velocity_deg_s", "acceleration_deg_s2", "jerk_deg_s3"):
+        axis["limits"][name] = axis["limits"][name] / scale
+    motor = {
+        "counts_per_turn": int(rng.choice([4000, 8000, 10_000, 16_384])),
+        "direction": int(rng.choice([1, -1])),
+    }
+    load = {
+        "counts_per_turn": int(rng.choice([1_048_576, 2_880_000, 8_388_608])),
+        "direction": int(rng.choice([1, -1])),
+    }
+    axis["motor_encoder"].update(motor)
+    axis["load_encoder"].update(load)
+    truth["motor"]["encoder"].update(motor)
+    truth["load"]["encoder"].update(load, noise_arcsec=float(rng.uniform(0.5, 3.0)))
+    truth["load"]["inertia_kg_m2"] *= scale**2
+    offset = float(rng.uniform(15.0, 80.0))
+    truth["gear"].update(
+        ratio=ratio,
+        stiffness_nm_per_rad=truth["gear"]["stiffness_nm_per_rad"] * scale**2,
+        damping_nm_s_per_rad=truth["gear"]["damping_nm_s_per_rad"] * scale**2,
+        motor_orders=[
+            {
+                "order": int(order),
+                "amplitude_arcsec": float(np.exp(rng.uniform(np.log(0.8), np.log(14.0)))),
+                "phase_deg": float(rng.uniform(-180.0, 180.0)),
+            }
+            for order in sorted(rng.choice(np.arange(1, 11), int(rng.integers(3, 7)), replace=False))
+        ],
+        hysteresis={
+            "law": "rolling_friction",
+            "offset_arcsec": offset,
+            "width_deg": float(rng.uniform(5.0, 40.0)),
+            "exponent": float(rng.uniform(1.2, 2.8)),
+            "start_arcsec": float(rng.uniform(-offset, offset)),
+        },
+    )
+    return axis, truth
+
+
+def one(job: tuple[int, str]) -> Outcome:
+    seed, plan = job
+    axis_data, truth = draw(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, data in (("axis.yaml", axis_data), ("truth.yaml", truth)):
+            (folder / file).write_text(yaml.safe_dump(data))
+        axis = AxisConfig.load(folder)
+        wall, cpu = time.perf_counter(), time.process_time()
+        with (
+            simulated_bench(folder / "truth.yaml", axis.eds_path, axis.drive.node_id, seed) as (
+                bus,
+                clock,
+                _,
+            ),
+            Drive(bus, axis, clock) as drive,
+        ):
+            drive.boot()
+            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, identity_of(drive))
+            result = calibrate(drive, journal, folder, DATE)
+            axis_s = clock.now()
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return judge(seed, axis, truth, result, axis_s, wall, cpu)
+
+
+def judge(
+    seed: int,
+    axis: AxisConfig,
+    truth: dict[str, Any],
+    result: Calibration,
+    axis_s: float,
+    wall_s: float,
+    cpu_s: float,
+) -> Outcome:
+    gear = truth["gear"]
+    known = {
+        f"orders[{each['order']}].{name}": float(each[name])
+        for each in gear["motor_orders"]
+        for name in ("amplitude_arcsec", "phase_deg")
+    } | {name: float(gear["hysteresis"][name]) for name in ("offset_arcsec", "width_deg", "exponent")}
+    found = {each.parameter: each for each in result.fit.intervals}
+    off = {name: found[name].value - value for name, value in known.items() if name in found}
+    off = {name: (value + 180.0) % 360.0 - 180.0 if "phase" in name else value for name, value in off.items()}
+    held = {name: abs(value) <= found[name].half_width for name, value in off.items()}
+    amplitudes = {name: value for name, value in known.items() if "amplitude" in name}
+    worst = max(abs(off.get(name, value)) / max(0.15, 0.02 * value) for name, value in amplitudes.items())
+    checked = result.validation
+    nothing = float("nan")
+    return Outcome(
+        seed,
+        axis.gear.ratio,
+        axis.motor_encoder.counts_per_turn,
+        float(truth["load"]["encoder"]["noise_arcsec"]),
+        *(  # type: ignore[arg-type]
+            (known[name], off.get(name, nothing), held.get(name, False))
+            for name in ("offset_arcsec", "width_deg", "exponent")
+        ),
+        worst,
+        sum(name not in found for name in amplitudes),
+        sum("amplitude" in name and name not in known for name in found),
+        sum(held.values()),
+        len(held),
+        checked.floor.three_sigma_arcsec if checked else nothing,
+        checked.after.pooled.three_sigma_arcsec if checked else nothing,
+        checked.before.pooled.three_sigma_arcsec if checked else nothing,
+        bool(result.offer and result.offer.made),
+        axis_s,
+        wall_s,
+        cpu_s,
+    )
+
+
+def row(each: Outcome) -> str:
+    def part(value: tuple[float, float, bool], percent: bool) -> str:
+        error = 100.0 * value[1] / value[0] if percent else value[1]
+        return f"{value[0]:6.2f} {error:+6.{1 if percent else 3}f}{' ' if value[2] else '!'}"
+
+    return (
+        f"{each.seed:4d} {each.ratio:6.1f} {each.counts:6d} {each.noise:5.2f} | {part(each.offset, True)} | "
+        f"{part(each.width, True)} | {part(each.exponent, False)} | {each.amplitude:5.2f} {each.missed:2d} "
+        f"{each.invented:2d} | {each.held:2d}/{each.intervals:<2d} | {each.before:7.2f} {each.three_sigma:6.2f} "
+        f"{each.floor:6.2f} {each.three_sigma / each.floor:5.2f} | {each.axis_s:6.0f} "
+        f"{each.axis_s / each.wall_s:5.1f} {each.axis_s / each.cpu_s:5.1f}{'' if each.offered else '  not offered'}"
+    )
+
+
+HEAD = (
+    "seed  ratio counts noise |  offset, off % |   width, off % |  exponent, off | worst mis inv | held  | "
+    " before  after  floor ratio | axis s  x wall  x cpu"
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--axes", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
+    parser.add_argument("--plan", default="quick")
+    parser.add_argument("--workers", type=int, default=1)
+    options = parser.parse_args()
+    jobs = [(seed, options.plan) for seed in range(options.first, options.first + options.axes)]
+    print(HEAD)
+    print(
+        "worst: largest amplitude error over its tolerance (0.15 arcsec or 2 %); !: outside its 95 % interval"
+    )
+    found = []
+    with Pool(options.workers) as pool:
+        for each in pool.imap(one, jobs):
+            found.append(each)
+            print(row(each), flush=True)
+    near = {
+        "offset within 1 % or its interval": [
+            o.offset[2] or abs(o.offset[1]) <= 0.01 * o.offset[0] for o in found
+        ],
+        "width within 4 % or its interval": [
+            o.width[2] or abs(o.width[1]) <= 0.04 * o.width[0] for o in found
+        ],
+        "exponent within 0.04 or its interval": [o.exponent[2] or abs(o.exponent[1]) <= 0.04 for o in found],
+        "every amplitude within 0.15 arcsec or 2 %": [o.amplitude <= 1.0 for o in found],
+        "no order missed or invented": [not o.missed and not o.invented for o in found],
+        "stepping at most 1.15 x the floor": [o.three_sigma <= 1.15 * o.floor for o in found],
+        "at least 20 x faster than the axis": [o.axis_s >= 20.0 * o.wall_s for o in found],
+    }
+    for name, values in near.items():
+        print(f"{sum(values):3d} of {len(values)}  {name}")
+    held, intervals = sum(o.held for o in found), sum(o.intervals for o in found)
+    print(f"coverage of the 95 % intervals: {held} of {intervals}, {100 * held / intervals:.1f} %")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
