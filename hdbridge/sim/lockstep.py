@@ -61,7 +61,7 @@ class VirtualClock:
 
         False, and nothing happened but the clock's advance, when no event comes before the deadline.
         """
-        event_s = min([node.next_event_s() for node in self.nodes], default=deadline_s)
+        event_s = min([node.next_event_s() for node in self.nodes], default=float("inf"))
         if event_s > deadline_s:
             self._now_s = max(self._now_s, deadline_s)
             return False

@@ -15,6 +15,7 @@ from typing import Final
 import can
 
 from hdbridge.clock import Clock
+from hdbridge.errors import InputError
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults, Outgoing
@@ -80,7 +81,18 @@ class SimulatedDrive:
         self.faults = Faults()
         self.lost_frames = 0
         self.dictionary = Dictionary(Path(eds_path), node_id)
-        (nameplate or Nameplate()).engrave(self.dictionary)
+        self._clock = clock
+        self._now_s = clock.now()
+        try:
+            self._assemble(machine, nameplate or Nameplate())
+        except SdoAbortError as error:
+            raise InputError(
+                f"{eds_path}: {error}, which the simulated drive needs; use the bundled hdbridge-402.eds"
+            ) from error
+        self._begin()
+
+    def _assemble(self, machine: Machine, nameplate: Nameplate) -> None:
+        nameplate.engrave(self.dictionary)
         self.dictionary.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
         self.firmware = Firmware(self.dictionary, machine, self.emergency)
@@ -88,12 +100,6 @@ class SimulatedDrive:
         numbers = range(1, PDO_COUNT + 1)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
         self._rpdos = [ReceivePdo(self.dictionary, number, self._route) for number in numbers]
-        self._guard()
-        self._clock = clock
-        self._now_s = clock.now()
-        self._begin()
-
-    def _guard(self) -> None:
         entry = self.dictionary
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()

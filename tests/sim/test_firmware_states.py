@@ -1,0 +1,301 @@
+"""The power state machine: every controlword in every state, against CiA 402 written out once more."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+STATES = ("disabled", "ready", "switched on", "enabled", "quick stop", "fault")
+WORDS = [low | high for low in range(16) for high in (0, 0x80)]
+
+
+def bring(master, state: str) -> None:
+    """Put the drive, at rest, into ``state`` (605Ah = 6, so that a quick stop stays)."""
+    master.put(0x605A, 0, 6, 2)
+    words = {
+        "disabled": (),
+        "ready": (0x06,),
+        "switched on": (0x06, 0x07),
+        "enabled": (0x06, 0x07, 0x0F),
+        "quick stop": (0x06, 0x07, 0x0F, 0x02),
+        "fault": (0x06, 0x07, 0x0F),
+    }[state]
+    for word in words:
+        master.control(word)
+    if state == "fault":
+        master.node.faults.raise_error(0x2310)
+        master.wait(0.01)
+    assert master.state == state
+
+
+def demanded(state: str, word: int) -> str:
+    """Where CiA 402 says that ``word`` leads from ``state`` (axis at rest, 605Ah = 6).
+
+    The commands of the profile's table, bits 7 3 2 1 0, with x for any.
+    """
+    if state == "fault":
+        return "disabled" if word & 0x80 else "fault"
+    bits = f"{word >> 7 & 1}{word >> 3 & 1}{word >> 2 & 1}{word >> 1 & 1}{word & 1}"
+
+    def says(pattern: str) -> bool:
+        return all(want in ("x", bit) for want, bit in zip(pattern, bits, strict=True))
+
+    if says("0xx0x"):  # disable voltage: 7, 9, 10, 12
+        return "disabled"
+    if says("0x01x"):  # quick stop: 7, 10, 11
+        return {"enabled": "quick stop", "ready": "disabled", "switched on": "disabled"}.get(state, state)
+    if says("0x110"):  # shutdown: 2, 6, 8
+        return state if state == "quick stop" else "ready"
+    if says("00111"):  # switch on: 3; disable operation: 5
+        return {"ready": "switched on", "enabled": "switched on"}.get(state, state)
+    if says("01111"):  # enable operation: (3 and) 4, 16
+        return state if state == "disabled" else "enabled"
+    return state
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_every_controlword_does_what_the_profile_demands(master, state):
+    for word in WORDS:
+        master.nmt(129)
+        bring(master, state)
+        before = master.motor.position
+        master.control(word)
+        assert master.state == demanded(state, word), f"{word:02X}h in {state}"
+        assert master.motor.position == before
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ((), 0x0250),
+        ((0x06,), 0x0231),
+        ((0x06, 0x07), 0x0233),
+        ((0x06, 0x07, 0x0F), 0x0237),
+        ((0x06, 0x07, 0x0F, 0x02), 0x0617),
+    ],
+)
+def test_the_statusword_of_each_state(master, words, status):
+    master.put(0x605A, 0, 6, 2)
+    for word in words:
+        master.control(word)
+    assert master.statusword == status
+
+
+def test_only_a_fault_reset_leaves_fault_and_only_its_edge(master):
+    bring(master, "fault")
+    for word in (0x06, 0x07, 0x0F, 0x00, 0x02):
+        master.control(word)
+        assert master.state == "fault"
+    master.control(0x80)
+    assert master.state == "disabled"
+    master.node.faults.raise_error(0x2310)
+    master.wait(0.01)
+    master.control(0x80)
+    assert master.state == "fault"  # the bit is still set from before: no edge
+    master.control(0x00)
+    master.control(0x80)
+    assert master.state == "disabled"
+
+
+def test_a_repeated_controlword_does_not_enable_again(master):
+    """A target stream that goes on, with a stale 'enable', must not undo a stop."""
+    master.put(0x6007, 0, 3, 2)
+    master.put(0x605A, 0, 6, 2)
+    master.put(0x1016, 1, 0x7F0032, 4)
+    master.put(0x1029, 1, 1, 1)
+    master.enable_csp()
+    master.send(0x77F, b"\x05")
+    for _ in range(30):
+        status = master.cycle(0x0F)[0]
+    assert status & 0x6F == 0x07
+    for word in (0x00, 0x06, 0x07, 0x0F, 0x0F):
+        status = master.cycle(word)[0]
+    assert master.cycle()[0] & 0x6F == 0x27
+
+
+def test_nothing_moves_at_enable_whatever_the_target_was(master, motor):
+    motor.position = 123_456.0
+    master.put(0x607A, 0, -999_999, 4)
+    master.wait(0.01)
+    for mode in (0, 1, 6, 8):
+        master.enable(mode)
+        master.wait(0.1)
+        assert master.read(0x607A) == 123_456
+        master.control(0)
+    assert motor.position == 123_456.0
+
+
+@pytest.mark.parametrize(
+    ("option", "decel", "state"),
+    [(0, None, "disabled"), *[(k, (20e3, 50e3, 80e3, 80e3)[(k - 1) % 4], None) for k in range(1, 9)]],
+)
+def test_quick_stop_by_605a(master, motor, option, decel, state):
+    """Distance v^2 / 2a on the ramp that the option names; 1 to 4 switch off after it, 5 to 8 stay."""
+    for index, value in ((0x6084, 20_000), (0x6085, 50_000), (0x60C6, 80_000)):
+        master.put(index, 0, value, 4)
+    master.put(0x605A, 0, option, 2)
+    master.enable_csp()
+    master.cruise(40, 10)
+    start = motor.position
+    master.control(0x02)
+    speed = 40 / 0.004
+    if decel is None:
+        assert master.state == state
+        master.wait(0.5)
+        assert motor.powered is False
+        return
+    assert master.state == "quick stop"
+    assert master.statusword & 0x0400 == 0
+    stopping_s = speed / decel
+    master.wait(0.9 * stopping_s)
+    assert motor.velocity_counts_s > 0.0
+    assert master.state == "quick stop"
+    master.wait(0.1 * stopping_s + 0.02)
+    assert motor.position - start == pytest.approx(speed**2 / (2 * decel), abs=1.0)
+    stays = option >= 5
+    assert master.state == ("quick stop" if stays else "disabled")
+    assert motor.powered is stays
+    if stays:
+        assert master.statusword & 0x0400
+        master.control(0x0F)
+        assert master.state == "enabled"
+        master.wait(0.1)
+        assert motor.velocity_counts_s == 0.0
+
+
+def test_enabling_again_waits_for_rest(master, motor):
+    master.put(0x6085, 0, 50_000, 4)
+    master.put(0x605A, 0, 6, 2)
+    master.enable_csp()
+    master.cruise(40, 10)
+    master.control(0x02)
+    master.control(0x0F)
+    assert master.state == "quick stop"
+    master.wait(0.25)
+    assert master.state == "quick stop"
+    master.control(0x0F)
+    assert master.state == "enabled"
+
+
+@pytest.mark.parametrize(
+    ("object_", "word", "state"), [(0x605B, 0x06, "ready"), (0x605C, 0x07, "switched on")]
+)
+@pytest.mark.parametrize("option", [0, 1])
+def test_disabling_by_605b_and_605c(master, motor, object_, word, state, option):
+    master.put(0x6084, 0, 50_000, 4)
+    master.put(object_, 0, option, 2)
+    master.enable_csp()
+    master.cruise(40, 10)
+    start = motor.position
+    master.control(word)
+    assert master.state == ("enabled" if option else state)
+    master.wait(0.3)
+    assert master.state == state
+    assert motor.powered is False
+    if option:
+        assert motor.position - start == pytest.approx(1000.0, abs=1.0)
+
+
+def test_disabling_on_a_ramp_can_still_be_cut_short(master):
+    master.put(0x6084, 0, 20_000, 4)
+    master.enable_csp()
+    master.cruise(40, 10)
+    master.control(0x07)
+    assert master.state == "enabled"
+    master.control(0x00)
+    assert master.state == "disabled"
+
+
+@pytest.mark.parametrize(("option", "decel"), [(0, None), (1, 20e3), (2, 50e3), (3, 80e3)])
+def test_fault_reaction_by_605e(master, motor, option, decel):
+    for index, value in ((0x6084, 20_000), (0x6085, 50_000), (0x60C6, 80_000)):
+        master.put(index, 0, value, 4)
+    master.put(0x605E, 0, option, 2)
+    master.enable_csp()
+    master.cruise(40, 10)
+    start = motor.position
+    master.node.faults.raise_error(0x2310, b"\x01\x02")
+    master.node.poll(master.clock.now())
+    assert master.emergencies() == [0x2310]
+    assert (0x081, struct.pack("<HB5s", 0x2310, 0x03, b"\x01\x02")) in master.seen
+    assert master.state == ("reaction" if decel else "fault")
+    master.wait(1.0)
+    assert master.state == "fault"
+    assert motor.powered is False
+    if decel:
+        assert motor.position - start == pytest.approx(10_000**2 / (2 * decel), abs=1.0)
+    assert master.read(0x603F) & 0xFFFF == 0x2310
+    assert master.read(0x1001) == 0x03
+    master.control(0x80)
+    assert master.emergencies()[-1] == 0x0000
+    assert (master.read(0x603F), master.read(0x1001)) == (0, 0)
+
+
+def test_the_history_keeps_the_last_eight_newest_first(master):
+    codes = [0x2310 + k for k in range(10)]
+    for code in codes:
+        master.node.faults.raise_error(code)
+        master.wait(0.01)
+    assert master.read(0x1003, 0) == 8
+    assert [master.read(0x1003, sub) for sub in range(1, 9)] == codes[:1:-1]
+    master.put(0x1003, 0, 0, 1)
+    assert [master.read(0x1003, sub) for sub in range(3)] == [0, 0, 0]
+
+
+def test_emergencies_can_be_silenced_and_moved(master):
+    master.put(0x1014, 0, 0x80000081, 4)
+    master.node.faults.raise_error(0x2310)
+    assert master.wait(0.01) == []
+    master.put(0x1014, 0, 0x0A1, 4)
+    master.control(0x80)
+    assert (0x0A1, bytes(8)) in master.take() + master.seen
+
+
+def test_the_brake_closes_at_rest_and_not_before(master, motor):
+    master.enable_csp()
+    master.cruise(40, 10)
+    master.control(0x00)
+    master.wait(0.04)
+    assert motor.velocity_counts_s > 0.0
+    assert not motor.braked
+    master.wait(1.0)
+    assert motor.braked
+
+
+def test_following_error_is_a_fault(master, motor):
+    master.put(0x6065, 0, 100, 4)
+    master.put(0x6066, 0, 20, 2)
+    master.enable_csp()
+    motor.stuck = True
+    target = 0
+    while target < 100:
+        target += 20
+        master.cycle(0x0F, target)
+    for _ in range(3):
+        master.cycle(0x0F, target)
+    assert master.emergencies() == []  # not beyond the window
+    for _ in range(5):
+        master.cycle(0x0F, 200)
+    assert master.emergencies() == []  # not for longer than the time
+    for _ in range(4):
+        status = master.cycle(0x0F, 200)[0]
+    assert master.emergencies() == [0x8611]
+    assert status & 0x2000
+    assert status & 0x4F in (0x08, 0x0F)
+    master.wait(0.5)
+    assert master.state == "fault"
+    motor.stuck = False
+    master.control(0x80)
+    assert master.statusword & 0x2000 == 0
+
+
+def test_following_error_can_be_switched_off_and_is_shown(master, motor):
+    master.put(0x6065, 0, 0xFFFFFFFF, 4)
+    master.enable_csp()
+    motor.stuck = True
+    master.cruise(100, 50)
+    master.cycle(0x0F, 5000)
+    assert master.read(0x60F4) == 5000
+    assert master.state == "enabled"
+    assert master.emergencies() == []
