@@ -37,9 +37,36 @@ def test_a_sound_axis_passes_every_check(case: Callable[..., Any]) -> None:
 
 
 def test_the_axis_turns_to_the_side_that_has_room(case: Callable[..., Any]) -> None:
-    verdicts = case(axis={"position_max_deg: 400": "position_max_deg: 0.5"}).run()
+    verdicts = case(axis={"position_max_deg: 400": "position_max_deg: 0.5"}).run(until="turn")
     assert failures(verdicts) == []
     assert verdicts["turn"].figures["forward_motor_counts"] == pytest.approx(-8000, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "counts", "turns"),
+    [(160, 2_880_000, 3), (50, 4096, 1)],
+    ids=["high ratio", "coarse load encoder"],
+)
+def test_other_gears_and_encoders_pass(case: Callable[..., Any], ratio: int, counts: int, turns: int) -> None:
+    """The motor's encoder counts the other way besides."""
+    verdicts = case(
+        axis={
+            "  direction: 1\n\nload": "  direction: -1\n\nload",
+            "counts_per_turn: 2880000 ": f"counts_per_turn: {counts} ",
+            "ratio: 50\n": f"ratio: {ratio}\n",
+            "flexspline: 100,": f"flexspline: {2 * ratio},",
+            "circular_spline: 102": f"circular_spline: {2 * ratio + 2}",
+        },
+        truth={
+            "{counts_per_turn: 8000, direction: 1,": "{counts_per_turn: 8000, direction: -1,",
+            "counts_per_turn: 2880000\n": f"counts_per_turn: {counts}\n",
+            "gear:\n  ratio: 50": f"gear:\n  ratio: {ratio}",
+        },
+        honest=True,
+    ).run()
+    assert failures(verdicts) == []
+    assert verdicts["turn"].figures["motor_turns"] == pytest.approx(turns, abs=0.01)
+    assert verdicts["turn"].figures["forward_motor_counts"] < 0
 
 
 def test_an_axis_without_room_is_not_moved_far(case: Callable[..., Any]) -> None:
@@ -119,7 +146,7 @@ def _without(*keys: tuple[int, int]) -> Callable[[SimulatedDrive], None]:
 def test_what_is_wrong_is_named(
     case: Callable[..., Any], name: str, parts: dict[str, Any], check: str, text: str
 ) -> None:
-    verdicts = case(**parts).run()
+    verdicts = case(**parts).run(until=check)
     assert failures(verdicts)[0] == check
     assert text in verdicts[check].remedies[0]
     assert all("\n" not in each for each in (verdicts[check].measured, *verdicts[check].remedies))
@@ -129,7 +156,7 @@ def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:
     def unplug(node: SimulatedDrive) -> None:
         node.dictionary[0x60E4, 1].bind(lambda: 17)
 
-    verdicts = case(spoil=unplug).run()
+    verdicts = case(spoil=unplug).run(until="turn")
     assert failures(verdicts) == ["turn"]
     assert "load encoder does not move" in verdicts["turn"].measured
     assert "axis.yaml:34:3: load_encoder.source: object 60E4h:01" in verdicts["turn"].remedies[0]
@@ -139,7 +166,7 @@ def test_an_object_that_repeats_the_motor_encoder(case: Callable[..., Any]) -> N
     def repeat(node: SimulatedDrive) -> None:
         node.dictionary[0x60E4, 1].bind(lambda: node.firmware.motion.motor_counts)
 
-    verdicts = case(spoil=repeat).run()
+    verdicts = case(spoil=repeat).run(until="turn")
     assert "reads the motor's encoder" in verdicts["turn"].remedies[0]
 
 
@@ -209,7 +236,7 @@ def test_a_drive_that_hardly_brakes(case: Callable[..., Any]) -> None:
 
         node.firmware._brake = weakly  # type: ignore[method-assign]
 
-    verdicts = case(spoil=coast).run()
+    verdicts = case(spoil=coast).run(until="quick_stop")
     assert "quick_stop" in failures(verdicts)
     assert "drive.quick_stop_option" in verdicts["quick_stop"].remedies[0]
 
