@@ -1,31 +1,35 @@
 """The gear's output: motor angle / ratio, and all that the gear adds to it.
 
-What is added is a sum of pieces, each one physical cause. A further cause is a further class here (or in a
-file of its own) and a line in `pieces_of`; it reads what it depends on from the `Conditions`.
+What is added is a sum of pieces, each one physical cause. A further cause is a further class in
+`hdbridge.sim.gear_pieces` (or in a file of its own) and a line in `pieces_of`; it reads what it depends on
+from the `Conditions`. A cause that is off has no piece, and costs nothing.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import ClassVar, Protocol
 
+from hdbridge.sim.conditions import Conditions
+from hdbridge.sim.gear_pieces import (
+    Creep,
+    Damage,
+    Flank,
+    Jumps,
+    Roller,
+    Seat,
+    SpeedFactor,
+    TorqueFactor,
+    WarmthFactor,
+    Wear,
+)
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders
 from hdbridge.sim.truth import TrueOrder, Truth
 from hdbridge.units import ARCSEC_PER_DEG
 
-
-class Conditions:
-    """What a piece may depend on, as it is now; the plant keeps it up to date."""
-
-    __slots__ = ("load_deg", "motor_deg", "temperature_c", "torque_nm")
-
-    def __init__(self, temperature_c: float) -> None:
-        self.motor_deg = 0.0
-        self.load_deg = 0.0
-        self.torque_nm = 0.0
-        """Torque of the flexspline's spring on the load."""
-        self.temperature_c = temperature_c
+Factor = Callable[[Conditions], float]
 
 
 class Piece(Protocol):
@@ -52,6 +56,30 @@ class MotorOrders:
     def arcsec(self, now: Conditions) -> float:
         """See `Piece`."""
         return self._orders.at(now.motor_deg * self._rad_per_deg)
+
+
+class VaryingOrders:
+    """Tooth error by the motor's angle that depends on more: the flank that carries, torque, warmth."""
+
+    BY_MOTOR_ONLY: ClassVar[bool] = False
+    __slots__ = ("_factors", "_flank", "_orders")
+
+    def __init__(
+        self, orders: tuple[TrueOrder, ...], flank: Flank | None, factors: tuple[Factor, ...]
+    ) -> None:
+        self._orders = Orders(orders)
+        self._flank = flank
+        self._factors = factors
+
+    def arcsec(self, now: Conditions) -> float:
+        """See `Piece`."""
+        angle_deg = now.motor_deg
+        if self._flank is not None:
+            angle_deg += self._flank.shift_deg(angle_deg)
+        error = self._orders.at(math.radians(angle_deg))
+        for factor in self._factors:
+            error *= factor(now)
+        return error
 
 
 class LoadOrders:
@@ -82,6 +110,24 @@ class ElasticHysteresis:
         return self._advance(now.motor_deg)
 
 
+class VaryingHysteresis:
+    """An elastic part that depends on speed or warmth too."""
+
+    BY_MOTOR_ONLY: ClassVar[bool] = False
+    __slots__ = ("_advance", "_factors")
+
+    def __init__(self, law: Law, factors: tuple[Factor, ...]) -> None:
+        self._advance = law.advance
+        self._factors = factors
+
+    def arcsec(self, now: Conditions) -> float:
+        """See `Piece`."""
+        error = self._advance(now.motor_deg)
+        for factor in self._factors:
+            error *= factor(now)
+        return error
+
+
 class ZeroDrift:
     """A shift that goes with the temperature."""
 
@@ -97,22 +143,93 @@ class ZeroDrift:
         return self._arcsec_per_k * (now.temperature_c - self._ambient_c)
 
 
+class SlowZeroDrift:
+    """A shift by the temperature of a housing that follows the measured one in its time."""
+
+    BY_MOTOR_ONLY: ClassVar[bool] = False
+    __slots__ = ("_ambient_c", "_arcsec_per_k", "_housing_c", "_nearer")
+
+    def __init__(self, ambient_c: float, arcsec_per_k: float, start_c: float, nearer: float) -> None:
+        self._ambient_c = ambient_c
+        self._arcsec_per_k = arcsec_per_k
+        self._housing_c = start_c
+        self._nearer = nearer
+
+    def arcsec(self, now: Conditions) -> float:
+        """See `Piece`."""
+        self._housing_c += (now.temperature_c - self._housing_c) * self._nearer
+        return self._arcsec_per_k * (self._housing_c - self._ambient_c)
+
+
 def pieces_of(truth: Truth) -> list[Piece]:
     """The causes that a truth file sets to work, at their start."""
-    gear, temperature = truth.gear, truth.temperature
+    gear, dt_s = truth.gear, truth.substep_s
     pieces: list[Piece] = []
     if gear.motor_orders:
-        pieces.append(MotorOrders(gear.motor_orders, 1.0))
+        pieces.append(_motor_orders(truth))
     if gear.flexspline_orders:
         pieces.append(MotorOrders(gear.flexspline_orders, 1.0 + 1.0 / gear.ratio))
     if gear.load_orders:
         pieces.append(LoadOrders(gear.load_orders))
-    law = law_of(gear.hysteresis, 0.0)
-    if law is not None:
-        pieces.append(ElasticHysteresis(law))
-    if temperature.zero_drift_arcsec_per_k:
-        pieces.append(ZeroDrift(temperature.ambient_c, temperature.zero_drift_arcsec_per_k))
+    pieces += _hysteresis(truth)
+    pieces += _zero_drift(truth)
+    if gear.wear is not None:
+        pieces.append(Wear(gear.wear, gear.ratio))
+    if gear.creep:
+        pieces.append(Creep(gear.creep, dt_s))
+    if gear.jumps:
+        pieces.append(Jumps(gear.jumps, gear.teeth or 2.0 * gear.ratio, dt_s))
+    if gear.damage:
+        pieces.append(Damage(gear.damage))
+    if gear.roller is not None:
+        pieces.append(Roller(gear.roller))
+    if gear.seat is not None:
+        pieces.append(Seat(gear.seat))
     return pieces
+
+
+def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
+    """A growth with temperature, if there is one."""
+    heat = truth.temperature
+    reference_c = heat.ambient_c if heat.reference_c is None else heat.reference_c
+    return WarmthFactor(per_k, reference_c) if per_k else None
+
+
+def _motor_orders(truth: Truth) -> Piece:
+    gear = truth.gear
+    flank = Flank(gear.flank) if gear.flank is not None and gear.flank.shift_deg else None
+    torque = TorqueFactor(gear.torque_growth_per_nm) if gear.torque_growth_per_nm else None
+    warmth = warmth_factor(truth, truth.temperature.tooth_growth_per_k)
+    factors = tuple(factor for factor in (torque, warmth) if factor is not None)
+    if flank is None and not factors:
+        return MotorOrders(gear.motor_orders, 1.0)
+    return VaryingOrders(gear.motor_orders, flank, factors)
+
+
+def _hysteresis(truth: Truth) -> list[Piece]:
+    gear = truth.gear
+    pieces: list[Piece] = []
+    for each in (gear.hysteresis, gear.second_hysteresis):
+        law = law_of(each, 0.0)
+        if law is None:
+            continue
+        rate = SpeedFactor(gear.rate_dependence, truth.substep_s) if gear.rate_dependence else None
+        warmth = warmth_factor(truth, truth.temperature.friction_growth_per_k)
+        factors = tuple(factor for factor in (rate, warmth) if factor is not None)
+        pieces.append(VaryingHysteresis(law, factors) if factors else ElasticHysteresis(law))
+    return pieces
+
+
+def _zero_drift(truth: Truth) -> list[Piece]:
+    heat = truth.temperature
+    per_k = heat.zero_drift_arcsec_per_k
+    if not per_k:
+        return []
+    if not heat.zero_time_constant_s:
+        return [ZeroDrift(heat.ambient_c, per_k)]
+    start_c = heat.ambient_c if heat.start_c is None else heat.start_c
+    nearer = -math.expm1(-truth.substep_s / heat.zero_time_constant_s)
+    return [SlowZeroDrift(heat.ambient_c, per_k, start_c, nearer)]
 
 
 class Gear:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from hdbridge.sim.truth import BoucWen, MaxwellSlip, RollingFriction
+from hdbridge.sim.truth_hysteresis import BoucWen, Dahl, Hysteresis, MaxwellSlip, RollingFriction
 
 
 class Law(Protocol):
@@ -20,12 +20,14 @@ class Law(Protocol):
         ...
 
 
-def law_of(truth: RollingFriction | MaxwellSlip | BoucWen | None, motor_deg: float) -> Law | None:
+def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
     """The law that a truth file names, at its start, the motor at an angle."""
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):
         return MaxwellSlipLaw(truth, motor_deg)
+    if isinstance(truth, Dahl):
+        return DahlLaw(truth, motor_deg)
     return None if truth is None else BoucWenLaw(truth, motor_deg)
 
 
@@ -152,3 +154,36 @@ class BoucWenLaw:
     def _slope(self, z: float, direction: float) -> float:
         turned = self._beta if z * direction > 0.0 else -self._beta
         return float(1.0 - abs(z) ** self._exponent * (turned + self._gamma))
+
+
+class DahlLaw:
+    """``dz/dx = (1 - z sgn dx)^i / yield``, exactly; the error is offset * z."""
+
+    __slots__ = ("_exponent", "_motor_deg", "_offset", "_yield", "_z")
+
+    def __init__(self, truth: Dahl, motor_deg: float) -> None:
+        self._offset = truth.offset_arcsec
+        self._yield = truth.yield_deg
+        self._exponent = truth.exponent
+        self._motor_deg = motor_deg
+        self._z = 0.0
+
+    def advance(self, motor_deg: float) -> float:
+        """See `Law`."""
+        travel = (motor_deg - self._motor_deg) / self._yield
+        if travel != 0.0:
+            self._motor_deg = motor_deg
+            direction = 1.0 if travel > 0.0 else -1.0
+            left = self._left(1.0 - direction * self._z, abs(travel))
+            self._z = direction * (1.0 - left)
+        return self._offset * self._z
+
+    def _left(self, left: float, travel: float) -> float:
+        """What is left to the offset ahead (0 to 2) after a travel, in units of the yield."""
+        if left <= 0.0:
+            return 0.0
+        rest = 1.0 - self._exponent
+        if rest == 0.0:
+            return left * math.exp(-travel)
+        power = left**rest - rest * travel
+        return power ** (1.0 / rest) if power > 0.0 else 0.0

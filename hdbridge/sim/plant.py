@@ -6,13 +6,16 @@ set-valued force, so a motor whose torque does not exceed it stands still exactl
 
 The gear's reaction on the motor is the spring's torque divided by the ratio; that the tooth error makes the
 momentary ratio differ from it by a hundredth or two is left out there, not in the angles.
+
+`Plant` has a linear spring and a load without outer torques; `hdbridge.sim.loaded_plant` has the rest.
 """
 
 from __future__ import annotations
 
 import math
 
-from hdbridge.sim.gear import Conditions, Gear
+from hdbridge.sim.conditions import Conditions
+from hdbridge.sim.gear import Gear
 from hdbridge.sim.oscillator import exact_step
 from hdbridge.sim.truth import Truth
 
@@ -23,9 +26,9 @@ class Plant:
     """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
 
     __slots__ = (
-        "_arm", "_coulomb", "_coupling", "_damping", "_drag", "_dt", "_encoder_rate", "_flexspline", "_gear",
-        "_inertia", "_load_drag", "_load_friction", "_ratio", "_stiffness", "encoder_deg", "load_deg_s",
-        "loss_j", "motor_deg_s", "now", "output_deg",
+        "_arm", "_cold_coulomb", "_cold_drag", "_coulomb", "_coupling", "_damping", "_drag", "_dt",
+        "_encoder_rate", "_flexspline", "_gear", "_inertia", "_load_drag", "_load_friction", "_ratio",
+        "_stiffness", "encoder_deg", "load_deg_s", "loss_j", "motor_deg_s", "now", "output_deg",
     )  # fmt: skip
 
     def __init__(self, truth: Truth) -> None:
@@ -38,14 +41,15 @@ class Plant:
         # Spring torque, averaged over a step, by the sum of the motor's speeds at its ends.
         self._arm = (self._stiffness * dt / 4.0 + self._damping / 2.0) / gear.ratio
         self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
-        self._drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
-        self._coulomb = motor.coulomb_nm
+        self._drag = self._cold_drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
+        self._coulomb = self._cold_coulomb = motor.coulomb_nm
 
-        frequency = math.sqrt(gear.stiffness_nm_per_rad / load.inertia_kg_m2)
-        damping_ratio = gear.damping_nm_s_per_rad / (2.0 * load.inertia_kg_m2 * frequency)
+        inertia = load.whole_inertia_kg_m2
+        frequency = math.sqrt(gear.stiffness_nm_per_rad / inertia)
+        damping_ratio = gear.damping_nm_s_per_rad / (2.0 * inertia * frequency)
         self._flexspline = exact_step(frequency, damping_ratio, dt)
-        self._load_drag = math.exp(-load.viscous_nm_s_per_rad / load.inertia_kg_m2 * dt)
-        self._load_friction = load.coulomb_nm / load.inertia_kg_m2 / RAD_PER_DEG * dt
+        self._load_drag = math.exp(-load.viscous_nm_s_per_rad / inertia * dt)
+        self._load_friction = load.coulomb_nm / inertia / RAD_PER_DEG * dt
 
         coupling = load.encoder.coupling
         self._coupling = (
@@ -65,14 +69,47 @@ class Plant:
     def advance(self, torque_nm: float, brake_nm: float) -> None:
         """One substep under a motor torque; the brake adds to the Coulomb friction."""
         now, dt = self.now, self._dt
-        speed, output, load = self.motor_deg_s, self.output_deg, now.load_deg
+        output, load = self.output_deg, now.load_deg
         load_speed = self.load_deg_s
         lag = output - load
+        spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
+        moved = self._turn_motor(torque_nm, brake_nm, spring)
 
-        # Motor. arm * (old speed + new speed) is the motor's own share in the spring's torque.
+        # Load, seen from the gear's output.
+        if moved or not self._gear.by_motor_only:
+            self.output_deg = new_output = self._gear.output_deg(now)
+            rate = (new_output - output) / dt
+        else:
+            new_output, rate = output, 0.0
+        a, b, c, d = self._flexspline
+        slip = load_speed - rate
+        new_load = new_output + b * slip - a * lag
+        new_load_speed = (rate + d * slip - c * lag) * self._load_drag
+        if self._load_friction:
+            new_load, new_load_speed = self._rub(load, new_load, new_load_speed, self._load_friction)
+        now.torque_nm = self._stiffness * (new_output - new_load)
+        now.load_deg = new_load
+        self.load_deg_s = new_load_speed
+        self._turn_encoder(load, new_load)
+
+    @property
+    def outer_torque_nm(self) -> float:
+        """Torque of gravity on the load, as a sensor at its flange tells; positive forward."""
+        return 0.0
+
+    def scale_friction(self, factor: float) -> None:
+        """Set the motor's friction to so many times what the truth file says."""
+        self._coulomb = self._cold_coulomb * factor
+        self._drag = self._cold_drag * factor
+
+    def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
+        """The motor's part of a substep; whether it moved.
+
+        ``spring`` is the spring's torque without the motor's own share in it, arm * (old speed + new speed).
+        """
+        now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
         arm = self._arm / self._ratio
-        spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
         push = (self._inertia - arm) * speed + torque_nm - spring / self._ratio
         if push > held:
             new_speed = (push - held) / (self._inertia + arm + self._drag)
@@ -86,37 +123,22 @@ class Plant:
             turned = abs(new_speed)
             self.loss_j += (held + self._drag * turned) * turned * RAD_PER_DEG * dt
         self.motor_deg_s = new_speed
+        return moved
 
-        # Load, seen from the gear's output.
-        if moved or not self._gear.by_motor_only:
-            self.output_deg = new_output = self._gear.output_deg(now)
-            rate = (new_output - output) / dt
-        else:
-            new_output, rate = output, 0.0
-        a, b, c, d = self._flexspline
-        slip = load_speed - rate
-        new_load = new_output + b * slip - a * lag
-        new_load_speed = (rate + d * slip - c * lag) * self._load_drag
-        if self._load_friction:
-            new_load, new_load_speed = self._rub(load, new_load, new_load_speed)
-        now.torque_nm = self._stiffness * (new_output - new_load)
-        now.load_deg = new_load
-        self.load_deg_s = new_load_speed
-
-        # Load encoder, seen from the load.
+    def _turn_encoder(self, load: float, new_load: float) -> None:
+        """The load encoder's part of a substep, seen from the load."""
         if self._coupling is None:
             self.encoder_deg = new_load
             return
         a, b, c, d = self._coupling
-        rate = (new_load - load) / dt
+        rate = (new_load - load) / self._dt
         ahead = self.encoder_deg - load
         slip = self._encoder_rate - rate
         self.encoder_deg = new_load + a * ahead + b * slip
         self._encoder_rate = rate + c * ahead + d * slip
 
-    def _rub(self, before: float, load: float, speed: float) -> tuple[float, float]:
-        """Coulomb friction at the load: takes speed away, and holds a load that it can hold."""
-        loss = self._load_friction
+    def _rub(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
+        """Coulomb friction at the load: takes a speed away, and holds a load that it can hold."""
         if abs(speed) <= loss:
             return before, 0.0
         loss = math.copysign(loss, speed)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
 
 from hdbridge.axis import AxisConfig
 from hdbridge.errors import InputError
-from hdbridge.sim import truth as truth_module
 from hdbridge.sim.truth import RollingFriction, Truth
 
 ROOT = Path(__file__).parents[2]
@@ -93,13 +92,62 @@ def test_an_absent_truth_file_is_refused(tmp_path: Path) -> None:
         Truth.load(tmp_path)
 
 
+def parts(model: type[BaseModel]) -> set[type[BaseModel]]:
+    """A model and all models that its fields name."""
+    found = {model}
+    waiting: list[Any] = [field.annotation for field in model.model_fields.values()]
+    while waiting:
+        each = waiting.pop()
+        if isinstance(each, type) and issubclass(each, BaseModel):
+            found |= parts(each) if each not in found else set()
+        else:
+            waiting += get_args(each)
+    return found
+
+
 def test_every_key_is_described_in_the_reference() -> None:
     reference = (ROOT / "docs" / "truth-file.md").read_text()
-    models: list[Any] = [
-        each
-        for each in vars(truth_module).values()
-        if isinstance(each, type) and issubclass(each, BaseModel) and each.__module__ == truth_module.__name__
-    ]
+    models = parts(Truth)
     keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
-    assert len(keys) > 40
+    assert len(models) > 30
+    assert len(keys) > 120
     assert [key for key in sorted(keys) if f"`{key}`" not in reference] == []
+
+
+def test_every_cause_is_off_unless_the_file_says_so() -> None:
+    gear, load = Truth.load(ARTICLE).gear, Truth.load(ARTICLE).load_
+    assert not any(
+        (gear.flank, gear.torque_growth_per_nm, gear.stiffening, gear.backlash_arcsec, gear.second_hysteresis)
+    )
+    assert not any(
+        (gear.rate_dependence, gear.wear, gear.creep, gear.jumps, gear.damage, gear.roller, gear.seat)
+    )
+    assert not any((load.stribeck, load.thinning, load.gravity, load.vibration))
+    assert not any((load.encoder.disc, load.encoder.late_ms, load.encoder.losses, load.encoder.signals))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (
+            "  hysteresis:  ",
+            "  stiffening: {first_torque_nm: 5, second_stiffness_nm_per_rad: 2.0e4, second_torque_nm: 4, "
+            "third_stiffness_nm_per_rad: 3.0e4}\n  hysteresis:  ",
+            "4 Nm is not above first_torque_nm, 5",
+        ),
+        (
+            "    direction: 1",
+            "    disc: {radius_mm: 10, eccentricity_um: 2000}\n    direction: 1",
+            "2000 um is more than a tenth of the radius",
+        ),
+        (
+            "  hysteresis:  ",
+            "  stiffening: {first_torque_nm: 5, second_stiffness_nm_per_rad: 4.0e6, second_torque_nm: 9, "
+            "third_stiffness_nm_per_rad: 3.0e4}\n  hysteresis:  ",
+            "too long for a resonance",
+        ),
+    ],
+)
+def test_a_cause_that_makes_no_sense_is_refused(old: str, new: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        changed(old, new)

@@ -1,0 +1,194 @@
+"""What an encoder makes of its shaft's angle: geometry of the disc, signals, cable, age, counts lost.
+
+Each error is a reading error in degrees of the encoder's shaft: the shaft itself does not move by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from typing import Protocol
+
+from hdbridge.sim.truth_encoder import (
+    TrueCable,
+    TrueDisc,
+    TrueEncoder,
+    TrueLoadEncoder,
+    TrueLoss,
+    TrueSensorWarming,
+    TrueSignals,
+)
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+class ReadingError(Protocol):
+    """One cause of a wrong reading, with its state."""
+
+    def error_deg(self, shaft_deg: float) -> float:
+        """What is read beyond the shaft's angle."""
+        ...
+
+
+class Disc:
+    """A disc off its shaft's axis, and distorted twice per turn.
+
+    The head stands still; from the graduation's centre, a distance e off the axis of radius R, it is seen at
+    another angle than from the axis: ``atan2(e sin a, R + e cos a)``, about e/R sin a.
+    """
+
+    __slots__ = ("_eccentric_rad", "_oval", "_oval_rad", "_relative")
+
+    def __init__(self, truth: TrueDisc) -> None:
+        self._relative = truth.eccentricity_um / 1000.0 / truth.radius_mm
+        self._eccentric_rad = math.radians(truth.eccentric_at_deg)
+        self._oval = truth.ovality_um / 1000.0 / truth.radius_mm
+        self._oval_rad = math.radians(truth.oval_at_deg)
+
+    def error_deg(self, shaft_deg: float) -> float:
+        """See `ReadingError`."""
+        angle = math.radians(shaft_deg)
+        turned, e = angle - self._eccentric_rad, self._relative
+        off = math.atan2(e * math.sin(turned), 1.0 + e * math.cos(turned))
+        return math.degrees(off + self._oval * math.sin(2.0 * (angle - self._oval_rad)))
+
+
+class Signals:
+    """The angle within a line, from a sine and a cosine that are not quite what they should be.
+
+    Offsets make an error once per line, unequal amplitudes or phases twice, third harmonics four times.
+    """
+
+    __slots__ = ("_cosine_offset", "_gain", "_lines", "_phase_rad", "_sine_offset", "_third")
+
+    def __init__(self, truth: TrueSignals) -> None:
+        self._lines = truth.lines_per_turn
+        self._sine_offset = truth.sine_offset
+        self._cosine_offset = truth.cosine_offset
+        self._gain = 1.0 + truth.gain_mismatch
+        self._phase_rad = math.radians(truth.phase_mismatch_deg)
+        self._third = truth.third_harmonic
+
+    def error_deg(self, shaft_deg: float) -> float:
+        """See `ReadingError`."""
+        phase = math.fmod(shaft_deg * self._lines, 360.0) * (math.pi / 180.0)
+        sine = self._gain * math.sin(phase) - self._third * math.sin(3.0 * phase) + self._sine_offset
+        cosine = math.cos(phase + self._phase_rad) + self._third * math.cos(3.0 * phase) + self._cosine_offset
+        return math.degrees(math.remainder(math.atan2(sine, cosine) - phase, math.tau)) / self._lines
+
+
+class Cable:
+    """A cable that is taut beyond an angle and pulls the encoder's body along; it reads that much less."""
+
+    __slots__ = ("_drag", "_from_deg", "_last_deg", "_per_deg", "_way")
+
+    BACK_DEG = 0.05
+    """Load travel within which the cable's drag turns over."""
+
+    def __init__(self, truth: TrueCable) -> None:
+        self._from_deg = truth.taut_from_deg
+        self._per_deg = truth.arcsec_per_deg / ARCSEC_PER_DEG
+        self._drag = truth.drag
+        self._last_deg: float | None = None
+        self._way = 0.0
+
+    def error_deg(self, shaft_deg: float) -> float:
+        """See `ReadingError`."""
+        if self._last_deg is not None:
+            travel = (shaft_deg - self._last_deg) / self.BACK_DEG
+            self._way = min(1.0, max(-1.0, self._way + travel))
+        self._last_deg = shaft_deg
+        beyond = shaft_deg - self._from_deg
+        return -self._per_deg * beyond * (1.0 + self._drag * self._way) if beyond > 0.0 else 0.0
+
+
+class SensorWarming:
+    """A shift that follows the square of the speed as the encoder warms and cools."""
+
+    __slots__ = ("_goal", "_interval_s", "_last_deg", "_nearer", "_shift_deg")
+
+    def __init__(self, truth: TrueSensorWarming, interval_s: float) -> None:
+        self._goal = truth.arcsec_at_10_deg_s / 100.0 / ARCSEC_PER_DEG
+        self._interval_s = interval_s
+        self._nearer = -math.expm1(-interval_s / truth.time_constant_s)
+        self._last_deg: float | None = None
+        self._shift_deg = 0.0
+
+    def error_deg(self, shaft_deg: float) -> float:
+        """See `ReadingError`."""
+        if self._last_deg is not None:
+            speed_deg_s = (shaft_deg - self._last_deg) / self._interval_s
+            self._shift_deg += (self._goal * speed_deg_s**2 - self._shift_deg) * self._nearer
+        self._last_deg = shaft_deg
+        return self._shift_deg
+
+
+class Losses:
+    """Counts lost so far."""
+
+    __slots__ = ("_counts", "_to_come")
+
+    def __init__(self, losses: Iterable[TrueLoss]) -> None:
+        self._to_come = deque(sorted(losses, key=lambda each: each.time_s))
+        self._counts = 0
+
+    def counts(self, now_s: float) -> int:
+        """By how much the reading is off at a time; times never go back."""
+        while self._to_come and self._to_come[0].time_s <= now_s:
+            self._counts += self._to_come.popleft().counts
+        return self._counts
+
+
+class Late:
+    """What a shaft's angle was some time ago; fed once per substep."""
+
+    __slots__ = ("_angles", "_part")
+
+    def __init__(self, late_s: float, dt_s: float, start_deg: float) -> None:
+        whole, self._part = divmod(late_s / dt_s, 1.0)
+        self._angles = deque([start_deg] * (int(whole) + 2), maxlen=int(whole) + 2)
+
+    def feed(self, shaft_deg: float) -> None:
+        """The angle after one more substep."""
+        self._angles.append(shaft_deg)
+
+    @property
+    def deg(self) -> float:
+        """The angle as late as it is."""
+        return self._angles[1] + (self._angles[0] - self._angles[1]) * self._part
+
+
+def fixed_errors(truth: TrueEncoder) -> tuple[ReadingError, ...]:
+    """The reading errors that follow from the shaft's angle alone."""
+    errors: list[ReadingError] = []
+    if truth.disc is not None:
+        errors.append(Disc(truth.disc))
+    if isinstance(truth, TrueLoadEncoder) and truth.signals is not None:
+        errors.append(Signals(truth.signals))
+    return tuple(errors)
+
+
+class Body:
+    """What moves the load encoder's body against its shaft, by the way the shaft has come.
+
+    It has a state, so it is led once per substep, and read as often as one likes.
+    """
+
+    __slots__ = ("_errors", "deg")
+
+    def __init__(self, truth: TrueLoadEncoder, dt_s: float) -> None:
+        errors: list[ReadingError] = []
+        if truth.cable is not None:
+            errors.append(Cable(truth.cable))
+        if truth.sensor_warming is not None:
+            errors.append(SensorWarming(truth.sensor_warming, dt_s))
+        self._errors = tuple(errors)
+        self.deg = 0.0
+        """The present shift of the reading."""
+
+    def __bool__(self) -> bool:
+        return bool(self._errors)
+
+    def feed(self, shaft_deg: float) -> None:
+        """The shaft's angle after one more substep."""
+        self.deg = sum(each.error_deg(shaft_deg) for each in self._errors)

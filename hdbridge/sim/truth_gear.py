@@ -1,0 +1,156 @@
+"""The truth file's section ``gear``."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from hdbridge.sim.truth_hysteresis import Hysteresis, TrueOrder
+from hdbridge.sim.truth_part import Part
+from hdbridge.yamlfile import wrong
+
+
+class TrueStiffening(Part):
+    """The spring's later stages: beyond each torque it is stiffer (or softer) than before."""
+
+    first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
+    second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")
+    second_torque_nm: float = Field(gt=0, le=1e6, description="torque T2 at which the second stage ends")
+    third_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K3 beyond T2")
+
+    @model_validator(mode="after")
+    def _breaks_in_order(self) -> Self:
+        if self.second_torque_nm <= self.first_torque_nm:
+            raise wrong(
+                f"{self.second_torque_nm:g} Nm is not above first_torque_nm, {self.first_torque_nm:g}",
+                "second_torque_nm",
+            )
+        return self
+
+
+class TrueFlank(Part):
+    """Teeth touch with the other flank after a reversal, and there the tooth error is shifted."""
+
+    shift_deg: float = Field(
+        ge=-90, le=90, description="shift of the tooth error by motor angle, either way from the mean"
+    )
+    travel_deg: float = Field(gt=0, le=360, description="motor travel from one flank to the other")
+
+
+class TrueRate(Part):
+    """The elastic hysteresis grows with speed: the grease's share in the rolling friction."""
+
+    growth_per_decade: float = Field(ge=-1, le=5, description="growth of the loop per decade of motor speed")
+    from_deg_s: float = Field(gt=0, le=1e5, description="motor speed at which the growth sets in")
+    time_constant_s: float = Field(0.05, gt=0, le=1e4, description="time that the friction takes to follow")
+
+
+class TrueWear(Part):
+    """Lost motion between the teeth, growing with the way that the motor has run."""
+
+    arcsec_per_1000_turns: float = Field(
+        ge=0, le=36_000, description="lost motion, one way, after the first 1000 motor turns"
+    )
+    exponent: float = Field(1.0, ge=0.1, le=3, description="growth with the way; below 1 it runs in")
+
+
+class TrueCreep(Part):
+    """A spring with a dashpot beside it (Kelvin-Voigt), in series with the gear."""
+
+    time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the element")
+    amplitude_arcsec: float = Field(
+        0.0, ge=-3_600, le=3_600, description="how far it yields, in time, to the teeth's drag in motion"
+    )
+    arcsec_per_nm: float = Field(
+        0.0, ge=0, le=3_600, description="how far it yields, in time, to the torque at the load"
+    )
+
+
+class TrueJump(Part):
+    """Teeth jumped: the output is off by them from then on."""
+
+    time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
+    teeth: int = Field(ge=-100, le=100, description="teeth that the output jumps forward by")
+    duration_s: float = Field(0.1, gt=0, le=10, description="time that the jump takes")
+
+
+class TrueDamage(Part):
+    """A damaged tooth: a bump of the output at one load angle."""
+
+    at_deg: float = Field(ge=-360, le=360, description="load angle of its middle")
+    width_deg: float = Field(gt=0, le=180, description="width from foot to foot, of the load")
+    height_arcsec: float = Field(ge=-36_000, le=36_000, description="height in its middle")
+
+
+class TrueRoller(Part):
+    """A roller on the motor's hub, pressed on at some load angles more than at others."""
+
+    order: float = Field(gt=0, le=512, description="its turns per motor turn, not a whole number")
+    amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude where it is pressed on most")
+    phase_deg: float = Field(0.0, ge=-360, le=360, description="phase at the motor angle zero")
+    pressed_at_deg: float = Field(0.0, ge=-360, le=360, description="load angle where it is pressed on most")
+    sharpness: float = Field(1.0, gt=0, le=50, description="how soon the pressure falls off from there")
+
+
+class TrueSeat(Part):
+    """A bearing ring that sticks in its seat, is carried along, and slips at random angles."""
+
+    slip_arcsec: float = Field(gt=0, le=36_000, description="how far it is carried at most; it slips before")
+    travel_deg: float = Field(gt=0, le=1e6, description="motor travel that carries it as far as that")
+    seed: int = Field(0, ge=0, description="seed of where it slips")
+
+
+class TrueGear(Part):
+    """The harmonic gear: what its output does beside turning by motor angle / ratio."""
+
+    ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
+    stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")
+    damping_nm_s_per_rad: float = Field(ge=0, le=1e6, description="flexspline's damping, to the load")
+    motor_orders: tuple[TrueOrder, ...] = Field((), description="tooth error by motor angle")
+    flexspline_orders: tuple[TrueOrder, ...] = Field(
+        (), description="tooth error by the angle between wave generator and flexspline: motor (1 + 1/ratio)"
+    )
+    load_orders: tuple[TrueOrder, ...] = Field((), description="tooth error by load angle")
+    hysteresis: Hysteresis | None = Field(None, description="elastic hysteresis law; without it: none")
+
+    flank: TrueFlank | None = Field(None, description="tooth error of the other flank; without it: the same")
+    torque_growth_per_nm: float = Field(
+        0.0, ge=-1, le=10, description="growth of the tooth error per torque at the load, of either sign"
+    )
+    stiffening: TrueStiffening | None = Field(None, description="stages of the spring; without it: linear")
+    backlash_arcsec: float = Field(
+        0.0,
+        ge=0,
+        le=36_000,
+        description="dead zone between the gear's spring and the load, from side to side",
+    )
+    second_hysteresis: Hysteresis | None = Field(None, description="a second law, added to the first")
+    rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
+    wear: TrueWear | None = Field(None, description="lost motion by the way run; without it: none")
+    creep: tuple[TrueCreep, ...] = Field((), max_length=16, description="elements that yield in time")
+    teeth: int | None = Field(None, ge=3, le=100_000, description="teeth of the output; else twice the ratio")
+    jumps: tuple[TrueJump, ...] = Field((), description="teeth jumped, each at its time")
+    damage: tuple[TrueDamage, ...] = Field((), max_length=64, description="damaged teeth, by load angle")
+    roller: TrueRoller | None = Field(None, description="a roller that beats with the load angle")
+    seat: TrueSeat | None = Field(None, description="a bearing ring that slips at random")
+
+    @property
+    def stiffest_nm_per_rad(self) -> float:
+        """The spring where it is stiffest."""
+        later = self.stiffening
+        if later is None:
+            return self.stiffness_nm_per_rad
+        return max(
+            self.stiffness_nm_per_rad, later.second_stiffness_nm_per_rad, later.third_stiffness_nm_per_rad
+        )
+
+    @model_validator(mode="after")
+    def _each_order_once(self) -> Self:
+        for name in ("motor_orders", "flexspline_orders", "load_orders"):
+            seen: set[int] = set()
+            for position, each in enumerate(getattr(self, name)):
+                if each.order in seen:
+                    raise wrong(f"order {each.order} stands twice", name, position, "order")
+                seen.add(each.order)
+        return self

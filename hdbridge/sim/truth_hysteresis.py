@@ -1,0 +1,78 @@
+"""The truth file's tooth errors and hysteresis laws."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from hdbridge.sim.truth_part import Part
+from hdbridge.yamlfile import wrong
+
+
+class TrueOrder(Part):
+    """A term of the tooth error: amplitude * cos(order * angle + phase)."""
+
+    order: int = Field(ge=1, le=512, description="periods per turn of the angle it belongs to")
+    amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude, at the load")
+    phase_deg: float = Field(ge=-360, le=360, description="phase at the angle zero")
+
+
+class RollingFriction(Part):
+    """The article's law: after a reversal the error crosses to the other side within a width."""
+
+    law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
+    offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
+    width_deg: float = Field(gt=0, le=36_000, description="motor travel of the crossing")
+    exponent: float = Field(gt=1, le=10, description="shape of the crossing, n")
+    start_arcsec: float = Field(0.0, description="error at the start")
+
+    @model_validator(mode="after")
+    def _starts_within(self) -> Self:
+        if abs(self.start_arcsec) > self.offset_arcsec:
+            raise wrong(
+                f"{self.start_arcsec:g} arcsec lies outside -offset_arcsec to offset_arcsec, "
+                f"{self.offset_arcsec:g}",
+                "start_arcsec",
+            )
+        return self
+
+
+class SlipElement(Part):
+    """A spring in series with a slider."""
+
+    limit_arcsec: float = Field(ge=0, le=36_000, description="error at which it slips")
+    yield_deg: float = Field(gt=0, le=36_000, description="motor travel from zero to slipping")
+
+
+class MaxwellSlip(Part):
+    """Parallel elasto-plastic elements; remembers every reversal that a larger one has not wiped out."""
+
+    law: Literal["maxwell_slip"] = Field(description="Maxwell slip, Prandtl-Ishlinskii; return-point memory")
+    elements: tuple[SlipElement, ...] = Field(
+        min_length=1, max_length=64, description="elements; their errors add up"
+    )
+
+
+class BoucWen(Part):
+    """A differential equation in the motor's travel, not in time."""
+
+    law: Literal["bouc_wen"] = Field(description="Bouc-Wen, the smooth law")
+    offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
+    yield_deg: float = Field(gt=0, le=36_000, description="offset divided by the slope at error zero")
+    exponent: float = Field(1.0, ge=1, le=10, description="sharpness of the transition to the offset")
+    beta: float = Field(
+        0.5, ge=0.5, le=1, description="dissipating part; 1 - beta is gamma. At 0.5 it unloads along a line"
+    )
+
+
+class Dahl(Part):
+    """Dahl's law: the slope falls with a power of what is left to the offset ahead."""
+
+    law: Literal["dahl"] = Field(description="Dahl's law; no return-point memory")
+    offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
+    yield_deg: float = Field(gt=0, le=36_000, description="offset divided by the slope at error zero")
+    exponent: float = Field(1.0, ge=0.5, le=5, description="1: exponential; below 1 the offset is reached")
+
+
+Hysteresis = Annotated[RollingFriction | MaxwellSlip | BoucWen | Dahl, Field(discriminator="law")]

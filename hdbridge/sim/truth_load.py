@@ -1,0 +1,63 @@
+"""The truth file's section ``load``."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from hdbridge.sim.truth_encoder import TrueLoadEncoder
+from hdbridge.sim.truth_part import Part
+
+
+class TrueGravity(Part):
+    """A mass on the axis."""
+
+    mass_kg: float = Field(gt=0, le=1e5, description="mass")
+    arm_m: float = Field(gt=0, le=100, description="its distance from the axis")
+    down_deg: float = Field(0.0, ge=-360, le=360, description="load angle at which it hangs straight down")
+    tilt_deg: float = Field(0.0, ge=0, le=90, description="tilt of the axis; 90 is upright, without torque")
+
+
+class TrueStribeck(Part):
+    """Friction at the load that is higher near rest."""
+
+    breakaway_nm: float = Field(
+        ge=0, le=1e6, description="friction at rest, in place of the Coulomb friction"
+    )
+    speed_rad_s: float = Field(gt=0, le=100, description="load speed by which it has come down to 1/e")
+
+
+class TrueThinning(Part):
+    """Grease that thins when sheared: viscous friction / (1 + speed / its speed)^exponent."""
+
+    speed_rad_s: float = Field(gt=0, le=1_000, description="load speed at which it sets in")
+    exponent: float = Field(0.5, gt=0, le=1, description="how much; 1 ends at a constant torque")
+
+
+class TrueVibration(Part):
+    """A machine nearby that shakes the load."""
+
+    frequency_hz: float = Field(gt=0, le=500, description="frequency")
+    torque_nm: float = Field(ge=0, le=1e6, description="amplitude of the torque on the load")
+    phase_deg: float = Field(0.0, ge=-360, le=360, description="phase when the axis is switched on")
+
+
+class TrueLoad(Part):
+    """The load with its encoder."""
+
+    inertia_kg_m2: float = Field(gt=0, le=1e6, description="inertia of the load, at the load")
+    coulomb_nm: float = Field(
+        0.0, ge=0, le=1e6, description="Coulomb friction at the load; leaves wind-up at rest"
+    )
+    viscous_nm_s_per_rad: float = Field(0.0, ge=0, le=1e6, description="viscous friction at the load")
+    stribeck: TrueStribeck | None = Field(None, description="friction near rest; without it: Coulomb only")
+    thinning: TrueThinning | None = Field(None, description="shear thinning of the viscous friction")
+    gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
+    vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
+    encoder: TrueLoadEncoder = Field(description="encoder at the load")
+
+    @property
+    def whole_inertia_kg_m2(self) -> float:
+        """The load's inertia with the mass on it."""
+        if self.gravity is None:
+            return self.inertia_kg_m2
+        return self.inertia_kg_m2 + self.gravity.mass_kg * self.gravity.arm_m**2

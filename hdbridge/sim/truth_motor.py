@@ -1,0 +1,68 @@
+"""The truth file's sections ``motor`` and ``servo``."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from hdbridge.sim.truth_encoder import TrueMotorEncoder
+from hdbridge.sim.truth_part import Part
+
+
+class TrueMotor(Part):
+    """The motor with the wave generator, and the friction on their shaft."""
+
+    inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of motor and wave generator")
+    rated_torque_nm: float = Field(gt=0, le=10_000, description="rated torque, the unit of 6077h")
+    coulomb_nm: float = Field(
+        0.0, ge=0, le=10_000, description="Coulomb friction; it holds the shaft at rest"
+    )
+    viscous_nm_s_per_rad: float = Field(0.0, ge=0, le=1_000, description="viscous friction")
+    brake_nm: float = Field(1.0, ge=0, le=100_000, description="torque up to which the brake holds")
+    encoder: TrueMotorEncoder = Field(description="encoder on the motor shaft")
+
+
+class TrueLoadFeedforward(Part):
+    """The drive's own picture of the load behind the gear's spring, as its commissioning has set it."""
+
+    inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of the load, seen by the motor")
+    frequency_hz: float = Field(ge=1, le=500, description="natural frequency of the load, the motor held")
+    damping_ratio: float = Field(ge=0, le=2, description="damping ratio of the load, the motor held")
+
+
+class TrueServo(Part):
+    """The drive's loops: position and velocity cascade with feed-forward, limited in torque."""
+
+    position_gain_per_s: float = Field(gt=0, le=5_000, description="position loop: speed per position error")
+    velocity_gain_nm_s_per_rad: float = Field(
+        gt=0, le=1_000, description="velocity loop: torque per speed error"
+    )
+    integral_time_ms: float = Field(gt=0, le=10_000, description="velocity loop: integral time")
+    integral_dead_band: float = Field(
+        1.0,
+        ge=0,
+        le=1_000,
+        description="shortfall within which the integral rests once the demand does, in interpolated steps",
+    )
+    hunting_band: float = Field(
+        16.0,
+        ge=0,
+        le=100_000,
+        description="overshoot within which it rests, so as not to turn back and hunt, in interpolated steps",
+    )
+    command_filter_ms: float = Field(
+        gt=0, le=100, description="time constant of the second-order filter on the demand"
+    )
+    velocity_feedforward: float = Field(1.0, ge=0, le=1.5, description="part of the demanded speed")
+    inertia_feedforward_kg_m2: float = Field(
+        0.0, ge=0, le=100, description="torque per demanded acceleration, for the motor itself"
+    )
+    load_feedforward: TrueLoadFeedforward | None = Field(
+        None, description="torque that carries the load along; without it: none"
+    )
+    viscous_feedforward_nm_s_per_rad: float = Field(
+        0.0, ge=0, le=1_000, description="torque per demanded speed"
+    )
+    friction_feedforward_nm: float = Field(
+        0.0, ge=0, le=10_000, description="torque in the direction of the last demanded motion"
+    )
+    torque_limit_percent: float = Field(gt=0, le=1_000, description="highest torque, of the rated one")
