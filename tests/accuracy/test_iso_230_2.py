@@ -1,0 +1,103 @@
+"""ISO 230-2 figures against numbers worked out by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.accuracy import axis_accuracy
+from hdbridge.errors import InputError
+
+# Two targets, two runs each way; standard deviations of a pair are |difference| / sqrt(2).
+#              target 0           target 90
+# forward    1, 3   mean 2     5, 5  mean 5
+# backward  -4, -2  mean -3   -1, 1  mean 0
+TARGET = [0.0, 0.0, 0.0, 0.0, 90.0, 90.0, 90.0, 90.0]
+DEVIATION = [1.0, 3.0, -4.0, -2.0, 5.0, 5.0, -1.0, 1.0]
+FORWARD = [True, True, False, False, True, True, False, False]
+S = 2.0**0.5
+
+
+def test_a_small_example_worked_by_hand():
+    found = axis_accuracy(TARGET, DEVIATION, FORWARD)
+    assert found.reversal == pytest.approx(5.0)
+    assert found.mean_reversal == pytest.approx(5.0)
+    assert found.systematic == pytest.approx(5.0 - -3.0)
+    assert found.systematic_forward == pytest.approx(3.0)
+    assert found.systematic_backward == pytest.approx(3.0)
+    assert found.range == pytest.approx(2.5 - -0.5)
+    assert found.repeatability_forward == pytest.approx(4.0 * S)
+    assert found.repeatability_backward == pytest.approx(4.0 * S)
+    assert found.repeatability == pytest.approx(2.0 * S + 2.0 * S + 5.0)
+    assert found.accuracy_forward == pytest.approx(5.0 - (2.0 - 2.0 * S))
+    assert found.accuracy_backward == pytest.approx((0.0 + 2.0 * S) - (-3.0 - 2.0 * S))
+    assert found.accuracy == pytest.approx(5.0 - (-3.0 - 2.0 * S))
+    assert (found.targets, found.runs) == (2, 2)
+
+
+def test_bidirectional_repeatability_is_never_below_either_direction():
+    found = axis_accuracy(
+        [0.0, 0.0, 0.0, 0.0, 9.0, 9.0, 9.0, 9.0],
+        [-10.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        FORWARD,
+    )
+    assert found.repeatability == pytest.approx(4.0 * 10.0 * S)
+
+
+def test_a_pure_reversal_error_shows_in_b_alone_of_the_means():
+    targets = np.repeat(np.arange(0.0, 360.0, 45.0), 10)
+    forward = np.tile([True] * 5 + [False] * 5, 8)
+    found = axis_accuracy(targets, np.where(forward, 20.0, -20.0), forward)
+    assert (found.reversal, found.mean_reversal, found.systematic) == (40.0, 40.0, 40.0)
+    assert (found.range, found.systematic_forward, found.repeatability_forward) == (0.0, 0.0, 0.0)
+    assert (found.accuracy, found.repeatability, found.runs) == (40.0, 40.0, 5)
+
+
+def test_a_target_approached_from_one_side_only_is_refused_with_its_place():
+    with pytest.raises(InputError, match=r"target at 90 deg .* 2 times forwards and 0 times backwards"):
+        axis_accuracy(TARGET[:6], DEVIATION[:6], FORWARD[:6])
+
+
+def test_a_single_target_is_refused():
+    with pytest.raises(InputError, match="1 targets"):
+        axis_accuracy(TARGET[:4], DEVIATION[:4], FORWARD[:4])
+
+
+def test_arrays_of_different_length_are_refused():
+    with pytest.raises(InputError, match="one of each"):
+        axis_accuracy(TARGET, DEVIATION[:-1], FORWARD)
+
+
+def test_the_figures_for_machines_carry_their_unit():
+    figures = axis_accuracy(TARGET, DEVIATION, FORWARD).as_dict()
+    assert figures["accuracy_arcsec"] == pytest.approx(5.0 + 3.0 + 2.0 * S)
+    assert figures["targets"] == 2
+
+
+@given(st.randoms(use_true_random=False), st.floats(-500.0, 500.0))
+def test_order_and_a_common_zero_do_not_matter(random, zero):
+    places = list(range(len(TARGET)))
+    random.shuffle(places)
+    plain = axis_accuracy(TARGET, DEVIATION, FORWARD)
+    other = axis_accuracy(
+        [TARGET[at] for at in places],
+        [DEVIATION[at] + zero for at in places],
+        [FORWARD[at] for at in places],
+    )
+    assert other.as_dict() == pytest.approx(plain.as_dict(), abs=1e-9)
+
+
+@given(
+    st.lists(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), min_size=2, max_size=8),
+)
+def test_figures_keep_the_order_that_the_definitions_give_them(rows):
+    targets = np.repeat(np.arange(len(rows), dtype=float), 6)
+    found = axis_accuracy(
+        targets, np.ravel(rows), np.tile([True, True, True, False, False, False], len(rows))
+    )
+    slack = 1e-9
+    assert found.accuracy + slack >= max(found.accuracy_forward, found.accuracy_backward)
+    assert found.accuracy + slack >= found.systematic
+    assert found.systematic + slack >= max(found.range, found.systematic_forward, found.reversal)
+    assert found.repeatability + slack >= max(found.repeatability_forward, found.reversal)
+    assert found.reversal + slack >= abs(found.mean_reversal)
