@@ -3,9 +3,9 @@
     .venv/bin/python tools/identify_coverage.py --axes 100
 
 Each axis is drawn at random (ratio 30-160, offset 15-80 arcsec, width 5-40 deg, exponent 1.2-2.8, noise 0.5-3
-arcsec, other encoders), moved through a bench plan and identified from the record alone. Printed: coverage of the
-95 % intervals, share within the tolerances (amplitudes 0.15 arcsec or 2 %, offset 1 %, width 4 %, exponent 0.04) and
-within tolerance or interval, orders invented and missed.
+arcsec, other encoders), moved through a bench plan and identified from the record alone. Printed: coverage of
+the 95 % intervals, share within the tolerances (amplitudes 0.15 arcsec or 2 %, offset 1 %, width 4 %,
+exponent 0.04) and within tolerance or interval, orders invented and missed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from identify_records import draw, plan, record  # noqa: E402
+from identify_records import draw, plan, record
 
-from hdbridge.effects import Start  # noqa: E402
-from hdbridge.identify import FitOptions, Kind, Segment, fit  # noqa: E402
+from hdbridge.effects import Start
+from hdbridge.identify import FitOptions, Kind, Segment, fit
 
 TOLERANCE = {"offset_arcsec": 0.01, "width_deg": 0.04}
 
@@ -103,7 +103,8 @@ def main() -> None:
         for name, true, value, half, near in axis["found"]:
             gathered[name].append((true, value, half, near))
     print(
-        f"{'parameter':18s}{'fits':>6s}{'covered':>9s}{'within':>8s}{'or in CI':>10s}{'median half':>13s}{'bias/se':>9s}"
+        f"{'parameter':18s}{'fits':>6s}{'covered':>9s}{'within':>8s}{'or in CI':>10s}"
+        f"{'median half':>13s}{'bias/se':>9s}"
     )
     for name, rows in gathered.items():
         true, value, half, near = np.array(rows).T
@@ -115,8 +116,10 @@ def main() -> None:
         )
     print(
         f"axes {len(axes)}, orders invented {sum(len(a['invented']) for a in axes)}, "
-        f"missed {sum(len(a['missed']) for a in axes)}, held-out improves {sum(a['improves'] for a in axes)}, "
-        f"median fit {np.median([a['seconds'] for a in axes]):.1f} s for {np.median([a['samples'] for a in axes]):.0f} samples"
+        f"missed {sum(len(a['missed']) for a in axes)}, "
+        f"held-out improves {sum(a['improves'] for a in axes)}, "
+        f"median fit {np.median([a['seconds'] for a in axes]):.1f} s "
+        f"for {np.median([a['samples'] for a in axes]):.0f} samples"
     )
     if options.json:
         options.json.write_text(json.dumps(axes, default=float))

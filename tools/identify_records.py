@@ -1,8 +1,8 @@
-"""Records of made-up axes for measuring the identification: written from the formulas, sharing no code with hdbridge.
+"""Records of made-up axes for measuring the identification: from the formulas, sharing no code with hdbridge.
 
-An axis is drawn at random (`draw`), moved through a bench plan and read through quantised encoders (`record`). It has
-what the identification does not model as such: a motor that lags behind its command and stops short within a count, a
-slow wander, a load encoder read a little later.
+An axis is drawn at random (`draw`), moved through a bench plan and read through quantised encoders
+(`record`). It has what the identification does not model as such: a motor that lags behind its command
+and stops short within a count, a slow wander, a load encoder read a little later.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ def plan(
     rest("standstill", 10.0)
     go("sweep", 360.0 * turns, speed)
     go("sweep", 0.0, speed)
-    for amplitude in (180.0, 45.0, 5.0):
-        amplitude /= ratio
+    for amplitude_deg in (180.0, 45.0, 5.0):
+        amplitude = amplitude_deg / ratio
         go("move", amplitude, 20.0)
         rest("move", 0.2)
         t = np.arange(1, int(periods * 20 * RATE_HZ) + 1) / RATE_HZ
@@ -193,7 +193,7 @@ def record(
 def _stopping_short(
     motor: np.ndarray, load_target: np.ndarray, count: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """At each rest the motor stays up to half a count short of where it should be, on the side that it came from."""
+    """At each rest the motor stays up to half a count short of where it should be, where it came from."""
     result = motor.copy()
     moving = np.diff(load_target, prepend=load_target[0]) != 0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~moving, [False]]).astype(np.int8)))

@@ -1,7 +1,7 @@
 """From records to parameters with uncertainties.
 
-`fit` takes stretches of a measurement (`Segment`) and returns a `FitResult`: the model, 95 % intervals that allow for
-noise that is not white, held-out figures, residual tests, and in words what the data cannot say.
+`fit` takes stretches of a measurement (`Segment`) and returns a `FitResult`: the model, 95 % intervals that
+allow for noise that is not white, held-out figures, residual tests, and in words what the data cannot say.
 """
 
 from hdbridge.identify.fit import fit

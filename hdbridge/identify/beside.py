@@ -1,10 +1,11 @@
 """What is fitted beside the model so that it does not bend it: zeros, and faults of the measurement.
 
-A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole counts
-reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a count *in the
-direction of motion*: that looks like hysteresis too, and the fraction changes with speed. Each turn is known to
-within a count only, and a hysteresis that is narrow or steep cannot be known better than its turns. Each has a
-column; a fraction of a count it cannot exceed. With fine encoders these columns vanish by themselves.
+A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole
+counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a
+count *in the direction of motion*: that looks like hysteresis too, and the fraction changes with speed.
+Each turn is known to within a count only, and a hysteresis that is narrow or steep cannot be known better
+than its turns. Each has a column; a fraction of a count it cannot exceed. With fine encoders these columns
+vanish by themselves.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ COUNTS = 0.29
 SPEEDS_COUNTS_S = (0.0, 50.0, 200.0, 800.0, 3200.0, np.inf)
 """Edges of the classes of speed that round alike; at rest is a class of its own."""
 AVERAGED_COUNTS_S = 200.0
-"""Faster than this a servo passes several counts in the time that it takes to answer, and rounding averages out."""
+"""Faster than this a servo passes several counts before it answers, and rounding averages out."""
 SHARE = 0.1
 """A nuisance of whose column less than this is left by what else is fitted stays out."""
 
@@ -48,7 +49,7 @@ class Beside:
     """Shape (b, q)."""
     names: tuple[str, ...]
     prior: FloatArray
-    """One over the variance that each coefficient is known with beforehand, about zero; 0 where nothing is."""
+    """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
 
     def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Beside:
         """With further columns of which nothing is known."""
@@ -77,8 +78,10 @@ def delay_column(design: Design) -> FloatArray:
 
 
 def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
-    """A count in the direction of motion, arcsec, for rest and each class of speed: (b, classes), and how much of it
-    there may be (standard deviation in counts)."""
+    """A count in the direction of motion, arcsec, at rest and per class of speed; how many there may be.
+
+    Columns (b, classes), and standard deviations in counts (classes,).
+    """
     blocks, samples = design.blocks, design.samples
     count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
     rate = np.abs(blocks.speed_deg_s) / max(samples.count_deg, 1e-12)
@@ -93,7 +96,7 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
 
 
 def turn_columns(design: Design, effects: Sequence[Effect]) -> FloatArray:
-    """A column for each turn that matters, shape (b, turns): what it would change to lie one count further out."""
+    """A column for each turn that matters, shape (b, turns): what a count further out would change."""
     change, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
     most = np.argsort(weight)[::-1][:MOST_TURNS]

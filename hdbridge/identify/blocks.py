@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class Blocks:
     """The sample in the middle of each block."""
     error_arcsec: FloatArray
     blur: FloatArray
-    """Variance (arcsec squared) that each block has because the driving angle is not known better than a count."""
+    """Variance of each block, arcsec squared, because the driving angle is known to a count only."""
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -169,7 +170,7 @@ def _cells(motor_deg: FloatArray, coarsest_deg: float) -> IntArray:
     cells = np.zeros(len(motor_deg), dtype=np.int64)
     edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest
     base = 0
-    for first, last in zip(turning[:-1], turning[1:], strict=True):
+    for first, last in pairwise(turning):
         since = np.abs(motor_deg[first + 1 : last + 1] - motor_deg[first])
         near = 20.0 * np.log1p(np.minimum(since, edge) / FINE_DEG)
         number = np.floor(near + np.maximum(since - edge, 0.0) / coarsest_deg).astype(np.int64)

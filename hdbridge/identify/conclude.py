@@ -111,7 +111,7 @@ def _sum(design: Design, effects: tuple[Effect, ...]) -> FloatArray:
 
 
 def _lines(state: State, selection: Selection, clean: FloatArray, options: FitOptions) -> Spectrum:
-    """Each candidate's line with everything else that is in the fit: own coefficients, or what it would add."""
+    """Each candidate's line beside everything that is in the fit: what it is, or what it would add."""
     information, right = state.information()
     waves = 2 * len(state.candidates)
     inside = [
@@ -201,14 +201,14 @@ def _describe_limits(
         warnings.append(f"{order} cannot be told from what else was fitted")
     if lines.resolution.load_turns < 0.95:
         warnings.append(
-            f"the record spans {lines.resolution.load_turns:.2f} load turns: errors that repeat with the load "
-            "turn cannot be seen and may bend the rest; sweep over two"
+            f"the record spans {lines.resolution.load_turns:.2f} load turns: errors that repeat with the "
+            "load turn cannot be seen and may bend the rest; sweep over two"
         )
     if outliers.samples:
         share = outliers.samples / len(samples)
         warnings.append(
-            f"{outliers.samples} samples ({share:.2%}, at most {outliers.longest_run} in a row) stand out from "
-            "their neighbours and were given no weight: look for lost counts, plugs, shields"
+            f"{outliers.samples} samples ({share:.2%}, at most {outliers.longest_run} in a row) stand out "
+            "from their neighbours and were given no weight: look for lost counts, plugs, shields"
         )
     for order in selection.chosen:
         if order.family is not Family.MOTOR:

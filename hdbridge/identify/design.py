@@ -25,7 +25,7 @@ class Design:
     blocks: Blocks
     starts: tuple[Start, ...]
     sketch: tuple[tuple[IntArray, IntArray], ...]
-    """Per chain: samples that stand for all (each block's middle, and the turns), and which of them are middles."""
+    """Per chain: samples that stand for all (blocks' middles and turns), and which are middles."""
 
     memo: dict[Effect, FloatArray] = field(default_factory=dict)
     """Columns of effects without shape or memory, which are asked for again and again."""
@@ -40,9 +40,10 @@ class Design:
         return replace(self, starts=tuple(starts))
 
     def thinned(self, target: int, near_deg: float) -> tuple[Design, IntArray]:
-        """A design of about so many blocks for a search, and which they are; only inexact columns can be had of it.
+        """A design of about so many blocks for a search, and which they are.
 
-        All blocks within ``near_deg`` after a reversal stay, of the others a random share that counts for all.
+        All blocks within ``near_deg`` after a reversal stay, of the others a random share counts for all.
+        Only inexact columns can be had of it.
         """
         blocks = self.blocks
         near = np.zeros(len(blocks), dtype=bool)
@@ -53,7 +54,8 @@ class Design:
             since = np.abs(self.samples.motor_deg[blocks.middle] - self.samples.motor_deg[turn])
             near |= (blocks.chain == number) & (since < near_deg)
         far = np.flatnonzero(~near)
-        share = min(max(target - np.count_nonzero(near), target // 2) / max(len(far), 1), 1.0)
+        wanted = max(target - int(np.count_nonzero(near)), target // 2)
+        share = min(float(wanted) / max(len(far), 1), 1.0)
         kept = far[np.random.default_rng(0).random(len(far)) < share]
         index = np.sort(np.concatenate([np.flatnonzero(near), kept]))
         part = blocks.picked(index)
@@ -61,7 +63,7 @@ class Design:
         return Design.of(self.samples, part, self.starts), index
 
     def columns(self, effect: Effect, exact: bool = True) -> FloatArray:
-        """Columns of an effect, shape (blocks, p); ``exact`` averages all samples, else the middles stand for them."""
+        """Columns of an effect, shape (b, p); ``exact`` averages all samples, else middles stand for them."""
         memoryless = isinstance(effect.tracker(), Memoryless)
         if memoryless and exact:
             key = effect.fitted(np.zeros_like(effect.coefficients()))
@@ -83,7 +85,7 @@ class Design:
         return result if every is None else self.blocks.mean(every)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
-        """What half a count further at the turn before would change, arcsec per count (b,), and which turn that is.
+        """What a count further at the turn before would change, arcsec (b,), and which turn that is.
 
         Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
         """
@@ -109,7 +111,7 @@ class Design:
         return change / max(shift, 1e-12) * self.samples.count_deg, turn
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
-        """The same, each block's variance raised by what a count's rounding of the driving angle does to the effects.
+        """The same, each block's variance raised by what rounding of the driving angle does to the effects.
 
         Just after a turn a hysteresis may rise without bound: what is measured there says little, and should
         not say much.
@@ -118,7 +120,7 @@ class Design:
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
-        """Observation minus effects for each sample, minus what ``rest`` gives per block; NaN where not usable."""
+        """Observation minus effects per sample, minus ``rest`` per block; NaN where not usable."""
         left = self.samples.error_arcsec.copy()
         for chain, start in zip(self.samples.chains, self.starts, strict=True):
             for effect in effects:
@@ -177,7 +179,7 @@ def tangents(
 
 
 def moved(effect: Effect, coefficients: FloatArray, steps: Mapping[str, float]) -> Effect:
-    """The effect with its shape parameters moved (logarithmic ones in the logarithm), kept in their ranges."""
+    """The effect with its shape parameters moved (some in the logarithm), kept in their ranges."""
     values: dict[str, float] = {}
     for shape in effect.shape:
         here = float(getattr(effect, shape.name))

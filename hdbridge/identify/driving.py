@@ -77,8 +77,8 @@ def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) ->
 def quantum_deg(angle_deg: FloatArray) -> float:
     """The count in which an angle was read, degrees; 0 where it moves in no counts that can be seen.
 
-    Changes of a counted angle, and the differences between them, are whole multiples of the count; the smallest
-    of them is the count itself if nearly all changes are multiples of it.
+    Changes of a counted angle, and the differences between them, are whole multiples of the count; the
+    smallest of them is the count itself if nearly all changes are multiples of it.
     """
     steps = np.abs(np.diff(angle_deg))
     values = np.unique(np.round(steps, 9))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import median_filter
 
@@ -44,7 +46,7 @@ def standing(samples: Samples) -> Standing | None:
 
 
 def laps_arcsec(samples: Samples) -> float | None:
-    """Rms by which two passes of a sweep in the same direction differ, over the root of two; means over `LAP_BIN_DEG`."""
+    """Rms by which passes in the same direction differ, over the root of two; means over `LAP_BIN_DEG`."""
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
     sweep = samples.usable & (samples.kind == KINDS.index(Kind.SWEEP))
     for chain in samples.chains:
@@ -63,7 +65,7 @@ def laps_arcsec(samples: Samples) -> float | None:
     differences = [
         earlier[cell] - later[cell]
         for each in passes.values()
-        for earlier, later in zip(each[:-1], each[1:], strict=True)
+        for earlier, later in pairwise(each)
         for cell in earlier.keys() & later.keys()
     ]
     if len(differences) < 8:

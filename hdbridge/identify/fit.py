@@ -44,8 +44,8 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
     usable = int(np.count_nonzero(samples.usable))
     if usable < MINIMUM_USABLE:
         raise InputError(
-            f"{segments[0].name}: only {usable} of {len(samples)} samples are slow enough to be used; expected "
-            f"at least {MINIMUM_USABLE}: record slow sweeps, sines and rests"
+            f"{segments[0].name}: only {usable} of {len(samples)} samples are slow enough to be used; "
+            f"expected at least {MINIMUM_USABLE}: record slow sweeps, sines and rests"
         )
     state = _prepare(samples, options, warnings)
     state = _search(state, warnings)
@@ -163,8 +163,8 @@ def _hold_what_is_unknown(
         edge = [name for owner, name in solution.at_bound if owner == index]
         if edge and not unknown:
             warnings.append(
-                f"{effect.name}: {', '.join(edge)} ended on the edge of its range: do not trust its interval, "
-                "or the law is not this gear's"
+                f"{effect.name}: {', '.join(edge)} ended on the edge of its range: do not trust its "
+                "interval, or the law is not this gear's"
             )
         if unknown:
             prototype = options.prototype(next(each for each in options.effects if each.name == effect.name))

@@ -79,8 +79,8 @@ def held_out(
 def folds(problem: Problem) -> tuple[IntArray, str]:
     """Which fold each block is in, and what is left out in words.
 
-    Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines, reversals)
-    by stretches of time, so that no fold takes all there is to know about a reversal.
+    Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
+    reversals) by stretches of time, so that no fold takes all there is to know about a reversal.
     """
     blocks = problem.design.blocks
     lowest = float(np.min(blocks.motor_deg))

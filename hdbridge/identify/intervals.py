@@ -1,12 +1,13 @@
 """95 % intervals of everything that was fitted, from the noise as it is, not as one would like it.
 
 The covariance of a fit under the noise model is the inverse information. Where the noise model is wrong the
-scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger 1986)
-finds out, and wherever it is wider it is believed.
+scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger
+1986) finds out, and wherever it is wider it is believed.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -98,10 +99,10 @@ def effect_intervals(solution: Solution, index: int, cov: FloatArray) -> list[In
     for name, value in base.items():
         if not np.any(slopes[name]):
             continue
-        half = NORMAL_95 * float(np.sqrt(max(slopes[name] @ own @ slopes[name], 0.0)))
+        half = NORMAL_95 * math.sqrt(max(float(slopes[name] @ own @ slopes[name]), 0.0))
         known = True
         if name in shapes:
-            widest = max(shapes[name].upper - value, value - shapes[name].lower)
+            widest = max(float(shapes[name].upper) - value, value - float(shapes[name].lower))
             known = half < 0.5 * (
                 value if shapes[name].logarithmic else shapes[name].upper - shapes[name].lower
             )
@@ -126,7 +127,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
 
 def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every floating-point parameter with its path; list items are labelled by their ``order`` if they have one."""
+    """Every floating-point parameter with its path; list items are labelled by their ``order`` if any."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
             yield from leaves(part, _joined(path, key))

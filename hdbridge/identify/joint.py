@@ -311,7 +311,7 @@ def joint_fit(
 
 
 def search(problem: Problem, precision: Precision) -> tuple[float, tuple[Effect, ...]]:
-    """Chi square and effects at the best minimum that a grid over all shapes leads to; by the blocks' middles."""
+    """Chi square and effects at the best minimum that a grid over all shapes leads to; by blocks' middles."""
     fit = JointFit(problem, precision, exact=False)
     begins = [list(problem.effects)]
     for index, effect in enumerate(problem.effects):

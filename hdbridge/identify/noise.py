@@ -123,8 +123,8 @@ def fit_noise(
 ) -> NoiseModel:
     """The noise model that makes a residual (b,) most likely.
 
-    Pieces of the record, spread over all of it, are enough: a likelihood of ten thousand blocks. ``parameters``
-    that were fitted have taken their share of the white noise out.
+    Pieces of the record, spread over all of it, are enough: a likelihood of ten thousand blocks. The
+    ``parameters`` that were fitted have taken their share of the white noise out.
     """
     pieces = _pieces(blocks)
     part = blocks.picked(pieces)

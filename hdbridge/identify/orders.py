@@ -1,4 +1,4 @@
-"""Which orders a record shows: best first, by a test that a family of candidates passes by chance in one of a hundred."""
+"""Which orders a record shows: best first, by a test that all candidates together pass by chance 1 in 100."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.identify.linear import solve_symmetric
+from hdbridge.identify.samples import IntArray
 
 NOT_APART = 0.95
 """Correlation above which two orders cannot be told apart by a record."""
@@ -67,7 +68,7 @@ class Selection:
 
 
 def threshold(candidates: int, family_wise: float) -> float:
-    """Fall in chi square (two coefficients) that the best of so many candidates reaches by chance this often."""
+    """Fall in chi square (two coefficients) that the best of so many reaches by chance this often."""
     return -2.0 * math.log(family_wise / max(candidates, 1))
 
 
@@ -81,8 +82,8 @@ def select(
     """Forward selection with look-back.
 
     ``information`` and ``right`` are J' K^-1 J and J' K^-1 y of [candidates' cosine and sine pairs | all that
-    is in the fit anyway]. An order enters when it lowers chi square by more than `threshold` and its amplitude is at
-    least ``smallest_arcsec``; it leaves again when later ones take its place.
+    is in the fit anyway]. An order enters when it lowers chi square by more than `threshold` and its
+    amplitude is at least ``smallest_arcsec``; it leaves again when later ones take its place.
     """
     pairs = [np.array([2 * index, 2 * index + 1]) for index in range(len(candidates))]
     always = np.arange(2 * len(candidates), len(information))
@@ -124,8 +125,8 @@ def select(
 
 def _scores(
     inside: Sequence[int],
-    pairs: Sequence[FloatArray],
-    always: FloatArray,
+    pairs: Sequence[IntArray],
+    always: IntArray,
     information: FloatArray,
     right: FloatArray,
     only: int | None = None,
@@ -150,7 +151,7 @@ def _scores(
     return result
 
 
-def _twins(pairs: Sequence[FloatArray], information: FloatArray) -> list[tuple[int, int]]:
+def _twins(pairs: Sequence[IntArray], information: FloatArray) -> list[tuple[int, int]]:
     """Pairs of candidates whose columns span nearly the same."""
     found = []
     for a, one in enumerate(pairs):
@@ -160,7 +161,7 @@ def _twins(pairs: Sequence[FloatArray], information: FloatArray) -> list[tuple[i
     return found
 
 
-def correlation(information: FloatArray, one: FloatArray, other: FloatArray) -> float:
+def correlation(information: FloatArray, one: IntArray, other: IntArray) -> float:
     """Largest canonical correlation of two sets of columns: 1 when one can stand for the other."""
     roots = []
     for each in (one, other):

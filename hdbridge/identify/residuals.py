@@ -53,7 +53,7 @@ def _orders(name: str, lines: Spectrum, families: tuple[Family, ...], fitted: se
 def _contrast(
     name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
 ) -> ResidualTest:
-    """Generalised least squares of the residual on one column and the mean; size is that of ``scale`` columns."""
+    """Generalised least squares of the residual on one column and the mean; size: ``scale`` columns."""
     columns = np.stack([np.ones(len(column)), column], axis=1)
     weighted = precision.apply(columns)
     information = columns.T @ weighted
@@ -75,7 +75,8 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
     size = math.hypot(noise.slow_arcsec, noise.place_arcsec)
     text = (
         f"wanders by {noise.slow_arcsec:.2f} arcsec within {noise.slow_s:.1f} s and by "
-        f"{noise.place_arcsec:.2f} arcsec within {noise.place_deg:.2f} deg of the motor; the intervals allow for it"
+        f"{noise.place_arcsec:.2f} arcsec within {noise.place_deg:.2f} deg of the motor; "
+        "the intervals allow for it"
     )
     return ResidualTest("whiteness", size < WORTH_ARCSEC, size, text)
 
@@ -84,5 +85,6 @@ def _level(figures: NoiseFigures) -> ResidualTest:
     if figures.standing is None:
         return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
     size = math.sqrt(max(figures.residual_arcsec**2 - figures.standing.rms_arcsec**2, 0.0))
-    text = f"{figures.residual_arcsec:.2f} arcsec is left, at rest the noise is {figures.standing.rms_arcsec:.2f}"
+    rest = figures.standing.rms_arcsec
+    text = f"{figures.residual_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
     return ResidualTest("noise_level", size < max(figures.standing.rms_arcsec, 1.0), size, text)

@@ -35,7 +35,7 @@ class NoiseFigures:
     standing: Standing | None
     """None where the axis never stood for long enough."""
     laps_arcsec: float | None
-    """What two passes over the same angles in the same direction differ by, over the root of two; block means."""
+    """What two passes over the same angles in one direction differ by, over the root of two."""
     model: NoiseModel
     """White noise and wanders as the intervals use them, from the residual."""
     residual_arcsec: float

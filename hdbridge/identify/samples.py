@@ -63,7 +63,7 @@ class Samples:
         return len(self.time_s)
 
     def delayed(self, delay_s: float) -> Samples:
-        """The same if the load was read so much later than the motor: the gear as it was then, with that motor angle."""
+        """The same if the load was read so much later than the motor: with the motor as it was then."""
         motor = self.motor_deg.copy()
         chains = []
         for chain in self.chains:
@@ -185,7 +185,7 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
 
 
 def _check_ratio(motor: FloatArray, load: FloatArray, zero: IntArray, ratio: float, name: str) -> None:
-    """InputError where load against motor has another slope than 1 / ratio by far more than any error of a gear."""
+    """InputError where the slope of load against motor is off by far more than any error of a gear."""
     inside = zero == zero[0]
     motor, load = motor[inside] - motor[inside].mean(), load[inside] - load[inside].mean()
     spread = float(motor @ motor)

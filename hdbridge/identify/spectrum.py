@@ -1,8 +1,8 @@
 """Spectra over the angle: by least squares at the true angles, and a plain one to look at.
 
-Samples are never even in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26 times: a Fourier
-transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the true angles each order
-stands where it is, or is reported as one that the record cannot tell from another.
+Samples are never even in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26 times: a
+Fourier transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the true angles
+each order stands where it is, or is reported as one that the record cannot tell from another.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def spectrum(
 ) -> Spectrum:
     """Spectrum of an error by least squares at the true angles; all orders and the mean fitted at once.
 
-    ``count`` is how many samples each row stands for. Standard errors come from stretches of the record (sandwich), so
-    noise need not be white. For a record with hysteresis take the part of one direction, or use `fit`, which takes
-    everything together. InputError where there are fewer rows than columns.
+    ``count`` is how many samples each row stands for. Standard errors come from stretches of the record
+    (sandwich), so noise need not be white. For a record with hysteresis take one direction's part, or use
+    `fit`, which takes everything together. InputError where there are fewer rows than columns.
     """
     if len(motor_deg) < 2 * len(orders) + 2:
         raise InputError(
@@ -108,9 +108,9 @@ def spectrum(
     sums = np.array([each.sum(axis=0) for each in stretches])
     robust = inverse @ (sums.T @ sums) @ inverse
     errors = np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
-    return assemble(orders, coefficients[1:], errors[1:], information[1:, 1:], motor_deg, ratio, family_wise, Curve(
-        *plain_spectrum(motor_deg, error_arcsec - coefficients[0], weight)
-    ))  # fmt: skip
+    curve = Curve(*plain_spectrum(motor_deg, error_arcsec - coefficients[0], weight))
+    waves = information[1:, 1:]
+    return assemble(orders, coefficients[1:], errors[1:], waves, motor_deg, ratio, family_wise, curve)
 
 
 def assemble(
@@ -174,7 +174,7 @@ def plain_spectrum(
     order = np.fft.rfftfreq(size, 1.0 / BINS_PER_TURN)
     amplitude = 2.0 * np.abs(np.fft.rfft(binned)) / (size * share) / np.sinc(order / BINS_PER_TURN)
     shown = order <= highest
-    return order[shown], np.asarray(amplitude[shown])
+    return np.asarray(order[shown], dtype=np.float64), np.asarray(amplitude[shown])
 
 
 def _columns(motor_deg: FloatArray, orders: Sequence[Order]) -> FloatArray:

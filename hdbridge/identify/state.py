@@ -64,7 +64,7 @@ class State(NamedTuple):
         return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
 
     def problem(self, selection: Selection) -> Problem:
-        """Motor orders as the synchronous part, other effects; orders that are not the motor's beside them."""
+        """Motor orders as the synchronous part, other effects; orders not the motor's beside them."""
         motor = tuple(
             MotorOrder(order=each.number, amplitude_arcsec=0.0, phase_deg=0.0)
             for each in selection.chosen
@@ -95,7 +95,7 @@ class State(NamedTuple):
 
 
 def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
-    """Orders to look for: those of the load and the flexspline only where the record spans enough of a load turn."""
+    """Orders to look for: the load's and flexspline's only where the record spans enough of a load turn."""
     ratio = design.samples.ratio
     turns = float(np.ptp(design.blocks.motor_deg)) / DEG_PER_TURN
     motor = [Order.motor(number) for number in range(1, options.highest_order + 1)]
