@@ -10,7 +10,7 @@ from rich.table import Table
 from hdbridge.atomic import write_atomically
 from hdbridge.calibration import Calibration
 from hdbridge.calibration.result import unit_of
-from hdbridge.cli.options import console, notes
+from hdbridge.cli.options import console
 from hdbridge.modeldiff import diff
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
@@ -69,7 +69,7 @@ def print_calibration(result: Calibration) -> None:
 def write_calibration_page(path: Path, result: Calibration) -> None:
     """The result as a self-contained page."""
     write_atomically(path, render(calibration_page(result)))
-    notes.print(f"wrote {path}")
+    console.print(f"report: {path}", soft_wrap=True)
 
 
 def _title(result: Calibration) -> str:

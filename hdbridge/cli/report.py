@@ -9,7 +9,7 @@ import typer
 
 from hdbridge.calibration import concluded
 from hdbridge.cli.findings import print_calibration, write_calibration_page
-from hdbridge.cli.options import HtmlOption, JsonOption, console, write_json
+from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -28,6 +28,4 @@ def command(
     result = concluded(recording)
     print_calibration(result)
     write_json(json_file, result.as_dict())
-    page = html_file or recording / "report.html"
-    if write_calibration_page(page, result):
-        console.print(f"report: {page}", soft_wrap=True)
+    write_calibration_page(html_file or recording / "report.html", result)
