@@ -60,7 +60,8 @@ def calibration_page(result: Calibration) -> Page:
 def _verdict(result: Calibration) -> str:
     text = result.offer.reason if result.offer is not None else result.fit.held_out.text
     if result.fit.warnings:
-        text += f". Read the notes: there are {len(result.fit.warnings)}"
+        count = len(result.fit.warnings)
+        text += ". Read the note below" if count == 1 else f". Read the {count} notes below"
     return text[:1].upper() + text[1:] + "."
 
 
