@@ -110,13 +110,12 @@ def _of_one(recording: Recording, shift_s: float, zero: int) -> Iterator[Segment
             name = part.source or f"part {number + 1}"
             yield _segment(part, Kind.UNKNOWN, shift_s, zero, None, name)
         return
-    begun = {each.session: each.start_s for each in reversed(tasks_of(recording))}
-    starts = sorted((start_s, session) for session, start_s in begun.items())
-    session, known = 0, not starts
+    tasks = list(tasks_of(recording))
+    session, known = 1, not tasks
     pieces = list(recording.pieces())
     for number, (leg, piece) in enumerate(pieces):
-        if session < len(starts) and leg.start_s >= starts[session][0]:
-            session, known = session + 1, False
+        if tasks and leg.start_s >= tasks[0].start_s:
+            session, known = tasks.pop(0).session, False
         if not known and leg.kind == "precondition":
             continue  # the state before it is not known, after it it is
         if not len(piece):
@@ -125,7 +124,7 @@ def _of_one(recording: Recording, shift_s: float, zero: int) -> Iterator[Segment
         start = None if known else Start.FORWARD
         known = True
         name = f"leg {number + 1} of {len(pieces)} ({leg.kind})"
-        yield _segment(piece, kind, shift_s, zero + max(session - 1, 0), start, name)
+        yield _segment(piece, kind, shift_s, zero + session - 1, start, name)
 
 
 def _segment(

@@ -25,7 +25,7 @@ from hdbridge.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 
 _HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
 PAUSE_S = 1.0
-"""Between two sessions in the recording's time; how long it really was does not matter."""
+"""Between two tasks in the recording's time; the drive is disabled there."""
 
 
 class TaskEntry(BaseModel):
@@ -35,7 +35,7 @@ class TaskEntry(BaseModel):
 
     task: str = Field(description="its name in the plan")
     file: str = Field(description="file with its samples")
-    session: int = Field(ge=1, description="the drive stayed enabled from one task of a session to the next")
+    session: int = Field(ge=1, description="the encoders kept their zeros within a session")
     complete: bool = Field(description="false: it was interrupted")
     start_s: float = Field(description="time of its first sample")
     end_s: float = Field(description="time of its last sample")
@@ -57,7 +57,6 @@ class Journal:
         self._about = about
         self._tasks = list(_Notes.model_validate(about.notes).tasks)
         self._session = max((each.session for each in self._tasks), default=0)
-        self._shift_s: float | None = None
 
     @classmethod
     def create(
@@ -139,18 +138,16 @@ class Journal:
         return dict(self._about.notes)
 
     def begin_session(self) -> None:
-        """The drive was enabled: time starts anew, and nothing is known of what happened in between."""
+        """Nothing is known of what happened since the last task: the encoders may have lost their zeros."""
         self._session += 1
-        self._shift_s = None
 
     def add(self, task: str, record: Record, legs: Sequence[Leg], *, complete: bool) -> None:
         """Keep what a task has measured; nothing where it has measured nothing."""
         if not len(record):
             return
-        if self._shift_s is None:
-            end_s = max((each.end_s for each in self._tasks), default=None)
-            self._shift_s = 0.0 if end_s is None else end_s + PAUSE_S - float(record.time_s[0])
-        shift_s = self._shift_s
+        end_s = max((each.end_s for each in self._tasks), default=-PAUSE_S)
+        # Each run on the bench begins at its own zero of time.
+        shift_s = end_s + PAUSE_S - float(record.time_s[0])
         if shift_s:
             record = Record({**record.columns, "time_s": record.time_s + shift_s})
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -52,7 +52,7 @@ def calibrate(
     if not result.fit.held_out.improves:
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
-    tell("stepping test before and after")
+    tell("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked = validate(
         drive,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hdbridge.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Bench, axis_view, compensation_for
 from hdbridge.calibration.identification import resting
@@ -90,6 +92,9 @@ class Validation:
     before: Stepped
     after: Stepped
     floor: Floor
+    accuracy_before: AxisAccuracy | None = None
+    accuracy_after: AxisAccuracy | None = None
+    """By the positioning test, where the plan has one."""
 
     @property
     def improves(self) -> bool:
@@ -108,13 +113,18 @@ class Validation:
             "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
             "noise_floor_arcsec": self.floor.noise_arcsec,
             "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
+            "accuracy": {
+                "before": self.accuracy_before.as_dict() if self.accuracy_before else None,
+                "after": self.accuracy_after.as_dict() if self.accuracy_after else None,
+            },
         }
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
         """Read back."""
         floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
-        return cls(Stepped.from_dict(data["before"]), Stepped.from_dict(data["after"]), floor)
+        accuracy = [_accuracy(data["accuracy"][name]) for name in ("before", "after")]
+        return cls(Stepped.from_dict(data["before"]), Stepped.from_dict(data["after"]), floor, *accuracy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,15 +162,19 @@ def validate(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Validation:
-    """Step a booted drive's axis with the model before (None: without compensation) and with the new one.
+    """Step and position a booted drive's axis with the model before (None: none) and with the new one.
 
     Each run's samples go to ``folder``, also when it is stopped.
     """
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
+    positioning = plan.positioning(axis_view(axis))
     each_s = rehearse(stepping, axis_view(axis), stepping.start_deg).duration_s
+    if positioning:
+        each_s += rehearse(positioning, axis_view(axis), positioning.targets_deg[0]).duration_s
     pace = Pace(2.0 * each_s, axis.drive.cycle_s, progress, interrupted)
     results: list[Stepped] = []
+    accuracies: list[AxisAccuracy] = []
     for name, model, words in (
         ("before", before, "the active model" if before else "no compensation"),
         ("after", after, "the new model"),
@@ -168,11 +182,38 @@ def validate(
         pace.begin(f"stepping {name}")
         compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
         bench = Bench(drive, compensation, interrupted=pace.interrupted)
-        try:
-            run = bench.run(stepping)
-        finally:
-            if len(bench.record()):
-                folder.mkdir(parents=True, exist_ok=True)
-                bench.record().write_csv(folder / f"stepping-{name}.csv.gz")
-        results.append(Stepped.of(words, run.outcome))
-    return Validation(results[0], results[1], floor)
+        with _kept(bench, folder / f"stepping-{name}.csv.gz"):
+            results.append(Stepped.of(words, bench.run(stepping).outcome))
+        if positioning:
+            pace.begin(f"positioning {name}")
+            with _kept(bench, folder / f"positioning-{name}.csv.gz"):
+                approaches = bench.run(positioning).outcome
+            accuracies.append(
+                axis_accuracy(
+                    [each.target_deg for each in approaches],
+                    [each.error_arcsec for each in approaches],
+                    [each.forward for each in approaches],
+                )
+            )
+    return Validation(results[0], results[1], floor, *accuracies)
+
+
+@contextmanager
+def _kept(bench: Bench, path: Path) -> Iterator[None]:
+    """Write what the bench measures within, also when it is stopped."""
+    try:
+        yield
+    finally:
+        record = bench.record()
+        if len(record):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            record.write_csv(path)
+
+
+def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:
+    """Read back what `AxisAccuracy.as_dict` gave."""
+    return (
+        AxisAccuracy(**{name.removesuffix("_arcsec"): value for name, value in data.items()})
+        if data
+        else None
+    )

@@ -159,9 +159,9 @@ def _progress() -> Iterator[Callable[[str, float, float], None]]:
         bars: dict[bool, int] = {}
 
         def show(name: str, done_s: float, total_s: float) -> None:
-            validating = name.startswith("stepping ")
+            validating = name.startswith(("stepping ", "positioning "))
             if validating not in bars:
                 bars[validating] = bar.add_task("", total=total_s)
-            bar.update(bars[validating], completed=done_s, description=f"{name:>16}")  # type: ignore[arg-type]
+            bar.update(bars[validating], completed=done_s, description=f"{name:>18}")  # type: ignore[arg-type]
 
         yield show

@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.atomic import write_atomically
-from hdbridge.calibration import Calibration
+from hdbridge.calibration import Calibration, Validation
 from hdbridge.calibration.result import unit_of
 from hdbridge.cli.options import console
 from hdbridge.modeldiff import diff
@@ -93,9 +93,29 @@ def _print_stepping(result: Calibration) -> None:
         ]
         table.add_row(each.model, *cells)
     console.print(table)
+    _print_accuracy(checked)
     floor = checked.floor
     console.print(
         f"floor of this axis's counts and noise: {floor.three_sigma_arcsec:.2f} arcsec; the new model is at "
         f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} of it",
         soft_wrap=True,
     )
+
+
+def _print_accuracy(checked: Validation) -> None:
+    found = ((checked.before.model, checked.accuracy_before), (checked.after.model, checked.accuracy_after))
+    rows = [(model, each) for model, each in found if each is not None]
+    if not rows:
+        return
+    table = Table(
+        title=f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
+        "approaches from each side",
+        title_justify="left",
+    )
+    table.add_column("with")
+    for name in ("accuracy A", "repeatability R", "reversal B", "systematic E", "range M"):
+        table.add_column(name, justify="right")
+    for model, each in rows:
+        figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
+        table.add_row(model, *(f"{value:.2f}" for value in figures))
+    console.print(table)

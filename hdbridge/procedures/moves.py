@@ -100,18 +100,13 @@ class MoveTo:
         """Time-optimal within the limits (ruckig)."""
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
-        demand = InputParameter(1)
-        demand.current_position = [start_deg]
-        demand.target_position = [self.load_deg]
-        demand.max_velocity = [min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
-        demand.max_acceleration = [min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)]
-        demand.max_jerk = [limits.jerk_deg_s3]
-        trajectory = Trajectory(1)
-        try:
-            result = Ruckig(1).calculate(demand, trajectory)
-        except RuckigError:  # not finite, or a limit that is not positive
-            result = Result.ErrorInvalidInput
-        if result not in {Result.Working, Result.Finished}:
+        # Ruckig finds nothing where limits and distance meet in a point, as with 10 deg/s, 200 deg/s2,
+        # 4000 deg/s3 over 1 deg; a hair slower it does.
+        for speed_share in (1.0, 1.0 - 1e-6):
+            trajectory, result = self._trajectory(start_deg, limits, speed_share)
+            if result in {Result.Working, Result.Finished}:
+                break
+        else:
             raise InputError(
                 f"no trajectory from {start_deg:g} to {self.load_deg:g} deg in the limits ({result.name}): "
                 "check the target, and velocity, acceleration and jerk in the axis file"
@@ -122,6 +117,21 @@ class MoveTo:
             return goal if time_s >= duration else float(at_time(time_s)[0][0])
 
         return Path(duration, at, min(start_deg, goal), max(start_deg, goal))
+
+    def _trajectory(
+        self, start_deg: float, limits: MotionLimits, speed_share: float
+    ) -> tuple[Trajectory, Result]:
+        demand = InputParameter(1)
+        demand.current_position = [start_deg]
+        demand.target_position = [self.load_deg]
+        demand.max_velocity = [speed_share * min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
+        demand.max_acceleration = [min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)]
+        demand.max_jerk = [limits.jerk_deg_s3]
+        trajectory = Trajectory(1)
+        try:
+            return trajectory, Ruckig(1).calculate(demand, trajectory)
+        except RuckigError:  # not finite, or a limit that is not positive
+            return trajectory, Result.ErrorInvalidInput
 
     def ended(self, samples: Sequence[Sample]) -> bool:
         """The path's end is the leg's end."""

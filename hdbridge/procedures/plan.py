@@ -23,6 +23,7 @@ from hdbridge.errors import InputError
 from hdbridge.expectation import nearest
 from hdbridge.procedures.chain import Chain
 from hdbridge.procedures.moves import AxisView, Procedure
+from hdbridge.procedures.positioning import Positioning, targets
 from hdbridge.procedures.reversals import Reversals
 from hdbridge.procedures.sine import Sines
 from hdbridge.procedures.standstill import Precondition, Reference, Standstill
@@ -166,6 +167,26 @@ class ValidationEntry(_Part):
 
     count: int = Field(120, ge=2, le=100_000, description="steps each way")
     step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
+    cycles: int = Field(
+        5,
+        ge=0,
+        le=100,
+        description="approaches of the positioning test (ISO 230-2) from each side; 0: no test",
+    )
+    travel_deg: float = Field(
+        360.0,
+        gt=0,
+        le=36_000,
+        description="travel of the positioning test at the load, if the limits allow it",
+    )
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.cycles == 1:
+            raise wrong(
+                "one approach shows no repeatability; expected 0, or at least 2 (the standard: 5)", "cycles"
+            )
+        return self
 
 
 class Plan(_Part):
@@ -232,6 +253,15 @@ class Plan(_Part):
         """The stepping test of the validation, on one axis."""
         room = Room(axis, self.precondition_deg)
         return room.stepping("validation", self.validation.count, self.validation.step_deg)
+
+    def positioning(self, axis: AxisView) -> Positioning | None:
+        """The positioning test of the validation, on one axis; None where the plan has none."""
+        if not self.validation.cycles:
+            return None
+        room = Room(axis, self.precondition_deg)
+        half = room.half("validation", "the positioning test", 0.5 * self.validation.travel_deg)
+        places = targets(room.middle_deg - half, room.middle_deg + half, axis)
+        return Positioning(places, self.validation.cycles, self.precondition_deg / axis.ratio)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ procedures:
   - {procedure: sweep, motor_turns: 5, motor_turns_per_s: 1.0}
   - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 1}
   - {procedure: reversals, depths_deg: [8, 20], reach_deg: 50, motor_deg_per_s: 20}
-validation: {count: 8}
+validation: {count: 8, cycles: 2, travel_deg: 10}
 """
 
 

@@ -49,6 +49,9 @@ def test_the_axis_points_better_with_it(calibrated_once):
     assert after < 2.0 * stepping["floor_arcsec"]
     assert 2.8 < stepping["floor_arcsec"] < 3.2
     assert len(stepping["after"]["errors_arcsec"][0]) == 8
+    accuracy = stepping["accuracy"]
+    assert accuracy["after"]["accuracy_arcsec"] < 0.3 * accuracy["before"]["accuracy_arcsec"]
+    assert accuracy["before"]["reversal_arcsec"] > 50
 
 
 def test_the_recording_is_kept_with_what_moved_how(calibrated_once):

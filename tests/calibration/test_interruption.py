@@ -14,7 +14,7 @@ procedures:
   - {procedure: standstill, duration_s: 1}
   - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 1}
   - {procedure: sweep, motor_turns: 12, motor_turns_per_s: 0.5}
-validation: {count: 4}
+validation: {count: 4, cycles: 0}
 """
 
 

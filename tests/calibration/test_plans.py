@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
-from hdbridge.procedures.moves import AxisView, MotionLimits
+from hdbridge.procedures.moves import AxisView, MotionLimits, MoveTo, Sample
 from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.sweep import Sweep
@@ -41,7 +41,7 @@ def test_quick_takes_minutes_and_full_does_not():
         sum(rehearse(each.procedure, axis).duration_s for each in Plan.load(name).tasks(axis).tasks)
         for name in ("quick", "full")
     )
-    assert quick < 600 < 1800 < full
+    assert quick < 900 < 1800 < full
 
 
 @given(
@@ -60,7 +60,8 @@ def test_no_plan_leaves_the_limits_wherever_it_begins(low, travel, speed, ratio,
         assert travel * ratio < 2 * (90 + 1.02 * plan.precondition_deg)
         return
     begin = low + start * travel
-    for procedure in (*(task.procedure for task in tasks), plan.stepping(axis)):
+    tests = (plan.stepping(axis), plan.positioning(axis))
+    for procedure in (*(task.procedure for task in tasks), *tests):
         walked = rehearse(procedure, axis, begin)
         assert low <= walked.lowest_deg
         assert walked.highest_deg <= low + travel
@@ -116,3 +117,42 @@ def test_a_plan_that_is_not_there_names_those_that_are():
 def test_a_plan_survives_being_written_into_a_recording():
     plan = Plan.load("full")
     assert Plan.model_validate(plan.as_dict()) == plan
+
+
+@pytest.mark.parametrize(("travel", "count"), [(80.0, 3), (170.0, 5), (360.0, 8)])
+def test_the_positioning_test_has_as_many_targets_as_the_standard_asks(travel, count):
+    axis = AxisView(50.0, WIDE)
+    plan = plan_of("  - {procedure: standstill}\n", f"validation: {{travel_deg: {travel}}}\n")
+    places = plan.positioning(axis).targets_deg
+    assert len(places) == count
+    assert list(places) == sorted(places)
+    assert max(map(abs, places)) <= travel / 2
+    phases = {round(each * 50.0 % 360.0, 3) for each in places}
+    assert len(phases) == count
+
+
+def test_every_target_is_approached_from_either_side_five_times():
+    axis = AxisView(50.0, WIDE)
+    procedure = Plan.load("quick").positioning(axis)
+    place, seen, steps, reply = 0.0, [], procedure.moves(axis), None
+    while True:
+        try:
+            move = steps.send(reply)
+        except StopIteration as end:
+            approaches = end.value
+            break
+        path = move.path(place, axis.limits)
+        if move.kind == "step":
+            seen.append((move.load_deg, move.load_deg > place))
+        place = path.at(path.duration_s)
+        reply = [Sample(0.01 * i, place, 0.0, 0.0, place + 1 / 3600, 0.0) for i in range(20)]
+    assert [(each.target_deg, each.forward) for each in approaches] == seen
+    for target in procedure.targets_deg:
+        assert seen.count((target, True)) == seen.count((target, False)) == 5
+    assert all(each.error_arcsec == pytest.approx(1.0) for each in approaches)
+
+
+def test_a_move_whose_limits_and_distance_meet_in_a_point_is_found():
+    path = MoveTo(16.5).path(15.5, MotionLimits(0.0, 20.0, 10.0, 200.0, 4000.0))
+    assert path.duration_s == pytest.approx(0.2, abs=1e-4)
+    assert path.at(path.duration_s) == 16.5

@@ -1,0 +1,67 @@
+"""The positioning test of machine tools (ISO 230-2): targets approached from both sides, again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One approach of a target."""
+
+    target_deg: float
+    forward: bool
+    error_arcsec: float
+    """Load encoder minus target, mean over the settled window."""
+
+
+@dataclass(frozen=True, slots=True)
+class Positioning:
+    """The standard test cycle: up through all targets, past the last, down through all, past the first."""
+
+    targets_deg: tuple[float, ...]
+    """Load angles, rising."""
+    cycles: int = 5
+    overrun_deg: float = 2.0
+    """Beyond the first and the last, at the load: more than any hysteresis is wide."""
+    settle: Settle = Settle()
+
+    def moves(self, axis: AxisView) -> Steps[tuple[Approach, ...]]:
+        """Each approach a jerk-limited move and a settle."""
+        found: list[Approach] = []
+        yield MoveTo(self.targets_deg[0] - self.overrun_deg, kind="precondition")
+        for _ in range(self.cycles):
+            for upwards in (True, False):
+                for target in self.targets_deg if upwards else reversed(self.targets_deg):
+                    yield MoveTo(target, kind="step")
+                    samples = yield self.settle
+                    found.append(Approach(target, upwards, self._error(target, samples)))
+                beyond = self.overrun_deg if upwards else -self.overrun_deg
+                yield MoveTo(self.targets_deg[-1 if upwards else 0] + beyond, kind="precondition")
+        return tuple(found)
+
+    def _error(self, target_deg: float, samples: Sequence[Sample]) -> float:
+        window = self.settle.window(samples)
+        return sum(each.load_position_deg - target_deg for each in window) / len(window) * ARCSEC_PER_DEG
+
+
+def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:
+    """Targets over a travel, as many as ISO 230-2 asks of a rotary axis (at least 3, 5 or 8).
+
+    Within their spacing they are spread over the motor's turn by the golden ratio, so that an error that
+    repeats with the motor turn is not met at one phase only.
+    """
+    travel = high_deg - low_deg
+    count = 3 if travel <= 90.0 else 5 if travel <= 180.0 else 8
+    turn = 360.0 / axis.ratio
+    places = []
+    for index in range(count):
+        even = low_deg + travel * index / (count - 1)
+        phase = (0.618_033_988_75 * index) % 1.0
+        shift = (phase - 0.5) * min(turn, 0.5 * travel / count)
+        places.append(min(max(even + shift, low_deg), high_deg))
+    return tuple(places)
