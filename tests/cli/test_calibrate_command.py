@@ -1,0 +1,131 @@
+"""`hdbridge calibrate` and `fit` at their edges: bad input, and records from elsewhere."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hdbridge.effects import Hysteresis, Motion, MotorOrder, Start, Synchronous
+from hdbridge.model import TransmissionModel
+
+RATIO = 50.0
+GEAR = TransmissionModel(
+    RATIO,
+    (
+        Synchronous(
+            orders=(
+                MotorOrder(order=1, amplitude_arcsec=5.0, phase_deg=30.0),
+                MotorOrder(order=2, amplitude_arcsec=11.0, phase_deg=-70.0),
+            )
+        ),
+        Hysteresis(offset_arcsec=33.0, width_deg=18.0, exponent=1.7),
+    ),
+)
+
+
+def motor_path(*turning_deg: float, speed_deg_s: float = 90.0, period_s: float = 0.01) -> np.ndarray:
+    """A motor that goes from one turning point to the next at constant speed."""
+    parts = [np.arange(a, b, np.sign(b - a) * speed_deg_s * period_s) for a, b in pairwise(turning_deg)]
+    return np.concatenate(parts)
+
+
+def write(path, motor_deg, columns=("time_s", "motor_position_deg", "load_position_deg"), ratio=RATIO):
+    """What a bench of somebody else's might have recorded of `GEAR`."""
+    noise = np.random.default_rng(5).normal(0.0, 0.8, len(motor_deg))
+    error = GEAR.predict(Motion(motor_deg=motor_deg), Start.FORWARD) + noise
+    data = {
+        "time_s": 0.01 * np.arange(len(motor_deg)),
+        "motor_position_deg": motor_deg,
+        "load_position_deg": motor_deg / ratio + error / 3600.0,
+    }
+    rows = [
+        ",".join(columns),
+        *(",".join(f"{data[each][i]:.9f}" for each in columns) for i in range(len(motor_deg))),
+    ]
+    path.write_text("\n".join(rows) + "\n")
+    return path.name
+
+
+BOTH_WAYS = (0, 1800, 0, 60, 50, 60, 0, 30, 0)
+
+
+def test_a_model_from_somebody_elses_csv(hdbridge, tmp_path):
+    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
+    done = hdbridge("fit", name, "--ratio", 50, "--out", "model.yaml", "--json", "fit.json")
+    assert done.returncode == 0, done.stderr
+    found = {each.name: each.parameters() for each in TransmissionModel.load(tmp_path / "model.yaml").effects}
+    assert found["hysteresis"]["offset_arcsec"] == pytest.approx(33.0, rel=0.05)
+    assert found["hysteresis"]["width_deg"] == pytest.approx(18.0, rel=0.1)
+    orders = {each["order"]: each["amplitude_arcsec"] for each in found["synchronous"]["orders"]}
+    assert orders == pytest.approx({1: 5.0, 2: 11.0}, abs=0.2)
+    result = json.loads((tmp_path / "fit.json").read_text())
+    sure = {each["parameter"]: each["ci95"] for each in result["parameters"]}
+    for key, value in (("offset_arcsec", 33.0), ("width_deg", 18.0), ("exponent", 1.7)):
+        assert sure[key][0] < value < sure[key][1]
+    assert "one speed" in done.stdout
+    assert result["schema"] == "hdbridge.calibration/1"
+    assert result["offered"] is None
+    assert result["held_out"]["improves"] is True
+    assert result["recordings"] == [name]
+
+
+def test_a_record_without_reversals_says_what_it_cannot_tell(hdbridge, tmp_path):
+    name = write(tmp_path / "one-way.csv", motor_path(0, 3600))
+    done = hdbridge("fit", name, "--ratio", 50, "--out", "model.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "hysteresis" in done.stdout
+    assert "reversal" in done.stdout
+    model = TransmissionModel.load(tmp_path / "model.yaml")
+    assert [each.name for each in model.effects] == ["synchronous"]
+
+
+def test_a_second_fit_is_compared_with_the_active_model(hdbridge, tmp_path):
+    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
+    GEAR.save(tmp_path / "active.yaml")
+    done = hdbridge("fit", name, "--ratio", 50, "--model", "active.yaml", "--json", "fit.json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "fit.json").read_text())
+    assert result["held_out"]["improves"] is False
+    assert {each["parameter"] for each in result["changes"]} >= {"offset_arcsec", "width_deg"}
+
+
+def refused(done, *texts: str) -> None:
+    lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
+    assert done.returncode == 2, done.stderr
+    assert len(lines) == 1, done.stderr
+    for text in texts:
+        assert text in lines[0]
+    assert done.stdout == ""
+
+
+def test_records_that_cannot_be_used_are_refused(hdbridge, tmp_path):
+    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
+    refused(hdbridge("fit", name), name, "--ratio")
+    refused(hdbridge("fit", name, "--ratio", 80, "--out", "model.yaml"), name, "80", "ratio")
+    refused(hdbridge("fit", name, "--ratio", 80, "--axis", "article"), "50", "80")
+    short = write(tmp_path / "short.csv", motor_path(0, 9))
+    refused(hdbridge("fit", short, "--ratio", 50), "short.csv", "expected at least")
+    lacking = write(tmp_path / "lacking.csv", motor_path(0, 90), columns=("time_s", "motor_position_deg"))
+    refused(hdbridge("fit", lacking, "--ratio", 50), "lacking.csv", "load_position_deg")
+    assert not (tmp_path / "model.yaml").exists()
+
+
+def test_plans_that_cannot_be_run_are_refused_before_anything_moves(hdbridge, profile, tmp_path):
+    refused(
+        hdbridge("calibrate", profile.folder, "--simulate", "--plan", "quik"), "quik", "did you mean 'quick'"
+    )
+    (tmp_path / "own.yaml").write_text(
+        "schema: hdbridge.plan/1\nname: own\nprocedures:\n  - {procedure: dance}\n"
+    )
+    refused(hdbridge("calibrate", profile.folder, "--simulate", "--plan", "own.yaml"), "own.yaml:4", "sweep")
+    refused(hdbridge("calibrate", profile.folder, "--simulate", "--resume", "nowhere"), "nowhere")
+    assert not (tmp_path / "recordings").exists()
+
+
+def test_an_axis_that_may_hardly_move_cannot_be_calibrated(hdbridge, profile):
+    profile("position_min_deg: -400", "position_min_deg: -1")
+    folder = profile("position_max_deg: 400", "position_max_deg: 1")
+    done = hdbridge("calibrate", folder, "--simulate")
+    assert done.returncode == 2
+    assert "at least" in done.stderr

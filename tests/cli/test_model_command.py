@@ -1,0 +1,152 @@
+"""`hdbridge model`: look, compare, commit, go back; and what a kill leaves."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hdbridge.model import TransmissionModel
+
+PENDING = """\
+schema: hdbridge.model/1
+ratio: 50
+effects:
+  - effect: hysteresis
+    parameters: {{offset_arcsec: {offset}, width_deg: 20, exponent: 1.6}}
+    uncertainty: {{offset_arcsec: 0.1}}
+provenance:
+  axis: article
+  drive: {{vendor_id: 0x4844, product_code: 0x402}}
+  gear: {{ratio: 50}}
+  date: "2026-01-02T03:04:05Z"
+  reason: offset {offset}
+"""
+
+
+@pytest.fixture
+def propose(profile):
+    """A function that leaves a pending model with an offset in the profile."""
+    (profile.folder / "model.yaml").unlink()
+
+    def propose(offset: float):
+        (profile.folder / "pending.yaml").write_text(PENDING.format(offset=offset))
+        return profile.folder
+
+    return propose
+
+
+def offset(folder) -> float:
+    (effect,) = TransmissionModel.load(folder / "model.yaml").effects
+    return effect.parameters()["offset_arcsec"]
+
+
+def test_commit_activate_roll_back_and_log(hdbridge, propose, tmp_path):
+    for each in (41.0, 42.0):
+        folder = propose(each)
+        assert hdbridge("model", "commit", folder).returncode == 0
+        assert offset(folder) == each
+    assert not (folder / "pending.yaml").exists()
+    assert hdbridge("model", "activate", folder, 1, "--reason", "the first was better").returncode == 0
+    assert offset(folder) == 41.0
+    for expected in (42.0, 41.0):
+        assert hdbridge("model", "rollback", folder, "--reason", "no").returncode == 0
+        assert offset(folder) == expected
+    done = hdbridge("model", "rollback", folder)
+    assert done.returncode == 2
+    assert "nothing to roll back to" in done.stderr
+
+    done = hdbridge("model", "log", folder, "--json", "log.json")
+    assert "the first was better" in done.stdout
+    log = json.loads((tmp_path / "log.json").read_text())
+    assert log["schema"] == "hdbridge.model-log/1"
+    assert [each["number"] for each in log["models"]] == [2, 1]
+    assert [each["active"] for each in log["models"]] == [False, True]
+    assert log["models"][1]["reason"] == "offset 41.0"
+
+
+def test_diff_compares_active_and_pending_or_any_two(hdbridge, propose, tmp_path):
+    folder = propose(41.0)
+    done = hdbridge("model", "diff", folder)
+    assert "no model → pending" in done.stdout
+    hdbridge("model", "commit", folder)
+    propose(42.5)
+    done = hdbridge("model", "diff", folder, "--json", "diff.json")
+    assert "+1.500" in done.stdout
+    rows = json.loads((tmp_path / "diff.json").read_text())["parameters"]
+    changed = [each for each in rows if each["changed"]]
+    assert [(each["parameter"], each["before"], each["after"]) for each in changed] == [
+        ("offset_arcsec", 41.0, 42.5)
+    ]
+    hdbridge("model", "commit", folder)
+    assert "-1.500" in hdbridge("model", "diff", folder, 2, 1).stdout
+    done = hdbridge("model", "diff", folder, 2, 7)
+    assert done.returncode == 2
+    assert "there is no model '7'" in done.stderr
+
+
+def test_discard_leaves_the_active_model(hdbridge, propose):
+    folder = propose(41.0)
+    hdbridge("model", "commit", folder)
+    propose(42.0)
+    assert hdbridge("model", "discard", folder).returncode == 0
+    assert not (folder / "pending.yaml").exists()
+    assert offset(folder) == 41.0
+    for action in ("discard", "commit"):
+        done = hdbridge("model", action, folder)
+        assert done.returncode == 2
+        assert "no pending model" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("product_code: 0x402", "product_code: 0x403", "drive"),
+        ("name: article", "name: another", "axis"),
+    ],
+)
+def test_a_model_of_another_axis_is_not_committed(hdbridge, propose, profile, old, new, word):
+    folder = propose(41.0)
+    profile(old, new)
+    done = hdbridge("model", "commit", folder)
+    assert done.returncode == 2
+    assert f"provenance.{word}" in done.stderr
+    assert not (folder / "model.yaml").exists()
+    assert (folder / "pending.yaml").exists()
+
+
+def test_a_commit_killed_at_any_moment_leaves_the_old_model_or_the_new_one(hdbridge, propose):
+    folder = propose(40.0)
+    hdbridge("model", "commit", folder)
+    worker = (
+        "import sys\nfrom hdbridge.cli import app\n"
+        "print('ready', flush=True)\nsys.stdin.readline()\n"
+        "app(['model', 'commit', sys.argv[1]])\n"
+    )
+    rng = random.Random(3)
+    before = 40.0
+    for number in range(5):
+        after = 41.0 + number
+        propose(after)
+        process = subprocess.Popen(
+            [sys.executable, "-c", worker, str(folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )
+        assert process.stdout.readline() == b"ready\n"
+        process.stdin.write(b"go\n")
+        process.stdin.flush()
+        time.sleep(rng.uniform(0.0, 0.03))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        found = offset(folder)
+        assert found in {before, after}
+        before = found
+    (folder / "pending.yaml").write_text(PENDING.format(offset=60.0))
+    assert hdbridge("model", "commit", folder).returncode == 0
+    assert offset(folder) == 60.0
