@@ -100,10 +100,10 @@ class MoveTo:
         """Time-optimal within the limits (ruckig)."""
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
-        # Ruckig finds nothing where limits and distance meet in a point, as with 10 deg/s, 200 deg/s2,
-        # 4000 deg/s3 over 1 deg; a hair slower it does.
-        for speed_share in (1.0, 1.0 - 1e-6):
-            trajectory, result = self._trajectory(start_deg, limits, speed_share)
+        # Ruckig finds nothing where limits and distance meet in a point, as 200 deg/s2, 4000 deg/s3 and
+        # 1 deg plus a rounding error do; a hair slower it does.
+        for share in (1.0, 1.0 - 1e-6):
+            trajectory, result = self._trajectory(start_deg, limits, share)
             if result in {Result.Working, Result.Finished}:
                 break
         else:
@@ -118,14 +118,14 @@ class MoveTo:
 
         return Path(duration, at, min(start_deg, goal), max(start_deg, goal))
 
-    def _trajectory(
-        self, start_deg: float, limits: MotionLimits, speed_share: float
-    ) -> tuple[Trajectory, Result]:
+    def _trajectory(self, start_deg: float, limits: MotionLimits, share: float) -> tuple[Trajectory, Result]:
         demand = InputParameter(1)
         demand.current_position = [start_deg]
         demand.target_position = [self.load_deg]
-        demand.max_velocity = [speed_share * min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
-        demand.max_acceleration = [min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)]
+        demand.max_velocity = [share * min(self.velocity_deg_s or math.inf, limits.velocity_deg_s)]
+        demand.max_acceleration = [
+            share * min(self.acceleration_deg_s2 or math.inf, limits.acceleration_deg_s2)
+        ]
         demand.max_jerk = [limits.jerk_deg_s3]
         trajectory = Trajectory(1)
         try:

