@@ -57,7 +57,7 @@ class TrueTemperature(Part):
     friction_growth_per_k: float = Field(
         0.0, ge=-1, le=1, description="growth of the motor's friction and of the hysteresis per kelvin"
     )
-    ambient_k_per_hour: float = Field(0.0, ge=-1_000, le=1_000, description="how the surroundings warm up")
+    ambient_k_per_hour: float = Field(0.0, ge=-100_000, le=100_000, description="how the surroundings warm up")
     ambient_swing_k: float = Field(0.0, ge=0, le=100, description="amplitude of their going to and fro")
     ambient_period_s: float = Field(3_600.0, gt=0, le=1e6, description="period of that")
 
@@ -98,6 +98,12 @@ class Truth(Part):
     def load_frequency_hz(self) -> float:
         """Natural frequency of the load on the gear's spring, the motor held."""
         return math.sqrt(self.gear.stiffness_nm_per_rad / self.load_.whole_inertia_kg_m2) / math.tau
+
+    @property
+    def highest_stiffness_nm_per_rad(self) -> float:
+        """The stiffest spring whose resonance the time step resolves."""
+        reflected = self.motor.inertia_kg_m2 * self.gear.ratio**2
+        return 1.0 / (self.substep_s**2 * (1.0 / self.load_.whole_inertia_kg_m2 + 1.0 / reflected))
 
     @model_validator(mode="after")
     def _step_resolves_the_spring(self) -> Self:

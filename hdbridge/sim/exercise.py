@@ -1,0 +1,132 @@
+"""Lead the simulated axis through moves without a bus, and keep what its encoders say.
+
+This is how records are made in bulk: the same loops, mechanics and encoders as behind the firmware, 250 or
+more times faster than the axis itself. All moves begin and end at rest, with continuous speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.sim.machine import Machine
+from hdbridge.units import DEG_PER_TURN
+
+Floats = NDArray[np.float64]
+
+
+class Readings(NamedTuple):
+    """What was read, one entry per sample; angles as the encoders tell them, multi-turn."""
+
+    time_s: Floats
+    motor_deg: Floats
+    load_deg: Floats
+    target_deg: Floats
+    load_torque_nm: Floats
+    motor_torque_nm: Floats
+    temperature_c: Floats
+
+
+class Exercise:
+    """Moves of one machine, in degrees of the motor, from where it stands; one demand per cycle."""
+
+    def __init__(self, machine: Machine, cycle_s: float = 0.004, cycles_per_sample: int = 1) -> None:
+        self.machine = machine
+        self.cycle_s = cycle_s
+        self._substeps = round(cycle_s / machine.dt_s)
+        if abs(self._substeps * machine.dt_s - cycle_s) > 1e-9:
+            raise ValueError(f"cycle_s: found {cycle_s:g}; expected a multiple of {machine.dt_s:g}")
+        self._per_sample = cycles_per_sample
+        motor, load = machine.truth.motor, machine.truth.load_.encoder
+        self._counts_per_deg = motor.encoder.direction * motor.encoder.counts_per_turn / DEG_PER_TURN
+        self._load_counts_per_deg = load.direction * load.counts_per_turn / DEG_PER_TURN
+        self._rated_nm = motor.encoder.direction * motor.rated_torque_nm
+        self._zero = motor.encoder.zero_counts
+        self._load_zero = load.zero_counts
+        self._cycle = 0
+        self._target = float(machine.motor_counts)
+        self._rows: list[tuple[float, ...]] = []
+
+    @property
+    def target_deg(self) -> float:
+        """The motor angle last demanded."""
+        return (self._target - self._zero) / self._counts_per_deg
+
+    @property
+    def samples(self) -> int:
+        """Samples kept so far."""
+        return len(self._rows)
+
+    def hold(self, duration_s: float) -> None:
+        """Stand."""
+        self._lead(lambda seconds: 0.0 * seconds, duration_s)
+
+    def move(self, distance_deg: float, speed_deg_s: float, acceleration_deg_s2: float) -> None:
+        """Move by a distance; the speed rises and falls as half a cosine with that highest acceleration."""
+        distance = abs(distance_deg)
+        ramp_s = 0.5 * math.pi * speed_deg_s / acceleration_deg_s2
+        if speed_deg_s * ramp_s > distance:  # short: it turns round before it is up to speed
+            ramp_s = math.sqrt(0.5 * math.pi * distance / acceleration_deg_s2)
+        speed = min(speed_deg_s, distance / ramp_s if ramp_s else speed_deg_s)
+        even_s = max(0.0, distance / speed - ramp_s) if speed else 0.0
+
+        def ramped(seconds: Floats | float) -> Floats:
+            """Way after a time of speeding up."""
+            return 0.5 * speed * (seconds - ramp_s / math.pi * np.sin(math.pi * seconds / ramp_s))
+
+        def way(seconds: Floats) -> Floats:
+            up = ramped(np.clip(seconds, 0.0, ramp_s))
+            even = speed * np.clip(seconds - ramp_s, 0.0, even_s)
+            left = np.clip(2.0 * ramp_s + even_s - seconds, 0.0, ramp_s)
+            down = 0.5 * speed * ramp_s - ramped(left)
+            return math.copysign(1.0, distance_deg) * (up + even + down)
+
+        if distance:
+            self._lead(way, 2.0 * ramp_s + even_s, distance_deg)
+
+    def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
+        """Swing to the far side and back, twice the amplitude away, as 1 - cos."""
+        turn = math.tau * frequency_hz
+        self._lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
+
+    def readings(self) -> Readings:
+        """All that was kept so far."""
+        columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(Readings._fields)).T
+        return Readings(*columns)
+
+    def _lead(
+        self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
+    ) -> None:
+        """Follow a way from here for a duration; where a distance is given, end exactly there."""
+        cycles = max(1, math.ceil(duration_s / self.cycle_s - 1e-9))
+        ways = way(np.arange(1, cycles + 1, dtype=np.float64) * self.cycle_s)
+        if distance_deg is not None:
+            ways[-1] = distance_deg
+        start = self._target
+        follow, substeps = self.machine.follow, self._substeps
+        last = start
+        for target in (start + self._counts_per_deg * ways).tolist():
+            follow(last, target, substeps)
+            last = target
+            self._cycle += 1
+            if self._cycle % self._per_sample == 0:
+                self._keep(target)
+        self._target = last
+
+    def _keep(self, target: float) -> None:
+        machine = self.machine
+        self._rows.append(
+            (
+                self._cycle * self.cycle_s,
+                (machine.motor_counts - self._zero) / self._counts_per_deg,
+                (machine.load_counts - self._load_zero) / self._load_counts_per_deg,
+                (target - self._zero) / self._counts_per_deg,
+                machine.load_torque_nm,
+                machine.torque_permille / 1000.0 * self._rated_nm,
+                machine.temperature_c,
+            )
+        )

@@ -1,0 +1,250 @@
+"""Causes that are hidden in the simulated axis: each really has the size that its description states."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
+SPEED_DEG_S = 14.0
+RUN = Run(
+    duration_s=31.0,
+    load_speed_deg_s=SPEED_DEG_S,
+    load_acceleration_deg_s2=40.0,
+    motor_turns=57.0,
+    load_reach_deg=(0.0, 370.0),
+)
+
+
+def axis(changes: Callable[[dict[str, Any]], None] | None = None) -> Truth:
+    """The article's axis with finer encoders and a stiffer spring, at the coarsest time step."""
+    data = Truth.load(ARTICLE).model_dump(by_alias=True)
+    data["substep_ms"] = 1.0
+    data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)
+    data["load"]["encoder"].update(counts_per_turn=28_800_000)
+    data["gear"].update(stiffness_nm_per_rad=32_000.0, damping_nm_s_per_rad=34.0)
+    if changes is not None:
+        changes(data)
+    return Truth.model_validate(data)
+
+
+class Errors:
+    """Errors at the load, by the encoders, in the parts of one short run."""
+
+    def __init__(self, truth: Truth) -> None:
+        exercise = Exercise(Machine(truth, 1))
+        marks: dict[str, tuple[int, int]] = {}
+
+        def part(name: str, do: Callable[[], None]) -> None:
+            before = exercise.samples
+            do()
+            marks[name] = (before, exercise.samples)
+
+        fast = (SPEED_DEG_S * 50.0, 40.0 * 50.0)
+        exercise.move(60.0, *fast)
+        exercise.move(-60.0, *fast)
+        exercise.hold(0.3)
+        part("forth", lambda: exercise.move(370.0 * 50.0, *fast))
+        exercise.hold(0.3)
+        part("back", lambda: exercise.move(-600.0, *fast))
+        part("end", lambda: exercise.hold(0.5))
+
+        def nested() -> None:
+            for distance in (60.0, -10.0, 2.0, -4.0, -6.0, 8.0, -10.0):
+                exercise.move(distance, 100.0, 500.0)
+
+        part("nested", nested)
+        self._marks = marks
+        readings = exercise.readings()
+        self._arcsec = (readings.load_deg - readings.motor_deg / 50.0) * 3600.0
+        self._load_deg = readings.load_deg
+
+    def part(self, name: str) -> NDArray[np.float64]:
+        first, last = self._marks[name]
+        return self._arcsec[first:last]
+
+    def even(self) -> NDArray[np.float64]:
+        """Forth at even speed."""
+        first, last = self._marks["forth"]
+        ramp = round(0.3 * (last - first) / 13.0)  # the ramps take 0.55 s of 27 s each
+        return self._arcsec[first + 2 * ramp : last - 2 * ramp]
+
+
+@cache
+def bare() -> Errors:
+    return Errors(axis())
+
+
+def peak(there: Errors, here: Errors) -> float:
+    """Of a wave about zero, while moving evenly."""
+    change = there.even() - here.even()
+    return float(np.quantile(np.abs(change - np.mean(change)), 0.995))
+
+
+def moving(there: Errors, here: Errors) -> float:
+    """Of a shift that is there as long as the axis moves."""
+    return float(np.median(np.abs((there.even() - here.even())[-500:])))
+
+
+def change(there: Errors, here: Errors) -> float:
+    """From the start to the end, standing."""
+    apart = there.part("end") - here.part("end")
+    return float(abs(np.median(apart[-50:]) - np.median((there.even() - here.even())[:50])))
+
+
+def at_a_turn(there: Errors, here: Errors) -> float:
+    """After a turn of the load, against the start."""
+    apart = there.even() - here.even()
+    return float(abs(np.median(apart[-200:]) - np.median(apart[:200])))
+
+
+def highest(there: Errors, here: Errors) -> float:
+    """Anywhere while moving evenly."""
+    return float(np.max(np.abs(there.even() - here.even())))
+
+
+def ramping(there: Errors, here: Errors) -> float:
+    """In the ramps."""
+    return float(np.max(np.abs(there.part("forth") - here.part("forth"))))
+
+
+def returning(there: Errors, here: Errors) -> float:
+    """In nested loops."""
+    return float(np.max(np.abs(there.part("nested") - here.part("nested"))))
+
+
+def looping(there: Errors, here: Errors) -> float:
+    """Anywhere in a crossing, back or in nested loops."""
+    back = float(np.max(np.abs(there.part("back") - here.part("back"))))
+    return max(back, returning(there, here))
+
+
+Measure = Callable[[Errors, Errors], float]
+# Measure, and the least and the most that it may come to, in parts of the size stated. Second orders come on
+# top of first ones; orders of the motor are a tenth higher near the load's resonance.
+EXPECTED: dict[str, tuple[Measure, float, float]] = {
+    "motor_order": (peak, 0.95, 1.3),
+    "motor_encoder_eccentricity": (peak, 0.95, 1.35),
+    "load_order": (peak, 0.9, 1.45),
+    "flexspline_order": (peak, 0.95, 1.1),
+    "direction_phase": (highest, 0.9, 1.1),
+    "torque_modulation": (highest, 0.7, 1.15),
+    "compliance": (peak, 0.9, 1.1),
+    "inertial_windup": (ramping, 0.85, 1.25),
+    "velocity_windup": (moving, 0.93, 1.07),
+    "channel_skew": (moving, 0.95, 1.05),
+    "backlash": (moving, 0.95, 1.05),
+    "hysteresis_memory": (returning, 0.5, 1.1),
+    "hysteresis_parameters": (looping, 0.9, 1.2),
+    "rate_dependence": (moving, 0.93, 1.07),
+    "subdivisional_error": (highest, 0.95, 1.15),
+    "zero_drift": (change, 0.75, 1.25),
+    "amplitude_drift": (highest, 0.6, 1.2),
+    "wear": (change, 0.85, 1.1),
+    "creep": (moving, 0.9, 1.05),
+    "ratio_error": (at_a_turn, 0.9, 1.1),
+    "count_loss": (change, 0.97, 1.03),
+    "vibration": (peak, 0.85, 1.2),
+    "local_defect": (highest, 0.95, 1.1),
+    "unexplained:roller": (highest, 0.9, 1.1),
+    "unexplained:seat": (highest, 0.6, 1.05),
+    "unexplained:cable": (highest, 0.9, 1.1),
+    "unexplained:sensor_warming": (moving, 0.9, 1.05),
+}
+
+
+def size_of(cause: str, rng: random.Random) -> float:
+    return rng.uniform(0.5, 1.5) if cause == "subdivisional_error" else rng.uniform(3.0, 9.0)
+
+
+def test_every_cause_can_be_hidden_and_has_a_size_to_check() -> None:
+    assert set(EXPECTED) == {*CAUSES, *UNKNOWN}
+    assert len(CAUSES) == 23
+
+
+@pytest.mark.parametrize("cause", EXPECTED)
+def test_a_hidden_cause_has_the_size_that_it_states(cause: str) -> None:
+    rng = random.Random(f"size of {cause}")
+    wanted = size_of(cause, rng)
+    known, hidden = hide(axis(), cause, rng, wanted, RUN)
+    assert hidden.cause == cause.split(":", maxsplit=1)[0]
+    assert hidden.size_arcsec == pytest.approx(wanted, rel=0.05)
+    here = bare()
+    if hidden.brings:  # what it brings along is not what is to be measured
+        less = known.model_dump(by_alias=True)
+        less["gear"]["torque_growth_per_nm"] = 0.0
+        here = Errors(Truth.model_validate(less))
+    measure, least, most = EXPECTED[cause]
+    measured = measure(Errors(known), here)
+    assert least * hidden.size_arcsec < measured < most * hidden.size_arcsec, hidden.text
+
+
+@pytest.mark.parametrize("cause", EXPECTED)
+def test_the_same_chance_hides_the_same_and_another_one_something_else(cause: str) -> None:
+    def drawn(seed: int) -> tuple[Truth, Hidden]:
+        return hide(axis(), cause, random.Random(seed), 4.0, RUN)
+
+    assert drawn(1) == drawn(1)
+    assert any(drawn(seed)[0] != drawn(1)[0] for seed in range(2, 12))
+    assert drawn(1)[0] != axis()
+
+
+def test_pairs_are_hidden_one_beside_the_other() -> None:
+    names = list(CAUSES)
+    rng = random.Random(5)
+    for first in names:
+        second = rng.choice([each for each in names if each != first])
+        known, hidden = hide_all(axis(), [(first, 3.0), (second, 5.0)], rng, RUN)
+        assert [each.cause for each in hidden] == [first, second]
+        assert Machine(known, 1).load_counts is not None
+
+
+def test_unexplained_draws_one_of_several() -> None:
+    drawn = {
+        tuple(hide(axis(), "unexplained", random.Random(seed), 4.0, RUN)[1].parameters) for seed in range(20)
+    }
+    assert len(drawn) == len(UNKNOWN)
+    kinds = {tuple(sorted(hide(axis(), name, random.Random(1), 4.0, RUN)[1].parameters)) for name in UNKNOWN}
+    assert len(kinds) == len(UNKNOWN)
+
+
+def no_hysteresis(data: dict[str, Any]) -> None:
+    data["gear"]["hysteresis"] = None
+
+
+def no_orders(data: dict[str, Any]) -> None:
+    data["gear"]["motor_orders"] = []
+
+
+@pytest.mark.parametrize(
+    ("cause", "size", "changes", "complaint"),
+    [
+        ("gremlins", 3.0, None, "found 'gremlins'"),
+        ("creep", 0.0, None, "size_arcsec: found 0"),
+        ("hysteresis_memory", 3.0, no_hysteresis, "needs an axis with the hysteresis law"),
+        ("rate_dependence", 3.0, no_hysteresis, "needs an axis with hysteresis"),
+        ("direction_phase", 3.0, no_orders, "has no tooth error"),
+    ],
+)
+def test_what_cannot_be_hidden_is_refused(
+    cause: str, size: float, changes: Callable[[dict[str, Any]], None] | None, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        hide(axis(changes), cause, random.Random(1), size, RUN)
+
+
+def test_a_size_beyond_what_the_axis_can_have_is_stated_as_it_is() -> None:
+    _, hidden = hide(axis(), "direction_phase", random.Random(1), 500.0, RUN)
+    assert 5.0 < hidden.size_arcsec < 40.0
