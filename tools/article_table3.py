@@ -1,9 +1,11 @@
 """Why the article's Tables 1 and 2 cannot give its Table 3: every figure of docs/article-table-3.md.
 
-    python tools/article_table3.py [--json FILE]
+    python tools/article_table3.py [--json FILE] [--simulate]
 
 The axis is taken as ideal but for the article's own error model and its two encoders: no dynamics, no noise.
-The law and its inverse are the project's own; the rest is computed here.
+The law comes from the project's effects; the inverse and the statistics are computed here, on their own, so
+that they also check the compensation. ``--simulate`` runs the same test on the simulated drive (half a
+minute) and compares it step by step.
 """
 
 from __future__ import annotations
@@ -11,20 +13,30 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 
+from hdbridge.axis import AxisConfig
 from hdbridge.bundled import bundled_profile
-from hdbridge.compensation import Inverse
-from hdbridge.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start
+from hdbridge.comparison import compare_schemes
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
 from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.stepping import Scheme, quantisation_floor_arcsec
 
 RATIO, MOTOR_COUNTS, LOAD_COUNTS = 50.0, 8000, 2_880_000
 STEP_COUNTS, COUNT = 968, 240
+COUNT_DEG = 360.0 / MOTOR_COUNTS
+STEP_DEG = STEP_COUNTS * COUNT_DEG
+SCHEMES = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
 TABLE_3 = {
     "none": (75.0, 34.2),
     "synchronous": (50.2, 29.0),
@@ -32,31 +44,153 @@ TABLE_3 = {
     "both": (30.2, -29.15),
 }
 NOW = Moment()
+BRACKET_DEG = 5.0
+"""Motor degrees to either side in which the compensated angle is looked for: 360 arcsec at the load."""
+
+Target = Callable[[Tracker, float], float]
+Parts = dict[str, tuple[float, float]]
 
 
-def stepping(
-    model: TransmissionModel, scheme: Scheme, motor_counts: int = MOTOR_COUNTS
-) -> dict[str, tuple[float, float]]:
-    """3 sigma and mean, arcsec, of the stepping test on the ideal axis, per direction and pooled."""
-    inverse = Inverse(scheme.of(model), Start.FORWARD)
-    gear = model.tracker(Start.FORWARD)
-    inverse.advance(0.0)
-    gear.advance(0.0, NOW)
-    step_deg = 360.0 * STEP_COUNTS / MOTOR_COUNTS / RATIO
-    passes: list[list[float]] = []
+def exact(model: Tracker, load_deg: float) -> float:
+    """Motor angle that solves theta_M / N + TE(theta_M) = load target, by a bracketed root."""
+
+    def off(motor_deg: float) -> float:
+        return motor_deg / RATIO + model.peek(motor_deg, NOW) / 3600.0 - load_deg
+
+    motor_deg = float(brentq(off, load_deg * RATIO - BRACKET_DEG, load_deg * RATIO + BRACKET_DEG, xtol=1e-11))
+    model.advance(motor_deg, NOW)
+    return motor_deg
+
+
+def as_printed(model: Tracker, load_deg: float) -> float:
+    """The article's own formula: the error is looked up at the angle before compensation."""
+    return load_deg * RATIO - RATIO * model.advance(load_deg * RATIO, NOW) / 3600.0
+
+
+def step_errors(
+    gear: TransmissionModel,
+    compensated: TransmissionModel,
+    motor_counts: int = MOTOR_COUNTS,
+    target: Target = exact,
+) -> tuple[list[float], list[float]]:
+    """Load error at rest of each step, arcsec, there (240) and back (240), both encoders quantised."""
+    told, real = compensated.tracker(Start.FORWARD), gear.tracker(Start.FORWARD)
+    told.advance(0.0, NOW)
+    real.advance(0.0, NOW)
+    ways = []
     for order in (range(1, COUNT + 1), range(COUNT - 1, -1, -1)):
         errors = []
         for index in order:
-            load_deg = index * step_deg
-            motor_deg = inverse.solve(load_deg)
-            inverse.advance(motor_deg)
-            motor_deg = round(motor_deg / 360.0 * motor_counts) * 360.0 / motor_counts
-            reached_deg = motor_deg / RATIO + gear.advance(motor_deg, NOW) / 3600.0
-            read_deg = round(reached_deg / 360.0 * LOAD_COUNTS) * 360.0 / LOAD_COUNTS
-            errors.append((read_deg - load_deg) * 3600.0)
-        passes.append(errors)
-    parts = {"cw": passes[0], "ccw": passes[1], "pooled": passes[0] + passes[1]}
+            load_deg = index * STEP_DEG / RATIO
+            motor_deg = quantised(target(told, load_deg), motor_counts)
+            reached_deg = motor_deg / RATIO + real.advance(motor_deg, NOW) / 3600.0
+            errors.append((quantised(reached_deg, LOAD_COUNTS) - load_deg) * 3600.0)
+        ways.append(errors)
+    return ways[0], ways[1]
+
+
+def quantised(angle_deg: float, counts_per_turn: int) -> float:
+    """The nearest whole count, in degrees."""
+    return round(angle_deg / 360.0 * counts_per_turn) * 360.0 / counts_per_turn
+
+
+def statistics(there: Sequence[float], back: Sequence[float]) -> Parts:
+    """3 sigma and mean, arcsec, per direction and pooled."""
+    parts = {"cw": there, "ccw": back, "pooled": [*there, *back]}
     return {name: (3.0 * float(np.std(errors)), float(np.mean(errors))) for name, errors in parts.items()}
+
+
+def rms(three_sigma: float, mean: float) -> float:
+    """Root mean square about zero."""
+    return math.hypot(three_sigma / 3.0, mean)
+
+
+def figures() -> dict[str, Any]:
+    """Every figure, by name."""
+    model = TransmissionModel.load(bundled_profile("article") / "model.yaml")
+    law = next(effect for effect in model.effects if isinstance(effect, Hysteresis))
+    errors = {scheme.value: step_errors(model, scheme.of(model)) for scheme in SCHEMES}
+    computed = {name: statistics(*each) for name, each in errors.items()}
+    printed, fine = partial(step_errors, model, model, target=as_printed), 4 * MOTOR_COUNTS
+    return {
+        "computed": computed,
+        "both_by_the_formula_as_printed": statistics(*printed(MOTOR_COUNTS)),
+        "table_3": TABLE_3,
+        "rms_about_zero_arcsec": {
+            name: {"computed": rms(*parts["pooled"]), "table 3": rms(*TABLE_3[name])}
+            for name, parts in computed.items()
+        },
+        **_about_table_3(computed),
+        **_about_the_test(model, law),
+        **_about_the_law(law),
+        "floor_arcsec": quantisation_floor_arcsec(MOTOR_COUNTS, RATIO),
+        "with_4_x_counts_arcsec": {
+            "floor": quantisation_floor_arcsec(fine, RATIO),
+            "both": statistics(*step_errors(model, model, fine))["pooled"][0],
+            "both by the formula as printed": statistics(*printed(fine))["pooled"][0],
+        },
+    }
+
+
+def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
+    """What Table 3 says by itself, and against what its means and scatters could be."""
+    three_sigma = {name: each[0] for name, each in TABLE_3.items()}
+    mean = {name: each[1] for name, each in TABLE_3.items()}
+    wave = computed["none"]["cw"][0]
+    offset = computed["synchronous"]["cw"][1]
+    # of a share p forward the variance gains (2 offset)^2 p (1 - p): which p gives the scatter of "none"?
+    both_ways = (three_sigma["none"] ** 2 - wave**2) / (3.0 * 2.0 * offset) ** 2
+    forward = 0.5 + math.sqrt(0.25 - both_ways)
+    return {
+        "remaining_share": three_sigma["both"] / three_sigma["none"],
+        "root_sum_square_of_the_single_schemes_arcsec": math.hypot(
+            three_sigma["synchronous"], three_sigma["hysteresis"]
+        ),
+        "shift_of_the_mean_arcsec": {
+            "by hysteresis compensation, without synchronous": mean["hysteresis"] - mean["none"],
+            "by hysteresis compensation, with synchronous": mean["both"] - mean["synchronous"],
+            "by synchronous compensation, without hysteresis": mean["synchronous"] - mean["none"],
+            "by synchronous compensation, with hysteresis": mean["both"] - mean["hysteresis"],
+            "the most that an offset of 40 could": computed["hysteresis"]["cw"][1]
+            - computed["none"]["cw"][1],
+        },
+        "none_as_a_mixture_of_directions": {
+            "share forward": forward,
+            "mean": offset * (2.0 * forward - 1.0),
+        },
+        "without_the_synchronous_part_of_table_1_arcsec": math.sqrt(three_sigma["none"] ** 2 - wave**2),
+        "beyond_one_motor_count_in_both_arcsec": math.sqrt(
+            three_sigma["both"] ** 2 - computed["both"]["pooled"][0] ** 2
+        ),
+    }
+
+
+def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]:
+    """What the stepping test samples and what it cannot see."""
+    turn = np.linspace(0.0, 360.0, 100_001)
+    stops = np.concatenate([np.arange(COUNT + 1), np.arange(COUNT - 1, -1, -1)]) * STEP_DEG
+    reached = law.predict(Motion(stops), Start.FORWARD)[1:]
+    other = [
+        law.model_copy(update={"width_deg": width, "exponent": exponent}).predict(
+            Motion(stops), Start.FORWARD
+        )[1:]
+        for width in (5.0, 40.0)
+        for exponent in (1.2, 2.5)
+    ]
+    per_turn = 360.0 / STEP_DEG
+    return {
+        "ratio_of_80_and_82_teeth": {"flexspline output": 80 / 2, "circular-spline output": 82 / 2},
+        "ramp_per_step_between_ratios_40_and_50_arcsec": STEP_DEG * (1 / 40 - 1 / 50) * 3600.0,
+        "synchronous_peak_to_peak_arcsec": float(np.ptp(model.only(["synchronous"]).predict(Motion(turn)))),
+        "samples_per_motor_turn": per_turn,
+        "aliases": {str(order): alias(order, per_turn) for order in (1, 2, 3, 4, 6, 8)},
+        "load_turns_spanned": COUNT * STEP_DEG / RATIO / 360.0,
+        "steps_that_end_saturated": int(np.sum(np.abs(np.abs(reached) - law.offset_arcsec) < 1e-9)),
+        "steps": len(reached),
+        "largest_change_with_widths_5_to_40_and_n_1.2_to_2.5_arcsec": float(
+            max(np.max(np.abs(each - reached)) for each in other)
+        ),
+    }
 
 
 def alias(order: int, samples_per_turn: float) -> float:
@@ -65,40 +199,18 @@ def alias(order: int, samples_per_turn: float) -> float:
     return min(folded, samples_per_turn - folded)
 
 
-def figures() -> dict[str, Any]:
-    """Every figure, by name."""
-    model = TransmissionModel.load(bundled_profile("article") / "model.yaml")
-    law = next(effect for effect in model.effects if isinstance(effect, Hysteresis))
-    synchronous = model.only(["synchronous"]).predict(Motion(np.linspace(0.0, 360.0, 100_001)))
-    count_deg = 360.0 / MOTOR_COUNTS
-    n, width, offset = law.exponent, law.width_deg, law.offset_arcsec
-    first_count = float(offset - law.predict(Motion(np.array([0.0, -count_deg])), Start.FORWARD)[-1])
+def _about_the_law(law: Hysteresis) -> dict[str, Any]:
+    n, offset = law.exponent, law.offset_arcsec
+    first_count = float(offset - law.predict(Motion(np.array([0.0, -COUNT_DEG])), Start.FORWARD)[-1])
     rest = np.linspace(0.0, 20.0, 200_001)
-    xi = rest / width
+    xi = rest / law.width_deg
     literal = 2.0 * offset * (xi ** (n - 1.0) - (n - 1.0) * xi) / (2.0 - n)
     virgin = law.predict(Motion(rest), Start.VIRGIN)
     back_step, staircase = memory_gaps(law)
-    per_turn = 360.0 / (STEP_COUNTS * count_deg)
     return {
-        "computed": {
-            scheme.value: stepping(model, scheme)
-            for scheme in (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
-        },
-        "table_3": TABLE_3,
-        "ratio_of_80_and_82_teeth": {"flexspline output": 80 / 2, "circular-spline output": 82 / 2},
-        "ramp_per_step_between_ratios_40_and_50_arcsec": STEP_COUNTS * count_deg * (1 / 40 - 1 / 50) * 3600.0,
-        "table_3_remaining_share": 30.2 / 75.0,
-        "table_3_rms_about_zero_arcsec": {
-            name: math.hypot(three_sigma / 3.0, mean) for name, (three_sigma, mean) in TABLE_3.items()
-        },
-        "table_3_root_sum_square_arcsec": math.hypot(50.2, 55.7),
-        "synchronous_peak_to_peak_arcsec": float(np.ptp(synchronous)),
-        "samples_per_motor_turn": per_turn,
-        "aliases": {order: alias(order, per_turn) for order in (1, 2, 3, 4, 6, 8)},
-        "load_turns_spanned": COUNT * STEP_COUNTS / MOTOR_COUNTS / RATIO,
         "relay_jump_arcsec": 2.0 * offset,
         "first_count_after_reversal_arcsec": first_count,
-        "same_in_counts_after_the_ratio": first_count * RATIO / 3600.0 / count_deg,
+        "same_in_counts_after_the_ratio": first_count * RATIO / 3600.0 / COUNT_DEG,
         "saturation_from_rest_deg": {
             "the formula as printed": float(rest[np.argmax(literal >= offset)]),
             "a virgin curve": float(rest[np.argmax(virgin >= offset - 1e-9)]),
@@ -107,9 +219,6 @@ def figures() -> dict[str, Any]:
             "one 2 deg back-step": back_step,
             "1 / 0.5 deg staircase": staircase,
         },
-        "floor_arcsec": quantisation_floor_arcsec(MOTOR_COUNTS, RATIO),
-        "floor_with_4_x_counts_arcsec": quantisation_floor_arcsec(4 * MOTOR_COUNTS, RATIO),
-        "both_with_4_x_counts_arcsec": stepping(model, Scheme.BOTH, 4 * MOTOR_COUNTS)["pooled"][0],
     }
 
 
@@ -134,25 +243,75 @@ def memory_gaps(law: Hysteresis) -> tuple[float, float]:
     return back_step, gap(staircase)
 
 
+def simulated() -> dict[str, Any]:
+    """The same test on the simulated drive: its figures, and how far its steps are from the computed ones."""
+    profile = bundled_profile("article")
+    axis = AxisConfig.load(profile / "axis.yaml")
+    model = TransmissionModel.load(profile / "model.yaml")
+    stepping = Stepping(count=COUNT, step_deg=STEP_DEG)
+    with (
+        simulated_bench(profile / "truth.yaml", axis.eds_path, axis.drive.node_id) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        comparison = compare_schemes(drive, model, SCHEMES, stepping)
+    result = {}
+    for scheme, measured in comparison.results.items():
+        there, back = step_errors(model, scheme.of(model))
+        stands = (*measured.outcome.cw, *measured.outcome.ccw)
+        apart = np.array([each.error_arcsec for each in stands]) - np.array([*there, *back])
+        result[scheme.value] = {
+            **{
+                name: (part.three_sigma_arcsec, part.mean_arcsec)
+                for name, part in (("cw", measured.cw), ("ccw", measured.ccw), ("pooled", measured.pooled))
+            },
+            "off the computed steps, arcsec": {
+                "rms": float(np.sqrt(np.mean(np.square(apart)))),
+                "largest": float(np.max(np.abs(apart))),
+            },
+        }
+    return result
+
+
+def _print(result: Mapping[str, Any]) -> None:
+    rows = {**result["computed"], "(as printed)": result["both_by_the_formula_as_printed"]}
+    print("3 sigma / mean, arcsec, computed from Tables 1 and 2 with both encoders quantised\n")
+    print(f"{'scheme':>12} {'CW':>15} {'CCW':>15} {'pooled':>15} {'Table 3':>15}")
+    for name, parts in rows.items():
+        print(_row(name, parts, TABLE_3.get(name)))
+    if "simulated" in result:
+        print("\nthe same on the simulated drive\n")
+        for name, parts in result["simulated"].items():
+            off = "off the computed steps, arcsec"
+            print(_row(name, parts, None), f" {off}: {_words(parts[off])}")
+    print()
+    for name, value in result.items():
+        if name in {"computed", "both_by_the_formula_as_printed", "table_3", "simulated"}:
+            continue
+        print(f"{name.replace('_', ' ')}: {_words(value)}")
+
+
+def _row(name: str, parts: Parts, table: tuple[float, float] | None) -> str:
+    cells = [parts["cw"], parts["ccw"], parts["pooled"], *([table] if table else [])]
+    return f"{name:>12} " + " ".join(f"{a:7.1f} /{b:7.2f}" for a, b in cells)
+
+
+def _words(value: object) -> str:
+    if isinstance(value, dict):
+        return "; ".join(f"{key} {_words(each)}" for key, each in value.items())
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
 def main() -> None:
     """Print the figures, and write them where asked."""
     parser = argparse.ArgumentParser(description="Why Tables 1 and 2 cannot give Table 3.")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures for machines")
+    parser.add_argument("--simulate", action="store_true", help="run the test on the simulated drive too")
     options = parser.parse_args()
     result = figures()
-    print("3 sigma / mean, arcsec, computed from Tables 1 and 2 with both encoders quantised\n")
-    print(f"{'scheme':>12} {'CW':>15} {'CCW':>15} {'pooled':>15} {'Table 3':>15}")
-    for scheme, parts in result["computed"].items():
-        cells = [parts["cw"], parts["ccw"], parts["pooled"], TABLE_3[scheme]]
-        print(f"{scheme:>12} " + " ".join(f"{a:7.1f} /{b:6.1f}" for a, b in cells))
-    print()
-    for name, value in result.items():
-        if name in {"computed", "table_3"}:
-            continue
-        if isinstance(value, dict):
-            print(f"{name}: " + ", ".join(f"{key}: {each:.2f}" for key, each in value.items()))
-        else:
-            print(f"{name}: {value:.2f}")
+    if options.simulate:
+        result["simulated"] = simulated()
+    _print(result)
     if options.json is not None:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

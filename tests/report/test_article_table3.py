@@ -1,0 +1,85 @@
+"""What the page about the article's Table 3 says is what its script computes."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("article_table3", ROOT / "tools" / "article_table3.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def figures(tool):
+    return tool.figures()
+
+
+@pytest.fixture(scope="module")
+def page():
+    return (ROOT / "docs" / "article-table-3.md").read_text(encoding="utf-8")
+
+
+def test_the_computed_table_of_the_page_is_the_computed_one(figures, page):
+    for scheme, parts in figures["computed"].items():
+        cells = re.search(rf"^\| {scheme} \|(.*)\|$", page, re.MULTILINE).group(1)
+        shown = [float(each.replace("−", "-")) for each in re.findall(r"[−\d.]+", cells)]
+        rms = figures["rms_about_zero_arcsec"][scheme]
+        wanted = [value for part in (*parts.values(), figures["table_3"][scheme]) for value in part]
+        wanted += [rms["computed"], rms["table 3"]]
+        assert shown == pytest.approx(wanted, abs=0.0501)
+
+
+def test_every_step_of_the_test_ends_saturated_so_it_cannot_see_the_shape(figures):
+    assert figures["steps_that_end_saturated"] == figures["steps"] == 480
+    assert figures["largest_change_with_widths_5_to_40_and_n_1.2_to_2.5_arcsec"] < 1e-9
+
+
+def test_without_counts_only_the_exact_inverse_leaves_nothing(tool):
+    model = tool.TransmissionModel.load(tool.bundled_profile("article") / "model.yaml")
+    fine = 8000 * 1024
+    exact = tool.statistics(*tool.step_errors(model, model, fine))["pooled"][0]
+    printed = tool.statistics(*tool.step_errors(model, model, fine, tool.as_printed))["pooled"][0]
+    load_count = 3 * 0.45 / 12**0.5
+    assert exact == pytest.approx(load_count, rel=0.15)
+    assert printed > 3 * load_count
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("root_sum_square_of_the_single_schemes_arcsec", 75.0),
+        ("ramp_per_step_between_ratios_40_and_50_arcsec", 784.1),
+        ("synchronous_peak_to_peak_arcsec", 42.9),
+        ("samples_per_motor_turn", 8.26),
+        ("load_turns_spanned", 0.58),
+        ("relay_jump_arcsec", 80.0),
+        ("first_count_after_reversal_arcsec", 4.9),
+        ("same_in_counts_after_the_ratio", 1.5),
+        ("floor_arcsec", 2.8),
+    ],
+)
+def test_single_figures(figures, name, value):
+    assert figures[name] == pytest.approx(value, abs=0.06)
+
+
+def test_orders_above_half_the_sampling_appear_where_the_page_says(figures):
+    assert figures["aliases"]["6"] == pytest.approx(2.26, abs=0.005)
+    assert figures["aliases"]["8"] == pytest.approx(0.26, abs=0.005)
+    assert figures["aliases"]["4"] == 4
+
+
+def test_the_law_as_printed_and_the_law_without_memory(figures):
+    starts = figures["saturation_from_rest_deg"]
+    assert starts["the formula as printed"] == pytest.approx(2.2, abs=0.05)
+    assert starts["a virgin curve"] == pytest.approx(10.0, abs=0.01)
+    gaps = figures["without_return_point_memory_arcsec"]
+    assert gaps["one 2 deg back-step"] == pytest.approx(10.2, abs=0.05)
+    assert gaps["1 / 0.5 deg staircase"] == pytest.approx(26.9, abs=0.05)
