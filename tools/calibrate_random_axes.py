@@ -2,9 +2,9 @@
 
     .venv/bin/python tools/calibrate_random_axes.py --axes 20 --workers 2
 
-Each axis has orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio (30-160),
-encoder resolutions and directions and noise (0.5-3 arcsec) of its own. The calibration is the command's: a plan
-on the bench, the fit, the stepping test before and after. Printed for each axis: the errors of the parameters,
+Each axis has orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio
+(30-160), encoder resolutions and directions and noise (0.5-3 arcsec) of its own. The calibration is the
+command's: a plan on the bench, the fit, the stepping test before and after. Printed for each axis: the errors of the parameters,
 what share of the 95 % intervals holds the truth, the stepping test over the floor of the axis's counts and
 noise, and how much faster than the axis it was.
 """
@@ -188,9 +188,10 @@ def row(each: Outcome) -> str:
     return (
         f"{each.seed:4d} {each.ratio:6.1f} {each.counts:6d} {each.noise:5.2f} | {part(each.offset, True)} | "
         f"{part(each.width, True)} | {part(each.exponent, False)} | {each.amplitude:5.2f} {each.missed:2d} "
-        f"{each.invented:2d} | {each.held:2d}/{each.intervals:<2d} | {each.before:7.2f} {each.three_sigma:6.2f} "
-        f"{each.floor:6.2f} {each.three_sigma / each.floor:5.2f} | {each.axis_s:6.0f} "
-        f"{each.axis_s / each.wall_s:5.1f} {each.axis_s / each.cpu_s:5.1f}{'' if each.offered else '  not offered'}"
+        f"{each.invented:2d} | {each.held:2d}/{each.intervals:<2d} | {each.before:7.2f} "
+        f"{each.three_sigma:6.2f} {each.floor:6.2f} {each.three_sigma / each.floor:5.2f} | "
+        f"{each.axis_s:6.0f} {each.axis_s / each.wall_s:5.1f} {each.axis_s / each.cpu_s:5.1f}"
+        f"{'' if each.offered else '  not offered'}"
     )
 
 
