@@ -4,9 +4,9 @@
 
 Each axis has orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio
 (30-160), encoder resolutions and directions and noise (0.5-3 arcsec) of its own. The calibration is the
-command's: a plan on the bench, the fit, the stepping test before and after. Printed for each axis: the errors of the parameters,
-what share of the 95 % intervals holds the truth, the stepping test over the floor of the axis's counts and
-noise, and how much faster than the axis it was.
+command's: a plan on the bench, the fit, the stepping test before and after. Printed for each axis: the errors
+of the parameters, what share of the 95 % intervals holds the truth, the stepping test over the floor of the
+axis's counts and noise, and how much faster than the axis it was.
 """
 
 from __future__ import annotations
