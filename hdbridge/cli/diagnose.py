@@ -1,0 +1,135 @@
+"""``hdbridge diagnose``: what the simulation gets wrong, and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, write_json
+from hdbridge.diagnose import Diagnosis, Finding, diagnose
+from hdbridge.diagnose.planned import plan_report
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.plan import Plan
+from hdbridge.recording import Recording
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("diagnose")(run)
+
+
+def run(
+    records: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="RECORD...", help="CSV files or recording folders, in their order."),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="MODEL.yaml", help="The model that is put to the test.")
+    ] = None,
+    json_file: JsonOption = None,
+    html_file: HtmlOption = None,
+    extend: Annotated[
+        Path | None, typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model.")
+    ] = None,
+    independent_zeros: Annotated[
+        bool,
+        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
+    ] = False,
+    plan: Annotated[
+        str | None,
+        typer.Option(
+            "--plan", metavar="PLAN.yaml", help="Without records: what this plan could detect and tell apart."
+        ),
+    ] = None,
+) -> None:
+    """Compare records with a model; name what the model lacks, or say what cannot be told.
+
+    With --plan and no record: which causes the planned procedures could detect, down to how many
+    arcseconds, and which they could not tell apart.
+    """
+    if model is None:
+        raise InputError("--model is missing; name the model file that the records are compared with")
+    known = TransmissionModel.load(model)
+    if plan is not None:
+        if records:
+            raise InputError("--plan looks at a plan before anything is measured; leave the records out")
+        report = plan_report(Plan.load(plan), known)
+        _print_plan(report)
+        write_json(json_file, report)
+        return
+    if not records:
+        raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
+    recording = Recording.load(*records)
+    if recording.ratio is not None and abs(recording.ratio / known.ratio - 1.0) > 1e-9:
+        raise InputError(
+            f"{records[0]}: recorded with ratio {recording.ratio:g}, {model} has {known.ratio:g}; use the "
+            "model of this gear"
+        )
+    result = diagnose(
+        recording.record,
+        known,
+        recording.segments,
+        independent_zeros=independent_zeros,
+        progress=lambda words: notes.print(f"{words} ..."),
+    )
+    _print(result)
+    write_json(json_file, result.as_dict())
+    if extend is not None:
+        result.model.save(extend)
+        notes.print(f"wrote {extend}")
+    if html_file is not None:
+        write_page(html_file, result)
+
+
+def write_page(path: Path, result: Diagnosis) -> None:
+    """The page for people, where the reports have one."""
+    try:
+        from hdbridge.report.diagnosis import write_diagnosis  # type: ignore[import-not-found]  # noqa: PLC0415
+    except ImportError:
+        raise InputError(f"{path}: this version writes no page for a diagnosis; use --json") from None
+    write_diagnosis(path, result)
+
+
+def _print(result: Diagnosis) -> None:
+    console.print(result.verdict())
+    table = Table("cause", "probability", "or", "size", "held out", "parameters")
+    for each in result.findings:
+        table.add_row(
+            each.cause if not each.lives_in else f"{each.cause} (lives in {each.lives_in})",
+            f"{each.probability:.2f}",
+            ", ".join(each.aliases),
+            f"{each.peak_arcsec:.3g} arcsec",
+            f"{each.before_arcsec:.3g} -> {each.after_arcsec:.3g} arcsec rms",
+            _words(each),
+        )
+    if result.findings:
+        console.print(table)
+        for each in result.findings:
+            if each.experiment:
+                console.print(f"next, for {each.cause}: {each.experiment}")
+    for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
+        notes.print(remark)
+
+
+def _words(finding: Finding) -> str:
+    return "\n".join(
+        f"{name} {each.value:.4g} ({each.low:.4g} to {each.high:.4g}) {each.unit}"
+        for name, each in finding.parameters.items()
+    )
+
+
+def _print_plan(report: dict[str, Any]) -> None:
+    table = Table("cause", "detected from", "not told from")
+    for name, each in report["identifiability"].items():
+        limit = each["detection_limit_arcsec"]
+        words = (
+            f"{limit:.2g} arcsec" if each["detectable"] else f"no: {each.get('reason') or 'limit too high'}"
+        )
+        table.add_row(name, words, ", ".join(each["aliases"]))
+    console.print(table)
+    for note in report["notes"]:
+        notes.print(note)

@@ -1,0 +1,156 @@
+"""Findings within the model's own parts: the elastic law, its parameters, the first two orders of the motor.
+
+Calibrations are a few per cent off as a rule, and that is no finding: the change has to be larger than that.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hdbridge.diagnose.experiment import next_experiment
+from hdbridge.diagnose.holdout import held_out
+from hdbridge.diagnose.parameters import parameters_of
+from hdbridge.diagnose.result import Finding, Parameter
+from hdbridge.diagnose.search import Trail
+from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.effects import (
+    Effect,
+    FloatArray,
+    HysteresisParameters,
+    Loop,
+    MotorEncoderEccentricity,
+    Synchronous,
+)
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.model import TransmissionModel
+
+LAW_GAIN = 60.0
+"""Chi square by which another elastic law has to be better."""
+LAW_ARCSEC = 0.5
+"""... and the root mean square by which the two predictions differ there."""
+LOOP_SHARE = 0.07
+LOOP_ARCSEC = 1.5
+"""A loop has changed when it differs by this share of itself, root mean square, and by this much."""
+ORDER_SHARE = 0.15
+ORDER_ARCSEC = 0.8
+"""The same for an order of the motor."""
+
+
+def findings(workshop: Workshop, model: TransmissionModel, trail: Trail, spread: FloatArray) -> list[Finding]:
+    """What has changed within the baseline."""
+    result: list[Finding] = []
+    fitted = trail.fitted
+    for place, (given, now) in enumerate(zip(model.effects, fitted.theory.effects, strict=False)):
+        if isinstance(given, Hysteresis | HysteresisMemory):
+            found = _law(workshop, fitted, trail, place, given, now, spread)
+        elif isinstance(given, Synchronous):
+            found = _orders(workshop, fitted, place, given, now, spread)
+        else:
+            found = None
+        if found is not None:
+            result.append(found)
+    return result
+
+
+def _law(
+    workshop: Workshop,
+    fitted: Fitted,
+    trail: Trail,
+    place: int,
+    given: Effect,
+    now: Effect,
+    spread: FloatArray,
+) -> Finding | None:
+    start = fitted.theory.start
+
+    def values(effect: Effect) -> FloatArray:
+        return workshop.columns(effect, start) @ effect.coefficients()
+
+    if type(given) is not type(now):
+        if trail.law_gain < LAW_GAIN or not isinstance(now, HysteresisMemory):
+            return None
+        old = workshop.fit(fitted.theory.instead(place, type(given)(**now.parameters())))
+        apart = (old.residual - fitted.residual) / workshop.weight
+        if (
+            float(np.sqrt(np.mean(apart**2))) < 0.25 * LAW_ARCSEC
+            or float(np.max(np.abs(apart))) < 2.0 * LAW_ARCSEC
+        ):
+            return None
+        gain = held_out(workshop, fitted, old)
+        return Finding(
+            "hysteresis_memory", 0.95, (), parameters_of(fitted, place, spread), gain.before_arcsec,
+            gain.after_arcsec, next_experiment("hysteresis_memory", ()),
+            float(np.quantile(np.abs(apart), 0.998)),
+            robust=trail.law_gain, effect=now,
+        )  # fmt: skip
+    if type(given) is not type(now):
+        return None
+    before, after = values(given), values(now)
+    change = float(np.std(after - before))
+    if change < max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after))):
+        return None
+    loop = Loop(**given.parameters(), memory=isinstance(given, HysteresisMemory))
+    assert isinstance(now, Hysteresis | HysteresisMemory)
+    effect = HysteresisParameters(
+        base=loop, offset_arcsec=now.offset_arcsec, width_deg=now.width_deg, exponent=now.exponent
+    )
+    residual = fitted.residual / workshop.weight
+    old_residual = residual + (after - before) - float(np.mean(after - before))
+    return Finding(
+        "hysteresis_parameters", 0.9, (), parameters_of(fitted, place, spread),
+        float(np.sqrt(np.mean(old_residual**2))), float(np.sqrt(np.mean(residual**2))),
+        next_experiment("hysteresis_parameters", ()), 0.5 * float(np.ptp(after - before)),
+        robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
+        effect=effect, note="the baseline's own loop takes over the new parameters",
+    )  # fmt: skip
+
+
+def _orders(
+    workshop: Workshop, fitted: Fitted, place: int, given: Synchronous, now: Effect, spread: FloatArray
+) -> Finding | None:
+    assert isinstance(now, Synchronous)
+    columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
+    changed: list[MotorOrder] = []
+    parameters: dict[str, Parameter] = {}
+    weight = 0.0
+    for number, (old, new) in enumerate(zip(given.orders, now.orders, strict=True)):
+        one, other = _phasor(old), _phasor(new)
+        apart = other - one
+        pair = columns[2 * number : 2 * number + 2]
+        deviation = math.sqrt(max(float(np.trace(spread[np.ix_(pair, pair)])), 0.0))
+        if abs(apart) < max(ORDER_ARCSEC, ORDER_SHARE * abs(one), 5.0 * deviation):
+            continue
+        phase = math.degrees(math.atan2(apart.imag, apart.real))
+        changed.append(
+            MotorOrder.model_construct(order=old.order, amplitude_arcsec=abs(apart), phase_deg=phase)
+        )
+        half = 1.96 * deviation
+        parameters[f"order_{old.order}_amplitude_arcsec"] = Parameter(
+            abs(apart), "arcsec", max(abs(apart) - half, 0.0), abs(apart) + half
+        )
+        parameters[f"order_{old.order}_phase_deg"] = Parameter(
+            phase, "deg", phase - math.degrees(half / abs(apart)), phase + math.degrees(half / abs(apart))
+        )
+        weight += abs(apart) ** 2
+    if not changed:
+        return None
+    low = {each.order for each in changed} <= {1, 2}
+    size = sum(each.amplitude_arcsec for each in changed)
+    residual = float(np.sqrt(np.mean((fitted.residual / workshop.weight) ** 2)))
+    cause, aliases = ("motor_encoder_eccentricity", ("motor_order",)) if low else ("motor_order", ())
+    return Finding(
+        cause, 0.9, aliases, parameters, math.hypot(residual, math.sqrt(0.5 * weight)), residual,
+        next_experiment(cause, aliases), size,
+        robust=float(np.sum(workshop.weight**2) * 0.5 * weight),
+        effect=MotorEncoderEccentricity.model_construct(orders=tuple(changed)) if low else None,
+        note="a change of orders that the model has: its synchronous part takes it over",
+    )  # fmt: skip
+
+
+def _phasor(order: MotorOrder) -> complex:
+    angle = math.radians(order.phase_deg)
+    return order.amplitude_arcsec * complex(math.cos(angle), math.sin(angle))

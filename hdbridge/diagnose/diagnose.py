@@ -1,0 +1,335 @@
+"""From a measurement and a model to a diagnosis: the steps in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hdbridge.diagnose import changes
+from hdbridge.diagnose.evidence import Leg, gather
+from hdbridge.diagnose.experiment import for_unexplained, next_experiment
+from hdbridge.diagnose.extend import extended_model
+from hdbridge.diagnose.gates import Gate, gate
+from hdbridge.diagnose.holdout import held_out
+from hdbridge.diagnose.identifiability import ALWAYS, identifiability
+from hdbridge.diagnose.parameters import covariance, parameters_of
+from hdbridge.diagnose.probability import probability
+from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
+from hdbridge.diagnose.search import PENALTY, REPEATED, Search, Trail
+from hdbridge.diagnose.theory import Fitted, Theory, Workshop
+from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, rest
+from hdbridge.effects import Channel, ChannelSkew, FloatArray, InertialWindup, Start, unmet
+from hdbridge.effects.base import missing_error
+from hdbridge.effects.kinematics import direction_of
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
+
+INERTIA_SHARE = 0.15
+"""A skew whose part in speed is less than this of its part in acceleration is none."""
+LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
+SERIAL = REPEATED - {"creep"}
+ONE_WAY = 0.6
+"""A record without reversals makes no name more probable than this."""
+SHADOW = 2.0
+"""A name stands beside something unexplained when it takes away so many times its variance."""
+PLAIN_ARCSEC = 1.0
+"""More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
+particular."""
+SAME_FAMILY = 3
+"""So many picks of one family, nearly equal, are one unknown and not many causes."""
+
+
+def diagnose(
+    record: Record,
+    model: TransmissionModel,
+    legs: Sequence[Leg] = (),
+    *,
+    independent_zeros: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Say how the model differs from the record, and why.
+
+    ``legs`` are the segments of a recording, where it has them. InputError where the record is too short,
+    contradicts the model's ratio, or lacks a channel that the model needs.
+    """
+    lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
+    for name, channels in lacking.items():
+        if channels:
+            raise missing_error(name, channels)
+    progress("preparing the record")
+    evidence = gather(
+        record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
+    )
+    workshop = Workshop(evidence)
+    search = Search(workshop, model.effects)
+    progress("searching for causes")
+    trail = search.run()
+    progress("judging what was found")
+    return _Judge(workshop, search, trail, model, record).diagnosis()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judge:
+    workshop: Workshop
+    search: Search
+    trail: Trail
+    model: TransmissionModel
+    record: Record
+
+    def diagnosis(self) -> Diagnosis:
+        workshop, trail, base = self.workshop, self.trail, self.trail.base
+        fitted, considered = self._named_only(trail.fitted)
+        fitted, more = self._without_doubtful(fitted)
+        considered += more
+        fitted = self._inertia(fitted)
+        trail = replace(trail, fitted=fitted)
+        spread = covariance(workshop, fitted)
+        findings = [self._finding(fitted, place, spread) for place in range(base, len(fitted.theory.effects))]
+        findings += changes.findings(workshop, self.model, trail, spread)
+        findings.sort(key=lambda each: -each.robust)
+        if workshop.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
+            workshop.nuisance = workshop.nuisance[:, :0]
+            fitted = workshop.fit(fitted.theory)
+            spread = covariance(workshop, fitted)
+        left = rest(workshop, fitted)
+        findings = self._with_unexplained(findings, left)
+        chosen = tuple(range(base, len(fitted.theory.effects)))
+        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
+        given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
+        points = workshop.evidence.points
+        after = fitted.residual / workshop.weight
+        return Diagnosis(
+            baseline=_figures(given),
+            refitted=_figures(refitted.residual / workshop.weight),
+            extended=_figures(after),
+            noise_floor_arcsec=float(np.sqrt(np.mean(points.sigma_arcsec[workshop.index] ** 2))),
+            findings=tuple(findings),
+            identifiability=identifiability(workshop, fitted, self.model.effects),
+            by_kind=self._by_kind(given, after),
+            remarks=workshop.evidence.remarks,
+            model=extended,
+            traces=self._traces(fitted, given),
+            considered=tuple(considered),
+        )
+
+    def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
+        """Take out what a gate stops, weakest first, and fit again."""
+        considered: list[str] = []
+        while len(fitted.theory.effects) > self.trail.base:
+            gates: dict[int, Gate] = {
+                place: gate(self.workshop, fitted, place)
+                for place in range(self.trail.base, len(fitted.theory.effects))
+            }
+            stopped = [place for place in gates if not gates[place].passed]
+            if not stopped:
+                break
+            place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed)
+            considered.append(f"{fitted.theory.effects[place].name}: {gates[place].reason}")
+            fitted = self.workshop.fit(fitted.theory.without(place))
+        return fitted, considered
+
+    def _inertia(self, fitted: Fitted) -> Fitted:
+        """A skew that has all but no part in speed is an inertial wind-up."""
+        for place, effect in enumerate(fitted.theory.effects[self.trail.base :], self.trail.base):
+            if not isinstance(effect, ChannelSkew):
+                continue
+            parts = np.abs(self.workshop.columns(effect, fitted.theory.start) * effect.coefficients())
+            speed, acceleration = np.quantile(parts, 0.998, axis=0)
+            plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
+            if speed < INERTIA_SHARE * acceleration:
+                trial = self.workshop.fit(fitted.theory.instead(place, plain))
+                if not trial.theory.effects[place].violations():
+                    return trial
+        return fitted
+
+    def _without_doubtful(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
+        """Take out names that do less than what is left unexplained beside them: it may well be its
+        shadow.
+        """
+        considered: list[str] = []
+        while len(fitted.theory.effects) > self.trail.base:
+            left = rest(self.workshop, fitted)
+            if not self._is_unexplained(left):
+                break
+            does = {}
+            for place in range(self.trail.base, len(fitted.theory.effects)):
+                without = self.workshop.fit(fitted.theory.without(place))
+                lost = [each.residual / self.workshop.weight for each in (without, fitted)]
+                does[place] = (float(np.mean(lost[0] ** 2) - np.mean(lost[1] ** 2)), without)
+            place = min(does, key=lambda each: does[each][0])
+            if does[place][0] > SHADOW * left.arcsec**2:
+                break
+            considered.append(f"{fitted.theory.effects[place].name}: does less than what is left unexplained")
+            fitted = does[place][1]
+        return fitted, considered
+
+    def _finding(self, fitted: Fitted, place: int, spread: FloatArray) -> Finding:
+        effect = fitted.theory.effects[place]
+        without = self.workshop.fit(fitted.theory.without(place))
+        judged = gate(self.workshop, fitted, place)
+        gain = held_out(self.workshop, fitted, without)
+        aliases, margin = self._aliases(fitted, without, place)
+        own = without.chi_square - fitted.chi_square
+        sure = probability(judged.robust, judged.needed, gain.recovered, margin, own)
+        if self.workshop.evidence.reversals < 2:
+            sure = min(sure, ONE_WAY)  # speed, torque, place and time go together: useful, but no proof
+        return Finding(
+            cause=effect.name,
+            probability=sure,
+            aliases=aliases,
+            parameters=parameters_of(fitted, place, spread),
+            before_arcsec=gain.before_arcsec,
+            after_arcsec=gain.after_arcsec,
+            experiment=next_experiment(effect.name, aliases),
+            peak_arcsec=self.search.peak(fitted, place),
+            robust=own,
+            effect=effect,
+        )
+
+    def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[tuple[str, ...], float]:
+        """Other causes that do nearly as well in its place, and by how much the best of the others is
+        worse.
+        """
+        effect = fitted.theory.effects[place]
+        own = without.chi_square - fitted.chi_square
+        aliases: list[str] = []
+        margin = own
+        count = fitted.count()
+        for name, trial in self.search.rivals(without, effect.name):
+            worse = trial.chi_square - fitted.chi_square + PENALTY * (trial.count() - count)
+            if worse < 20.0 + 0.01 * own:
+                aliases.append(name)
+            else:
+                margin = min(margin, worse)
+        if effect.name == "motor_order" and {each.order for each in effect.orders} <= {1, 2}:  # type: ignore[attr-defined]
+            aliases += [each for each in ALWAYS["motor_order"] if each not in aliases]
+        has_torque = Channel.LOAD_TORQUE in self.workshop.motion.available()
+        orders = {each.order for each in getattr(effect, "orders", ())}
+        if effect.name == "load_order" and 1 in orders and not has_torque and "compliance" not in aliases:
+            aliases.append("compliance")
+        return tuple(aliases), margin
+
+    def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
+        many = _many_of_one(findings)
+        if many is None and not self._is_unexplained(left):
+            return findings
+        size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
+        lives = left.lives_in
+        if many is not None:
+            lives = {
+                "motor_order": "motor angle",
+                "load_order": "load angle",
+                "flexspline_order": "motor angle",
+            }.get(many[0].cause, left.lives_in)
+            findings = [each for each in findings if each not in many]
+        unknown = Finding(
+            cause="unexplained",
+            probability=min(max(1.0 - 0.5 * LEFT_ARCSEC / max(size, 1e-9), 0.5), 0.97),
+            aliases=(),
+            parameters={},
+            before_arcsec=left.arcsec,
+            after_arcsec=float(np.sqrt(max(left.arcsec**2 - left.explained_arcsec**2, 0.0))),
+            experiment=for_unexplained(lives),
+            peak_arcsec=size,
+            lives_in=lives,
+            note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
+            place=left.place,
+            curve_arcsec=left.curve_arcsec,
+            axis=left.lives_in,
+        )
+        loops = [each for each in findings if each.cause in LOOPS]
+        if many is None and loops and "last reversal" in lives:
+            # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
+            told = replace(
+                loops[0],
+                probability=min(loops[0].probability, 0.8),
+                note=f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left",
+                lives_in=lives,
+                place=left.place,
+                curve_arcsec=left.curve_arcsec,
+                axis=left.lives_in,
+            )
+            return [told if each is loops[0] else each for each in findings]
+        largest = max((each.peak_arcsec for each in findings), default=0.0)
+        return [*findings, unknown] if largest > 6.0 * size else [unknown, *findings]
+
+    def _is_unexplained(self, left: Rest) -> bool:
+        evidence = self.workshop.evidence
+        # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
+        # that.
+        counts = evidence.motor_count_arcsec / np.sqrt(12.0)
+        limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
+        if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
+            return True
+        return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
+
+    def _as_given(self) -> FloatArray:
+        """Residual of the model as it is, but for the zeros; with the start that suits it best."""
+        workshop = self.workshop
+        best: FloatArray | None = None
+        for start in Start:
+            error = workshop.observed - self.model.predict(workshop.motion, start)[workshop.index]
+            for zero in range(workshop.evidence.zeros):
+                rows = workshop.zero == zero
+                if np.any(rows):
+                    error[rows] -= np.average(error[rows], weights=workshop.weight[rows] ** 2)
+            if best is None or float(error @ error) < float(best @ best):
+                best = error
+        assert best is not None
+        return best
+
+    def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
+        workshop = self.workshop
+        kinds = workshop.evidence.points.kind[workshop.index]
+        direction = direction_of(workshop.motion)[workshop.index]
+        masks = {name: kinds == i for i, name in enumerate(workshop.evidence.kinds)}
+        masks |= {"forward": direction > 0, "backward": direction < 0}
+        return {
+            name: (_figures(given[rows], about_zero=True), _figures(after[rows], about_zero=True))
+            for name, rows in masks.items()
+            if np.count_nonzero(rows) > 10
+        }
+
+    def _traces(self, fitted: Fitted, given: FloatArray) -> Traces:
+        workshop = self.workshop
+        points = workshop.evidence.points
+        speed = points.motion.motor_speed_deg_s
+        assert speed is not None
+        measured = workshop.observed - workshop.level - fitted.zeros[workshop.zero]
+        return Traces(
+            time_s=workshop.time_s,
+            motor_deg=workshop.motion.motor_deg[workshop.index],
+            measured_arcsec=measured,
+            model_arcsec=measured - given,
+            extended_arcsec=measured - fitted.residual / workshop.weight,
+            direction=direction_of(workshop.motion)[workshop.index],
+            speed_deg_s=speed[workshop.index],
+            kind=workshop.evidence.kinds,
+            kind_number=points.kind[workshop.index].astype(np.float64),
+        )
+
+
+def _many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
+    """Several near-equal picks of one family: sidebands of something that is none of them."""
+    for family in {each.cause for each in findings}:
+        same = [each for each in findings if each.cause == family]
+        sizes = [
+            value.value
+            for each in same
+            for name, value in each.parameters.items()
+            if name.endswith("amplitude_arcsec") or name.endswith("size_arcsec")
+        ] or [each.peak_arcsec for each in same]
+        if family in SERIAL:
+            sizes.sort(key=abs, reverse=True)
+            near = [each for each in sizes if abs(each) > 0.4 * abs(sizes[0])]
+            if len(near) >= SAME_FAMILY + (2 if family == "motor_order" else 0):
+                return same
+    return None
+
+
+def _figures(values: FloatArray, about_zero: bool = False) -> Figures:
+    rms = float(np.sqrt(np.mean(values**2)))
+    return Figures(rms, 3.0 * (rms if about_zero else float(np.std(values))))

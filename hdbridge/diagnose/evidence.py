@@ -1,0 +1,362 @@
+"""What a diagnosis looks at: the observed error and what drove it, on at most some 50,000 points.
+
+The angle that drives the effects is the command's where the record has one, plus what the motor encoder shows
+against it as a smooth line in speed and acceleration: neither encoder counts nor a following error are
+findings.
+Longer records are averaged over runs of consecutive samples; the full rate stays at hand for what is fast
+(vibration, interpolation errors of an encoder).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from hdbridge.diagnose.noise import noise_arcsec
+from hdbridge.effects import FloatArray, Motion
+from hdbridge.errors import InputError
+from hdbridge.identify.driving import quantum_deg, steadied
+from hdbridge.record import Record
+from hdbridge.units import ARCSEC_PER_DEG
+
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+MOST_POINTS = 50_000
+LEAST_SAMPLES = 60
+SPEED_WINDOW_S = 0.03
+SETTLE_S = 0.15
+"""After a fast move the load is left this much time to come to rest."""
+FAST_KINDS = frozenset({"move", "precondition", "step"})
+"""Legs whose motion serves only to get somewhere: the load's own dynamics are not what is asked about."""
+
+
+class Leg(Protocol):
+    """A stretch of a recording; `hdbridge.recording.Segment` is one."""
+
+    @property
+    def kind(self) -> str:
+        """What the axis did."""
+        ...
+
+    @property
+    def start_s(self) -> float:
+        """Time of the first sample."""
+        ...
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last sample."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """A record as a diagnosis needs it; arrays of shape (n,)."""
+
+    motion: Motion
+    """Driving angle, time, speed, acceleration and the channels that were recorded."""
+    error_arcsec: FloatArray
+    sigma_arcsec: FloatArray
+    """White noise of each point."""
+    usable: BoolArray
+    """False in fast moves between the legs of a bench plan, and just after them."""
+    zero: IntArray
+    """Number of the absolute zero of each point."""
+    leg: IntArray
+    """Number of the leg; a new one wherever the kind of motion changes."""
+    kind: IntArray
+    """Index into `Evidence.kinds`."""
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.error_arcsec)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """A measurement, prepared."""
+
+    ratio: float
+    points: Series
+    """What is fitted."""
+    full: Series
+    """Every sample."""
+    kinds: tuple[str, ...]
+    zeros: int
+    commanded: bool
+    """Whether the record has the command."""
+    motor_count_arcsec: float
+    """One count of the motor encoder at the load; 0 where none is seen."""
+    load_count_arcsec: float
+    period_s: float
+    """Median time between samples."""
+    standstill: bool
+    reversals: int
+    """Turns of the driving angle."""
+    remarks: tuple[str, ...]
+    """What the record lacks, in words."""
+
+
+def gather(
+    record: Record,
+    ratio: float,
+    legs: Sequence[Leg] = (),
+    independent_zeros: bool = False,
+    expected: Callable[[Motion], FloatArray] | None = None,
+) -> Evidence:
+    """Prepare a record; ``expected`` is what a model predicts, taken off before the noise is looked at.
+    InputError where there is too little of it, or the ratio is not this gear's.
+    """
+    count = len(record)
+    if count < LEAST_SAMPLES:
+        raise InputError(
+            f"{record.source or 'the record'}: {count} samples are too few for a diagnosis; expected at "
+            f"least {LEAST_SAMPLES}: record more"
+        )
+    for part in record.parts() if independent_zeros else (record,):
+        part.check_ratio(ratio)
+    full, kinds, facts = _series(record, ratio, legs, independent_zeros)
+    motion = full.motion
+    turns = facts.reversals
+    remarks = []
+    if not facts.commanded:
+        remarks.append("no command (motor_target_deg): the encoder's own counts drive the hysteresis")
+    still = motion.motor_speed_deg_s == 0.0 if motion.motor_speed_deg_s is not None else np.zeros(count, bool)
+    standstill = float(np.mean(still)) > 0.02 and int(np.sum(still)) > 50
+    if not standstill:
+        remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
+    if turns < 2:
+        remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
+    known = expected(motion) if expected is not None else 0.0
+    sigma = noise_arcsec(
+        full.error_arcsec - known, still, facts.motor_count, facts.load_count, facts.commanded
+    )
+    full = replace(full, sigma_arcsec=sigma)
+    return Evidence(
+        ratio=ratio,
+        points=_averaged(full, -(-count // MOST_POINTS)),
+        full=full,
+        kinds=kinds,
+        zeros=int(full.zero[-1]) + 1,
+        commanded=facts.commanded,
+        motor_count_arcsec=facts.motor_count,
+        load_count_arcsec=facts.load_count,
+        period_s=facts.period_s,
+        standstill=standstill,
+        reversals=turns,
+        remarks=tuple(remarks),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    commanded: bool
+    motor_count: float
+    load_count: float
+    period_s: float
+    reversals: int
+
+
+def _series(
+    record: Record, ratio: float, legs: Sequence[Leg], independent: bool
+) -> tuple[Series, tuple[str, ...], _Facts]:
+    time = record.time_s
+    steps = np.diff(time)
+    period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
+    fresh = np.zeros(len(time), dtype=bool)
+    fresh[list(record.starts)] = True
+    window = max(1, round(SPEED_WINDOW_S / period)) | 1
+    count = quantum_deg(record.motor_position_deg)
+    target = record.motor_target_deg
+    if target is not None and np.ptp(target) <= 0.0 and np.ptp(record.motor_position_deg) > 4.0 * count:
+        target = None  # a command that never moves while the motor does is no command
+    edges = [*record.starts, len(time)]
+    pieces = [
+        _kinematics(
+            record.motor_position_deg[rows],
+            None if target is None else target[rows],
+            time[rows],
+            window,
+            count,
+        )
+        for rows in (slice(first, last) for first, last in pairwise(edges))
+    ]
+    driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
+    angle = driving if target is not None else record.motor_position_deg
+    error = (record.load_position_deg - angle / ratio) * ARCSEC_PER_DEG
+    zero = np.cumsum(fresh) - 1 if independent else np.zeros(len(time), dtype=np.intp)
+    kind, leg, names = _kinds(time, speed, fresh, legs)
+    usable = np.ones(len(time), dtype=bool)
+    if legs:
+        fast = np.isin(kind, [i for i, each in enumerate(names) if each in FAST_KINDS]) & (speed != 0.0)
+        reach = round(SETTLE_S / period)
+        recent = np.convolve(fast.astype(np.float64), np.ones(reach + 1))[: len(fast)] > 0.5
+        usable = ~(fast | recent)
+        if np.mean(usable) < 0.2:
+            usable[:] = True
+    motion = Motion(
+        motor_deg=driving,
+        time_s=time,
+        load_torque_nm=record.load_torque_nm,
+        motor_torque_nm=record.motor_torque_nm,
+        temperature_c=record.temperature_c,
+        motor_speed_deg_s=speed,
+        motor_acceleration_deg_s2=acceleration,
+        load_deg=driving / ratio,
+    )
+    series = Series(
+        motion, error, np.ones(len(time)), usable, zero.astype(np.intp), leg.astype(np.intp), kind
+    )
+    facts = _Facts(
+        target is not None,
+        count / ratio * ARCSEC_PER_DEG,
+        quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
+        period,
+        sum(_turns(piece[0]) for piece in pieces),
+    )
+    return series, names, facts
+
+
+def _kinematics(
+    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Driving angle, speed and acceleration of one record."""
+    if len(time) < 4 * window:
+        window = 1
+    driving = _driving(position, target, time, window, count)
+    smooth = _smooth(driving, window)
+    speed = _slope(smooth, time, window)
+    acceleration = _curvature(smooth, time, window)
+    resting = _resting(driving if target is None else target, window)
+    if count and target is None:
+        # Counts that come and go are no motion: less than half a count over eight windows is rest.
+        span = 4 * window + 1
+        resting |= np.abs(_slope(driving, time, span)) * span * np.median(np.diff(time)) < 0.5 * count
+    speed[resting] = acceleration[resting] = 0.0
+    return driving, speed, acceleration
+
+
+def _driving(
+    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
+) -> FloatArray:
+    """The command and a smooth line for the lag behind it; without a command the angle freed of chatter."""
+    if target is None:
+        return steadied(position, position, 1.6 * count)
+    lag = position - target
+    smooth = _smooth(target, window)
+    speed = _slope(target, time, window)
+    speed[_resting(target, window)] = 0.0
+    columns = np.column_stack([np.ones(len(lag)), speed, _curvature(smooth, time, window)])
+    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
+    solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
+    line = columns @ solution
+    rest = lag - line
+    if float(np.std(rest)) > 0.45 * count + 1e-6:
+        line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
+    return steadied(target + line, target + line, 0.05 * count)
+
+
+def _smooth(values: FloatArray, window: int) -> FloatArray:
+    return np.asarray(uniform_filter1d(values, window, mode="nearest"))
+
+
+def _resting(angle: FloatArray, window: int) -> BoolArray:
+    moved = np.abs(np.diff(angle, prepend=angle[:1])) > 1e-9
+    near = np.convolve(moved.astype(np.float64), np.ones(2 * window + 1), mode="same")
+    return np.asarray(near < 0.5)
+
+
+def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
+    """Central differences."""
+    half = max(1, window // 2)
+    count = len(values)
+    ahead = np.minimum(np.arange(count) + half, count - 1)
+    back = np.maximum(np.arange(count) - half, 0)
+    span = time[ahead] - time[back]
+    result = np.zeros(count)
+    np.divide(values[ahead] - values[back], span, out=result, where=span > 0.0)
+    return result
+
+
+def _curvature(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
+    """Second differences, as near to the sample as the window allows."""
+    half = max(1, window // 2)
+    count = len(values)
+    result = np.zeros(count)
+    if count <= 2 * half:
+        return result
+    middle = slice(half, count - half)
+    ahead, back = values[2 * half :] - values[middle], values[middle] - values[: count - 2 * half]
+    after, before = time[2 * half :] - time[middle], time[middle] - time[: count - 2 * half]
+    good = (after > 0.0) & (before > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bend = (ahead / after - back / before) / (0.5 * (after + before))
+    result[middle] = np.where(good, bend, 0.0)
+    return result
+
+
+def _kinds(
+    time: FloatArray, speed: FloatArray, fresh: BoolArray, legs: Sequence[Leg]
+) -> tuple[IntArray, IntArray, tuple[str, ...]]:
+    """Kind and number of the leg of each sample; without legs by whether it stands, is slow or fast."""
+    if legs:
+        names = tuple(dict.fromkeys(["other", *(each.kind for each in legs)]))
+        kind = np.zeros(len(time), dtype=np.intp)
+        leg = np.zeros(len(time), dtype=np.intp)
+        for number, each in enumerate(legs, 1):
+            rows = slice(np.searchsorted(time, each.start_s), np.searchsorted(time, each.end_s, "right"))
+            kind[rows] = names.index(each.kind)
+            leg[rows] = number
+        return kind, leg, names
+    magnitude = np.abs(speed)
+    moving = magnitude[magnitude > 0.0]
+    border = float(np.median(moving)) if len(moving) else 1.0
+    kind = np.where(magnitude == 0.0, 0, np.where(magnitude <= border, 1, 2)).astype(np.intp)
+    leg = np.cumsum(fresh) + 0
+    return kind, leg, ("standing", "slow", "fast")
+
+
+def _turns(motor_deg: FloatArray) -> int:
+    steps = np.sign(np.diff(motor_deg))
+    held = steps[steps != 0.0]
+    return int(np.count_nonzero(np.diff(held)))
+
+
+def _averaged(full: Series, run: int) -> Series:
+    """Means over runs of consecutive samples; what is not usable is left out of the means, not of the
+    path.
+    """
+    if run <= 1:
+        return full
+    first = np.arange(0, len(full), run)
+    size = np.diff(np.append(first, len(full)))
+    middle = np.minimum(first + run // 2, len(full) - 1)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(values, first) / size)
+
+    motion = full.motion
+    channels = {
+        name: None if (value := getattr(motion, name)) is None else mean(value)
+        for name in (
+            "motor_deg", "time_s", "load_torque_nm", "motor_torque_nm", "temperature_c",
+            "motor_speed_deg_s", "motor_acceleration_deg_s2", "load_deg",
+        )
+    }  # fmt: skip
+    return Series(
+        Motion(**channels),  # type: ignore[arg-type]
+        mean(full.error_arcsec),
+        np.sqrt(mean(full.sigma_arcsec**2) / size),
+        mean(full.usable.astype(np.float64)) > 0.999,
+        full.zero[middle],
+        full.leg[middle],
+        full.kind[middle],
+    )

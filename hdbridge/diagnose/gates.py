@@ -1,0 +1,124 @@
+"""Gates that a finding has to pass before it is named: block-robust evidence, and no false backlash.
+
+Evidence in chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a
+finding's
+score is summed over blocks of time, and its variance is taken from those sums: whatever is correlated
+within a block no longer counts as many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.diagnose.theory import Fitted, Workshop, orthonormal
+from hdbridge.effects import Backlash, FloatArray, LocalDefect, Wear
+from hdbridge.effects.hysteresis import branches
+
+BLOCKS_S = (1.0, 5.0)
+LEAST_BLOCKS = 30
+"""A short record is cut into so many, whatever their length."""
+ROBUST = 25.0
+"""Block-robust chi square that a finding needs, and 6 more for each further parameter."""
+SHARE_LEFT = 1e-5
+TURN_DEG = 60.0
+"""Motor angle after a reversal within which an elastic loop is felt."""
+LEAST_GAP_ARCSEC = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """How a finding fared."""
+
+    robust: float
+    """Smallest block-robust chi square over the block lengths."""
+    needed: float
+    passed: bool
+    reason: str = ""
+
+
+def robust_chi_square(
+    workshop: Workshop,
+    fitted: Fitted,
+    place: int,
+    beside: FloatArray | None = None,
+    rows: NDArray[np.bool_] | None = None,
+) -> float:
+    """Of one effect of a theory: its coefficients against zero, by the sums of their scores over blocks of
+    time.
+
+    Everything else is projected out, and the columns ``beside`` (weighted) too; only ``rows`` count, where
+    given.
+    """
+    own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
+    others = np.setdiff1d(np.arange(fitted.count()), own)
+    tangent, residual, time = fitted.tangent, fitted.residual, workshop.time_s
+    target = residual + tangent[:, own] @ fitted.theory.effects[place].coefficients()
+    rest = tangent[:, others] if beside is None else np.hstack([tangent[:, others], beside])
+    columns = tangent[:, own]
+    if rows is not None:
+        rest, columns, target, time = rest[rows], columns[rows], target[rows], time[rows]
+        if np.count_nonzero(rows) < 20:
+            return 0.0
+    basis = orthonormal(rest)
+    left = columns - basis @ (basis.T @ columns)
+    share = np.sum(left**2, axis=0) / np.maximum(np.sum(columns**2, axis=0), 1e-300)
+    left = left[:, share > SHARE_LEFT]
+    if not left.shape[1]:
+        return 0.0
+    gram = left.T @ left
+    target = target - basis @ (basis.T @ target)
+    moment = left.T @ target
+    residual = target - left @ np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
+    result = np.inf
+    scores = left * residual[:, np.newaxis]
+    for longest in BLOCKS_S:
+        number = blocks(
+            time, min(longest, workshop.evidence.period_s * len(workshop.evidence.full) / LEAST_BLOCKS)
+        )
+        sums = np.stack([np.bincount(number, each) for each in scores.T], axis=1)
+        # The noise itself is a floor: a residual may be quieter than it by luck.
+        variance = sums.T @ sums + 0.25 * gram
+        result = min(result, float(moment @ np.linalg.lstsq(variance, moment, rcond=1e-10)[0]))
+    return result
+
+
+def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
+    """Judge one finding."""
+    effect = fitted.theory.effects[place]
+    robust = robust_chi_square(workshop, fitted, place)
+    needed = ROBUST + 6.0 * (len(effect.coefficients()) - 1)
+    if robust < needed:
+        return Gate(robust, needed, passed=False, reason="not seen in enough independent stretches")
+    if isinstance(effect, Backlash | Wear):
+        free = workshop.weighted(workshop.free_loop(fitted.theory.start))
+        robust = min(robust, robust_chi_square(workshop, fitted, place, free))
+        if robust < needed:
+            return Gate(robust, needed, passed=False, reason="an elastic loop of another shape does as well")
+    if isinstance(effect, LocalDefect):
+        # Where it turns, a loop of another shape leaves bumps that lie at one load angle too.
+        far = since_reversal(workshop.motion.motor_deg)[workshop.index] > TURN_DEG
+        robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
+        if robust < needed:
+            return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
+    if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
+        return Gate(robust, needed, passed=False, reason="too small to tell from the loop's shape")
+    return Gate(robust, needed, passed=True)
+
+
+def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:
+    """A number per point that changes after every so many seconds; empty stretches are not counted."""
+    number = np.floor((time_s - time_s[0]) / length_s).astype(np.intp)
+    return np.asarray(np.unique(number, return_inverse=True)[1])
+
+
+def since_reversal(motor_deg: FloatArray) -> FloatArray:
+    """Motor angle since the axis last turned round (or began), degrees, shape (n,)."""
+    turning, _ = branches(motor_deg)
+    result = np.zeros(len(motor_deg))
+    if len(turning) > 1:
+        begin = np.repeat(motor_deg[turning[:-1]], np.diff(turning))
+        result[turning[0] + 1 :] = np.abs(motor_deg[turning[0] + 1 :] - begin)
+    return result

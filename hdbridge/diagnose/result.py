@@ -1,0 +1,196 @@
+"""What a diagnosis says, as plain values; `Diagnosis.as_dict` is the document for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hdbridge.effects import Effect, FloatArray
+from hdbridge.model import TransmissionModel
+
+SCHEMA = "hdbridge.diagnosis/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """How far measurement and simulation are apart."""
+
+    rms_arcsec: float
+    three_sigma_arcsec: float
+
+    def as_dict(self) -> dict[str, float]:
+        """For machines."""
+        return {"rms_arcsec": _round(self.rms_arcsec), "three_sigma_arcsec": _round(self.three_sigma_arcsec)}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter with its 95 % interval."""
+
+    value: float
+    unit: str
+    low: float
+    high: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {"value": self.value, "unit": self.unit, "ci95": [self.low, self.high]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """One thing that the simulation gets wrong."""
+
+    cause: str
+    """A name of the catalogue, or ``unexplained``."""
+    probability: float
+    """That this cause, or one of its aliases, is there."""
+    aliases: tuple[str, ...]
+    """Other causes that these data cannot tell from it."""
+    parameters: Mapping[str, Parameter]
+    before_arcsec: float
+    """Root mean square on held-out data without it, everything else refitted."""
+    after_arcsec: float
+    """... and with it."""
+    experiment: str
+    """What to measure next, in words."""
+    peak_arcsec: float
+    """Half the span of what it does in this record."""
+    robust: float = 0.0
+    """Block-robust chi square."""
+    lives_in: str = ""
+    """Of something unexplained: the coordinate over which it shows."""
+    note: str = ""
+    effect: Effect | None = field(default=None, repr=False)
+    """As it goes into the model."""
+    place: FloatArray | None = field(default=None, repr=False)
+    """Abscissa of a picture of it, shape (b,); in the unit of ``axis``."""
+    curve_arcsec: FloatArray | None = field(default=None, repr=False)
+    axis: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        data: dict[str, Any] = {
+            "cause": self.cause,
+            "probability": round(self.probability, 3),
+            "aliases": list(self.aliases),
+            "parameters": {name: each.as_dict() for name, each in self.parameters.items()},
+            "gain": {
+                "held_out_rms_before_arcsec": _round(self.before_arcsec),
+                "held_out_rms_after_arcsec": _round(self.after_arcsec),
+            },
+            "experiment": self.experiment,
+            "peak_arcsec": _round(self.peak_arcsec),
+        }
+        if self.lives_in:
+            data["lives_in"] = self.lives_in
+        if self.note:
+            data["note"] = self.note
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Identifiability:
+    """What this record could say about a cause."""
+
+    detectable: bool
+    detection_limit_arcsec: float | None
+    """Smallest peak that would be named; None where nothing of it can be seen."""
+    aliases: tuple[str, ...]
+    """Causes that it could not be told from in this record."""
+    share_left: float
+    """Share of its square that the baseline does not take over."""
+    reason: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        limit = self.detection_limit_arcsec
+        data: dict[str, Any] = {
+            "detectable": self.detectable,
+            "detection_limit_arcsec": None if limit is None else _round(limit),
+            "aliases": list(self.aliases),
+            "share_left": float(f"{self.share_left:.3g}"),
+        }
+        return data | ({"reason": self.reason} if self.reason else {})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traces:
+    """Arrays for pictures, one length: simulation beside measurement on the same trajectory."""
+
+    time_s: FloatArray
+    motor_deg: FloatArray
+    measured_arcsec: FloatArray
+    """About the zero of the fit."""
+    model_arcsec: FloatArray
+    """The model as it was given."""
+    extended_arcsec: FloatArray
+    direction: FloatArray
+    speed_deg_s: FloatArray
+    kind: tuple[str, ...]
+    """Names of the kinds of motion."""
+    kind_number: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """How a simulation differs from a measurement, and why."""
+
+    baseline: Figures
+    """Of the model as it was given."""
+    refitted: Figures
+    """Of the model with its own parameters fitted anew, but no new cause."""
+    extended: Figures
+    noise_floor_arcsec: float
+    findings: tuple[Finding, ...]
+    identifiability: Mapping[str, Identifiability]
+    by_kind: Mapping[str, tuple[Figures, Figures]]
+    """Per kind of motion and per direction: as given, and extended."""
+    remarks: tuple[str, ...]
+    model: TransmissionModel = field(repr=False)
+    """The extended model; the refitted one where nothing was found."""
+    traces: Traces = field(repr=False)
+    considered: tuple[str, ...] = ()
+    """What was taken into account and not named, with the reason."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The document for machines, schema hdbridge.diagnosis/1."""
+        return {
+            "schema": SCHEMA,
+            "baseline": self.baseline.as_dict(),
+            "refitted": self.refitted.as_dict(),
+            "noise_floor_arcsec": _round(self.noise_floor_arcsec),
+            "findings": [each.as_dict() for each in self.findings],
+            "identifiability": {name: each.as_dict() for name, each in self.identifiability.items()},
+            "extended": self.extended.as_dict(),
+            "by_kind": {
+                name: {"baseline": one.as_dict(), "extended": other.as_dict()}
+                for name, (one, other) in self.by_kind.items()
+            },
+            "remarks": list(self.remarks),
+            "considered": list(self.considered),
+        }
+
+    def verdict(self) -> str:
+        """One sentence."""
+        if not self.findings:
+            return (
+                "Nothing found: the simulation differs from the measurement by no more than noise and "
+                "calibration."
+            )
+        words = []
+        for each in self.findings:
+            if each.cause == "unexplained":
+                words.append(f"unexplained, lives in the {each.lives_in or 'time'}")
+            else:
+                others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
+                words.append(f"{each.cause}{others}, {each.peak_arcsec:.2g} arcsec")
+        return (
+            f"The simulation is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
+            f"extended it is off by {self.extended.rms_arcsec:.3g}."
+        )
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -1,0 +1,83 @@
+"""Screening: every candidate's score on the residual, with the whole present theory projected out.
+
+One matrix product for all columns: with Q an orthonormal basis of the theory's tangent and C a candidate's
+columns,
+C'C - (Q'C)'(Q'C) is what is left of it, and its score is the chi square that it would gain. So a grid of
+hundreds
+of shapes costs no more than one fit. A column of which less than `SHARE_LEFT` is left is not in the record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdbridge.diagnose.candidates import Candidate
+from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.effects import FloatArray, Start
+
+SHARE_LEFT = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What a candidate promises."""
+
+    candidate: Candidate
+    gain: float
+    """Chi square that it would take away, linearised."""
+    freedom: int
+    """Directions of it that the theory leaves."""
+    share: float
+    """Largest share of a column's square that the theory leaves."""
+
+
+class Screen:
+    """The weighted columns of all candidates, made once."""
+
+    def __init__(self, workshop: Workshop, candidates: Sequence[Candidate], start: Start) -> None:
+        self._candidates = tuple(candidates)
+        blocks = [workshop.weighted(workshop.columns(each.effect, start)) for each in candidates]
+        self._slices: list[slice] = []
+        at = 0
+        for block in blocks:
+            self._slices.append(slice(at, at + block.shape[1]))
+            at += block.shape[1]
+        self._matrix = np.hstack(blocks) if blocks else np.empty((len(workshop.index), 0))
+        self._grams = [block.T @ block for block in blocks]
+
+    def scores(self, fitted: Fitted) -> list[Score]:
+        """Each candidate's, in their order."""
+        basis, matrix = fitted.basis, self._matrix
+        residual = fitted.residual - basis @ (basis.T @ fitted.residual)
+        shadow = basis.T @ matrix
+        moment = matrix.T @ residual
+        return [
+            _score(candidate, gram, shadow[:, part], moment[part])
+            for candidate, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
+        ]
+
+
+def score_of(candidate: Candidate, columns: FloatArray, fitted: Fitted) -> Score:
+    """The score of one candidate from its weighted columns."""
+    basis = fitted.basis
+    residual = fitted.residual - basis @ (basis.T @ fitted.residual)
+    return _score(candidate, columns.T @ columns, basis.T @ columns, columns.T @ residual)
+
+
+def _score(candidate: Candidate, gram: FloatArray, shadow: FloatArray, moment: FloatArray) -> Score:
+    size = np.diag(gram)
+    seen = size > 0.0
+    if not np.any(seen):
+        return Score(candidate, 0.0, 0, 0.0)
+    scale = np.sqrt(size[seen])
+    left = (gram - shadow.T @ shadow)[np.ix_(seen, seen)] / np.outer(scale, scale)
+    share = float(np.max(np.diag(left)))
+    values, vectors = np.linalg.eigh(left)
+    kept = values > SHARE_LEFT
+    if not np.any(kept):
+        return Score(candidate, 0.0, 0, share)
+    inner = vectors[:, kept].T @ (moment[seen] / scale)
+    return Score(candidate, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)

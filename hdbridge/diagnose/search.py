@@ -1,0 +1,322 @@
+"""The search for causes: screen everything, fit the best few with everything, take the best, look again.
+
+Penalty per parameter and to enter as in `PENALTY`, `ENTER`; the elastic law is chosen again after each of
+the first
+picks; a swap at the end takes each finding out and puts the best one in its place, which cures most wrong
+first picks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hdbridge.diagnose import seek
+from hdbridge.diagnose.candidates import Candidate, candidates
+from hdbridge.diagnose.screen import Score, Screen, score_of
+from hdbridge.diagnose.theory import Fitted, Theory, Workshop
+from hdbridge.effects import Compliance, CountLoss, Creep, Effect, FloatArray, Start
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.effects.local_defect import LocalDefect
+from hdbridge.effects.orders import OrderSeries
+
+PENALTY = 11.5
+"""Chi square that each parameter has to earn."""
+ENTER = 30.0
+"""... and each cause."""
+MOST = 6
+BEST = 3
+FEW = 3
+"""Swaps are for so many findings at most; more of them mean something that is none of them."""
+FREE_LOOP_ARCSEC = 0.2
+"""Root mean square that a free-form loop has to take away to stand beside the law."""
+KIN = (
+    {"velocity_windup", "channel_skew", "rate_dependence"},
+    {"channel_skew", "inertial_windup"},
+    {"zero_drift", "count_loss"},
+    {"local_defect", "load_order"},
+    {"backlash", "wear"},
+)
+"""Causes of which one's wrong form leaves a rest that looks like the other."""
+SLOW = 0.8
+"""A third pick that leaves more than this of a large rest is the last."""
+REPEATED = frozenset(
+    {
+        "motor_order",
+        "load_order",
+        "flexspline_order",
+        "count_loss",
+        "creep",
+        "vibration",
+        "local_defect",
+        "subdivisional_error",
+    }
+)
+"""Causes of which there may be more than one."""
+KIN_SHARE = 0.05
+"""... so that the second needs this share of the first one's evidence."""
+FLOOR_ARCSEC = 0.5
+"""Findings whose peak is smaller than this are of no use to anybody, however certain."""
+LEFTOVER = 2e-5
+"""Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trail:
+    """Where a search ended."""
+
+    fitted: Fitted
+    base: int
+    """How many of the theory's effects are the baseline's."""
+    law_gain: float
+    """Chi square by which the chosen elastic law is better than the other; 0 without one."""
+
+
+class Search:
+    """One search on one workshop."""
+
+    def __init__(self, workshop: Workshop, base: Sequence[Effect]) -> None:
+        self.workshop = workshop
+        self.base = len(base)
+        self._base = tuple(base)
+        self._screens: dict[object, Screen] = {}
+        self._refused: set[object] = set()
+
+    def run(self) -> Trail:
+        """Find causes, best first."""
+        fitted, law_gain = self._with_best_law(self._begin())
+        for number in range(MOST):
+            found = self._best_addition(fitted)
+            if number < 3 and not self.workshop.nuisance.shape[1]:
+                loose = self._with_free_loop(fitted, found)
+                if loose is not None:
+                    fitted, law_gain = self._with_best_law(loose)
+                    continue
+            if found is None:
+                break
+            left = found.chi_square
+            slow = left > SLOW * fitted.chi_square and left > 4.0 * len(found.residual)
+            fitted = found
+            if number >= FEW - 1 and slow:
+                break  # piece by piece at something that is none of them
+            if number < 3:
+                fitted, law_gain = self._with_best_law(fitted)
+        if len(fitted.theory.effects) - self.base <= FEW:
+            fitted = self._swapped(fitted)
+        fitted = self._pruned(fitted)
+        fitted, law_gain = self._with_best_law(fitted)
+        fitted = self._pruned(fitted)
+        return Trail(fitted, self.base, law_gain)
+
+    def _begin(self) -> Fitted:
+        fits = [self.workshop.fit(Theory(self._base, start)) for start in Start]
+        return min(fits, key=lambda each: each.chi_square)
+
+    def _with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
+        """The article's law or the one with return-point memory, whichever fits better with all the rest."""
+        for place, effect in enumerate(fitted.theory.effects[: self.base]):
+            if isinstance(effect, Hysteresis | HysteresisMemory):
+                other = HysteresisMemory if isinstance(effect, Hysteresis) else Hysteresis
+                law = other(**effect.parameters())
+                rival = self.workshop.fit(fitted.theory.instead(place, law))
+                gain = rival.chi_square - fitted.chi_square
+                return (fitted, gain) if gain >= 0.0 else (rival, -gain)
+        return fitted, 0.0
+
+    def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
+        """With a hysteresis of any shape beside the law, where that does more than the best cause."""
+        self.workshop.nuisance = self.workshop.free_loop(fitted.theory.start)
+        loose = self.workshop.fit(fitted.theory)
+        added = loose.count() - fitted.count()
+        gain = fitted.chi_square - loose.chi_square - PENALTY * added - ENTER
+        rival = 0.0 if found is None else fitted.chi_square - found.chi_square
+        size = np.sqrt(max(gain, 0.0) / float(np.sum(self.workshop.weight**2)))
+        if gain > rival and size > FREE_LOOP_ARCSEC:
+            return loose
+        self.workshop.nuisance = self.workshop.nuisance[:, :0]
+        return None
+
+    # --- one more cause
+
+    def _best_addition(self, fitted: Fitted) -> Fitted | None:
+        best: tuple[float, Fitted] | None = None
+        for score in self._shortlist(fitted):
+            trial = self.workshop.fit(joined(fitted.theory, score.candidate.effect, self.base))
+            added = trial.count() - fitted.count()
+            net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
+            key = _key(score.candidate.effect)
+            if net <= 0.0 or not self._counts(trial, score.candidate):
+                self._refused.add(key)
+                continue
+            if best is None or net > best[0]:
+                best = (net, trial)
+        return None if best is None else best[1]
+
+    def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
+        """Whether what was added is large enough, physical, and really seen."""
+        place = next(
+            i for i in range(len(trial.theory.effects) - 1, -1, -1)
+            if trial.theory.effects[i].name == candidate.cause
+        )  # fmt: skip
+        effect = trial.theory.effects[place]
+        if effect.violations() and not isinstance(effect, OrderSeries):
+            return False
+        if isinstance(effect, Compliance) and not _stiffens(effect):
+            return False
+        if isinstance(effect, LocalDefect) and not seek.is_met(effect, self.workshop):
+            return False
+        return self.peak(trial, place) >= FLOOR_ARCSEC
+
+    def peak(self, fitted: Fitted, place: int) -> float:
+        """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
+        effect = fitted.theory.effects[place]
+        values = self.workshop.columns(effect, fitted.theory.start) @ effect.coefficients()
+        low, high = np.quantile(values, [0.002, 0.998])
+        return 0.5 * float(high - low)
+
+    def _shortlist(self, fitted: Fitted, most: int = BEST) -> list[Score]:
+        """The best candidate of each of the best causes."""
+        present = {each.name for each in fitted.theory.effects[self.base :]} - REPEATED
+        scores = [
+            each
+            for each in self._scores(fitted)
+            if _key(each.candidate.effect) not in self._refused and each.candidate.cause not in present
+        ]
+        net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
+        best: dict[str, Score] = {}
+        for each in scores:
+            cause = each.candidate.cause
+            if net[id(each)] > ENTER and (cause not in best or net[id(each)] > net[id(best[cause])]):
+                best[cause] = each
+        return sorted(best.values(), key=lambda each: -net[id(each)])[:most]
+
+    def _scores(self, fitted: Fitted) -> list[Score]:
+        screen = self._screen(fitted)
+        scores = screen.scores(fitted)
+        residual, load_deg = seek.fast_residual(self.workshop, fitted)
+        seek.with_load_angle(self.workshop, load_deg)
+        for candidate in self._sought(fitted, residual, load_deg):
+            columns = self.workshop.weighted(self.workshop.columns(candidate.effect, fitted.theory.start))
+            scores.append(score_of(candidate, columns, fitted))
+        return scores
+
+    def _sought(self, fitted: Fitted, residual: FloatArray, load_deg: FloatArray) -> list[Candidate]:
+        found = [seek.count_loss(self.workshop, fitted), seek.local_defect(self.workshop, fitted)]
+        return [
+            *(each for each in found if each is not None),
+            *seek.vibrations(self.workshop, residual),
+            *seek.interpolation_errors(self.workshop, residual, load_deg),
+        ]
+
+    def _screen(self, fitted: Fitted) -> Screen:
+        base = fitted.theory.effects[: self.base]
+        key = (fitted.theory.start, tuple(type(each) for each in base))
+        if key not in self._screens:
+            offered = candidates(self.workshop.evidence, base)
+            self._screens.clear()
+            self._screens[key] = Screen(self.workshop, offered, fitted.theory.start)
+        return self._screens[key]
+
+    def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
+        """Other causes in the place of one that was taken out, fitted; best first."""
+        self._refused.clear()
+        result = []
+        for score in self._shortlist(without, BEST + 1):
+            if score.candidate.cause != cause:
+                trial = self.workshop.fit(joined(without.theory, score.candidate.effect, self.base))
+                if self._counts(trial, score.candidate):
+                    result.append((score.candidate.cause, trial))
+        return sorted(result, key=lambda each: each[1].chi_square)
+
+    # --- second thoughts
+
+    def _swapped(self, fitted: Fitted) -> Fitted:
+        """Each finding taken out, the law chosen anew, the best one put in its place."""
+        for _ in range(2):
+            changed = False
+            for place in range(self.base, len(fitted.theory.effects)):
+                self._refused.clear()
+                without, _ = self._with_best_law(self.workshop.fit(fitted.theory.without(place)))
+                other = self._best_addition(without)
+                if other is None:
+                    continue
+                before = fitted.chi_square + PENALTY * fitted.count()
+                after = other.chi_square + PENALTY * other.count()
+                if after < before - 5.0:
+                    fitted, changed = other, True
+                    break
+            if not changed:
+                break
+        self._refused.clear()
+        return fitted
+
+    def _pruned(self, fitted: Fitted) -> Fitted:
+        """Without what no longer earns its keep beside the others."""
+        while len(fitted.theory.effects) > self.base:
+            gains = {}
+            for place in range(self.base, len(fitted.theory.effects)):
+                without = self.workshop.fit(fitted.theory.without(place))
+                gains[place] = (without.chi_square - fitted.chi_square, without)
+            largest = max(gain for gain, _ in gains.values())
+            place = min(gains, key=lambda each: gains[each][0] - self._toll(fitted, each))
+            gain, without = gains[place]
+            small = self.peak(fitted, place) < FLOOR_ARCSEC
+            name = fitted.theory.effects[place].name
+            kin = [
+                gains[other][0]
+                for other in gains
+                if any(
+                    {name, fitted.theory.effects[other].name} == each
+                    or (other != place and {name, fitted.theory.effects[other].name} <= each)
+                    for each in KIN
+                )
+            ]
+            share = KIN_SHARE * max(kin, default=0.0)
+            if gain > max(self._toll(fitted, place), LEFTOVER * largest, share) and not small:
+                break
+            fitted = without
+        return fitted
+
+    def _toll(self, fitted: Fitted, place: int) -> float:
+        return PENALTY * len(fitted.places(place)) + ENTER
+
+
+def joined(theory: Theory, effect: Effect, base: int) -> Theory:
+    """A theory with one more effect; orders and steps go into the finding of the same name."""
+    for place in range(base, len(theory.effects)):
+        present = theory.effects[place]
+        if (
+            isinstance(present, OrderSeries)
+            and isinstance(effect, OrderSeries)
+            and present.name == effect.name
+        ):
+            new = [each for each in effect.orders if each.order not in {o.order for o in present.orders}]
+            orders = tuple(sorted((*present.orders, *new), key=lambda each: each.order))
+            return theory.instead(place, present.model_copy(update={"orders": orders}))
+        if isinstance(present, CountLoss) and isinstance(effect, CountLoss):
+            steps = tuple(sorted((*present.steps, *effect.steps), key=lambda each: each.time_s))
+            return theory.instead(place, present.model_copy(update={"steps": steps}))
+        if isinstance(present, Creep) and isinstance(effect, Creep):
+            return theory.instead(
+                place, present.model_copy(update={"parts": (*present.parts, *effect.parts)})
+            )
+    return theory.plus(effect)
+
+
+def _stiffens(effect: Compliance) -> bool:
+    """A gear's spring stiffens with torque; a zone that the record does not reach has no compliance."""
+    zones = [each for each in effect.coefficients().tolist() if each != 0.0]
+    return all(later <= 1.05 * earlier for earlier, later in pairwise(zones))
+
+
+def _key(effect: Effect) -> object:
+    """What tells one candidate from another: its kind and, for orders, the orders."""
+    if isinstance(effect, OrderSeries):
+        return (effect.name, tuple(each.order for each in effect.orders))
+    if isinstance(effect, Compliance):
+        return (effect.name, effect.torque1_nm)
+    return effect.name

@@ -1,0 +1,265 @@
+"""A theory of a measurement: effects and zeros, fitted together by Gauss-Newton on everything that is free.
+
+The baseline is refitted with every candidate, so what the baseline can take over is never called a finding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hdbridge.diagnose.evidence import Evidence, IntArray, Series
+from hdbridge.effects import Effect, FloatArray, Motion, Start, refreshed
+from hdbridge.effects.orders import OrderSeries
+from hdbridge.effects.play import stop
+
+ITERATIONS = 8
+CONVERGED = 0.5
+"""A step that gains less than this in chi square is the last."""
+FIXED_SHAPES = frozenset({"time_s", "frequency_hz", "torque1_nm", "torque2_nm"})
+"""Shapes that a local step cannot improve: found by search over all their values."""
+STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Widths of the stop operators of the free-form hysteresis."""
+_EPS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Theory:
+    """Effects (the baseline's first) and the elastic state at the first sample."""
+
+    effects: tuple[Effect, ...]
+    start: Start = Start.VIRGIN
+
+    def plus(self, effect: Effect) -> Theory:
+        """With one more effect."""
+        return replace(self, effects=(*self.effects, effect))
+
+    def without(self, place: int) -> Theory:
+        """With one effect less."""
+        return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
+
+    def instead(self, place: int, effect: Effect) -> Theory:
+        """With one effect exchanged."""
+        return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """What a column of the tangent matrix stands for."""
+
+    effect: int
+    """Place of the effect in the theory; -1 for a zero."""
+    name: str
+    shape: bool = False
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """A theory with its best parameters."""
+
+    theory: Theory
+    zeros: FloatArray
+    residual: FloatArray
+    """Weighted residual of the usable points, shape (m,)."""
+    tangent: FloatArray
+    """Weighted derivatives, shape (m, p)."""
+    parameters: tuple[Parameter, ...]
+    chi_square: float
+    basis: FloatArray = field(repr=False, default_factory=lambda: np.empty((0, 0)))
+    """Orthonormal basis of the tangent's columns."""
+
+    def count(self) -> int:
+        """Free parameters."""
+        return len(self.parameters)
+
+    def places(self, effect: int) -> IntArray:
+        """Columns of one effect."""
+        return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
+
+
+class Workshop:
+    """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        points = evidence.points
+        self.evidence = evidence
+        self.index: IntArray = np.flatnonzero(points.usable)
+        self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
+        self.observed: FloatArray = points.error_arcsec[self.index]
+        self.time_s: FloatArray = _time(points)[self.index]
+        self.zero: IntArray = points.zero[self.index]
+        self._memo: dict[object, FloatArray] = {}
+        # About the level that they have in common: an encoder's zero is no part of the physics.
+        self.level = float(np.median(self.observed))
+        self.nuisance: FloatArray = np.empty((len(self.index), 0))
+        """Columns that every fit may use and that mean nothing, shape (m, k)."""
+
+    @property
+    def motion(self) -> Motion:
+        """What drove the axis, point by point (all points, the elastic state passes through each)."""
+        return self.evidence.points.motion
+
+    def columns(self, effect: Effect, start: Start) -> FloatArray:
+        """Regressors of an effect at the usable points, arcsec, shape (m, p)."""
+        if isinstance(effect, OrderSeries):
+            key = (effect.turns_per_motor_turn(), tuple(each.order for each in effect.orders))
+            if key not in self._memo:
+                self._memo[key] = effect.columns(self.motion, start)[self.index]
+            return self._memo[key]
+        return effect.columns(self.motion, start)[self.index]
+
+    def weighted(self, columns: FloatArray) -> FloatArray:
+        """Columns in units of the noise."""
+        return np.asarray(columns * self.weight[:, np.newaxis])
+
+    def zero_columns(self) -> FloatArray:
+        """One column per absolute zero, shape (m, zeros)."""
+        own: FloatArray = (self.zero[:, np.newaxis] == np.arange(self.evidence.zeros)).astype(np.float64)
+        return own
+
+    def free_loop(self, start: Start) -> FloatArray:
+        """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
+        memory.
+        """
+        angle = self.motion.motor_deg
+        return np.stack([stop(angle, each, start)[self.index] for each in STOPS_DEG], axis=1)
+
+    def fit(self, theory: Theory, iterations: int = ITERATIONS) -> Fitted:
+        """Gauss-Newton from where the theory stands; never worse than where it began."""
+        effects = refreshed(theory.effects)
+        best: Fitted | None = None
+        step = 1.0
+        direction: tuple[tuple[Effect, ...], FloatArray, tuple[Parameter, ...]] | None = None
+        for _ in range(iterations):
+            here = self._at(replace(theory, effects=effects))
+            if best is None or here.chi_square < best.chi_square:
+                gain = math.inf if best is None else best.chi_square - here.chi_square
+                best = here
+                step = 1.0
+                moves = _solve(here.tangent, here.residual)
+                direction = (here.theory.effects, moves, here.parameters)
+                if gain < CONVERGED:
+                    break
+            else:
+                step *= 0.35
+                if step < 0.02:
+                    break
+            assert direction is not None
+            effects = _moved(*direction, step)
+        assert best is not None
+        return replace(best, basis=orthonormal(best.tangent))
+
+    def _at(self, theory: Theory) -> Fitted:
+        """Residual and tangents at these shapes, with everything linear solved for."""
+        blocks = [self.zero_columns(), self.nuisance]
+        parameters = [Parameter(-1, f"zero{i}") for i in range(self.evidence.zeros)]
+        parameters += [Parameter(-1, f"nuisance{i}") for i in range(self.nuisance.shape[1])]
+        values = []
+        for place, effect in enumerate(theory.effects):
+            columns = self.columns(effect, theory.start)
+            blocks.append(columns)
+            values.append(effect.coefficients())
+            parameters += [Parameter(place, str(i)) for i in range(columns.shape[1])]
+        linear = self.weighted(np.hstack(blocks))
+        observed = (self.observed - self.level) * self.weight
+        # Linear in the coefficients: solve for them outright; what is carried elsewhere follows in
+        # `refreshed`.
+        solution = _solve(linear, observed)
+        effects: list[Effect] = []
+        at = self.evidence.zeros + self.nuisance.shape[1]
+        for effect in theory.effects:
+            size = len(effect.coefficients())
+            effects.append(effect.fitted(solution[at : at + size]))
+            at += size
+        residual = observed - linear @ solution
+        shapes: list[FloatArray] = []
+        for place, effect in enumerate(effects):
+            for each in effect.shape:
+                if each.name in FIXED_SHAPES:
+                    continue
+                here = shape_value(effect, each.name)
+                delta = 1e-2 * here if each.logarithmic else 2e-3 * (each.upper - each.lower)
+                low, high = max(here - delta, each.lower), min(here + delta, each.upper)
+                if high <= low:
+                    continue
+                span = math.log(high / low) if each.logarithmic else high - low
+                coefficients = effect.coefficients()
+                either = [
+                    self.columns(effect.fitted(coefficients, {each.name: value}), theory.start) @ coefficients
+                    for value in (low, high)
+                ]
+                shapes.append(self.weight * (either[1] - either[0]) / span)
+                parameters.append(Parameter(place, each.name, shape=True, logarithmic=each.logarithmic))
+        tangent = np.column_stack([linear, *shapes]) if shapes else linear
+        return Fitted(
+            replace(theory, effects=tuple(effects)),
+            solution[: self.evidence.zeros],
+            residual,
+            tangent,
+            tuple(parameters),
+            float(residual @ residual),
+        )
+
+    def predicted(self, fitted: Fitted, series: Series | None = None) -> FloatArray:
+        """What the theory says for each point of a series, zeros included, arcsec, shape (n,)."""
+        series = series or self.evidence.points
+        total = fitted.zeros[series.zero] + self.level
+        for effect in fitted.theory.effects:
+            total = total + effect.predict(series.motion, fitted.theory.start)
+        return np.asarray(total)
+
+
+def shape_value(effect: Effect, name: str) -> float:
+    """A shape parameter; where it is not a field, that of the first of its parts."""
+    holder = effect if hasattr(effect, name) else effect.parts[0]  # type: ignore[attr-defined]
+    return float(getattr(holder, name))
+
+
+def _time(series: Series) -> FloatArray:
+    assert series.motion.time_s is not None
+    return series.motion.time_s
+
+
+def _solve(columns: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares through the Gram matrix; directions that the data do not see stay at zero."""
+    gram = columns.T @ columns
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > _EPS * max(float(values[-1]), 1e-300)
+    moment = (columns.T @ right) / scale
+    inner = vectors[:, kept] @ ((vectors[:, kept].T @ moment) / values[kept])
+    return np.where(np.diag(gram) > 0.0, inner / scale, 0.0)
+
+
+def orthonormal(columns: FloatArray) -> FloatArray:
+    """An orthonormal basis of what the columns span, shape (m, r)."""
+    gram = columns.T @ columns
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > _EPS * max(float(values[-1]), 1e-300)
+    return np.asarray(columns @ (vectors[:, kept] / scale[:, np.newaxis] / np.sqrt(values[kept])))
+
+
+def _moved(
+    effects: tuple[Effect, ...], moves: FloatArray, parameters: Sequence[Parameter], step: float
+) -> tuple[Effect, ...]:
+    """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""
+    result = list(effects)
+    for move, parameter in zip(moves, parameters, strict=True):
+        if not parameter.shape:
+            continue
+        effect = result[parameter.effect]
+        shape = next(each for each in effect.shape if each.name == parameter.name)
+        here = shape_value(effect, shape.name)
+        if shape.logarithmic:
+            there = here * math.exp(min(max(step * float(move), -0.7), 0.7))
+        else:
+            reach = 0.15 * (shape.upper - shape.lower)
+            there = here + min(max(step * float(move), -reach), reach)
+        there = min(max(there, shape.lower), shape.upper)
+        result[parameter.effect] = effect.fitted(effect.coefficients(), {shape.name: there})
+    return refreshed(tuple(result))

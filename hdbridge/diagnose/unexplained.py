@@ -1,0 +1,183 @@
+"""What is left when no cause fits: how much, and where it lives.
+
+Non-parametric rivals that know nothing of causes (bins over load angle and direction, motor angle and
+direction, time,
+way since the last reversal, speed, torque, temperature) are fitted on every other stretch of time and
+judged on the
+rest. Where the best of them takes a good deal away, there something is that the catalogue does not have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from hdbridge.diagnose.gates import since_reversal
+from hdbridge.diagnose.holdout import stretches
+from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.effects import FloatArray
+from hdbridge.effects.kinematics import direction_of
+from hdbridge.units import DEG_PER_TURN
+
+LEFT_ARCSEC = 0.5
+"""More than this left in means over `BLOCK_S` is too much."""
+BLOCK_S = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rest:
+    """What is left."""
+
+    arcsec: float
+    """Root mean square beyond the noise, over short blocks."""
+    standing_arcsec: float
+    """The same at rest only; 0 where it never rests."""
+    lives_in: str
+    """Where most of it is; empty where nothing in particular."""
+    explained_arcsec: float
+    """Root mean square of what the best rival takes away on data it has not seen."""
+    place: FloatArray
+    """Abscissa of the picture, in the unit that `lives_in` says."""
+    curve_arcsec: FloatArray
+    shares: dict[str, float]
+    """Of each rival: held-out share of the rest's variance."""
+
+
+def rest(workshop: Workshop, fitted: Fitted) -> Rest:
+    """Look at a residual."""
+    residual = fitted.residual / workshop.weight
+    arcsec = beyond_noise(workshop, residual)
+    best = ("", 0.0, np.empty(0), np.empty(0))
+    shares: dict[str, float] = {}
+    odd = stretches(workshop) % 2 == 1
+    smooth = _smoothed(workshop, residual)
+    variance = float(np.mean(smooth**2)) + 1e-12
+    for name, number, places in _coordinates(workshop):
+        gain, curve = _gain(smooth, number, odd, len(places))
+        shares[name] = max(gain / variance, 0.0)
+        if gain > best[1]:
+            best = (name, gain, places, curve)
+    return Rest(
+        arcsec,
+        _standing(workshop, residual),
+        best[0] or "time",
+        float(np.sqrt(best[1])),
+        best[2],
+        best[3],
+        shares,
+    )
+
+
+def beyond_noise(workshop: Workshop, residual: FloatArray) -> float:
+    """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
+    number = np.floor((workshop.time_s - workshop.time_s[0]) / BLOCK_S).astype(np.intp)
+    number = np.unique(number, return_inverse=True)[1]
+    count = np.bincount(number)
+    mean = np.bincount(number, residual) / count
+    white = np.bincount(number, 1.0 / workshop.weight**2) / count**2
+    return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
+
+
+def _standing(workshop: Workshop, residual: FloatArray) -> float:
+    """What moves from one short block to the next while the axis rests: no physics, but noise that
+    wanders.
+    """
+    speed = workshop.motion.motor_speed_deg_s
+    if speed is None:
+        return 0.0
+    still = (speed == 0.0)[workshop.index]
+    if np.count_nonzero(still) < 50:
+        return 0.0
+    number = np.floor((workshop.time_s[still] - workshop.time_s[0]) / BLOCK_S).astype(np.intp)
+    names, number = np.unique(number, return_inverse=True)
+    mean = np.bincount(number, residual[still]) / np.bincount(number)
+    step = np.diff(mean)[np.diff(names) == 1]
+    return float(np.median(np.abs(step))) * 1.05 if len(step) else 0.0
+
+
+def _smoothed(workshop: Workshop, residual: FloatArray) -> FloatArray:
+    period = workshop.evidence.period_s * len(workshop.evidence.full) / len(workshop.evidence.points)
+    return np.asarray(uniform_filter1d(residual, max(1, round(0.1 / period))))
+
+
+def _gain(
+    values: FloatArray, number: NDArray[np.intp], odd: NDArray[np.bool_], bins: int
+) -> tuple[float, FloatArray]:
+    """Mean square that bin means from one half take away in the other, both ways round; and the bin means."""
+    before = after = 0.0
+    for train in (odd, ~odd):
+        count = np.bincount(number[train], minlength=bins)
+        mean = np.bincount(number[train], values[train], bins) / (count + 2.0)
+        test = values[~train]
+        before += float(np.sum(test**2))
+        after += float(np.sum((test - mean[number[~train]]) ** 2))
+    count = np.bincount(number, minlength=bins)
+    curve = np.bincount(number, values, bins) / np.maximum(count, 1)
+    return (before - after) / len(values), np.asarray(curve)
+
+
+def _coordinates(workshop: Workshop) -> Iterator[tuple[str, NDArray[np.intp], FloatArray]]:
+    """Name, bin of each point, and the middle of each bin."""
+    motion, index = workshop.motion, workshop.index
+    motor = motion.motor_deg[index]
+    load = motor / workshop.evidence.ratio
+    direction = direction_of(motion)[index]
+    back = (direction < 0).astype(np.intp)
+    for name, angle, bins in (
+        ("motor angle", np.mod(motor, DEG_PER_TURN), 72),
+        ("load angle", np.mod(load, DEG_PER_TURN), 360),
+    ):
+        number = np.minimum((angle * (bins / DEG_PER_TURN)).astype(np.intp), bins - 1)
+        middle = np.asarray((np.arange(bins) + 0.5) * (DEG_PER_TURN / bins), dtype=np.float64)
+        yield name, number, middle
+        yield f"{name} and direction", number + bins * back, np.tile(middle, 2)
+    if float(np.ptp(load)) > 0.0:
+        yield "position", *_ranged(load, 400)
+    yield "time", *_ranged(workshop.time_s, 200, alternate=True)
+    since = since_reversal(motion.motor_deg)[index]
+    number, middle = _ranged(np.log10(since + 0.05), 40)
+    angles = np.asarray(np.power(10.0, middle) - 0.05, dtype=np.float64)
+    yield "motor angle since the last reversal", number + 40 * back, np.tile(angles, 2)
+    speed = motion.motor_speed_deg_s
+    if speed is not None:
+        yield ("speed", *_quantiles(speed[index], 40))
+        yield "time since the last stop or start", *_ranged(np.log10(_since_change(workshop) + 0.02), 40)
+    if motion.motor_acceleration_deg_s2 is not None:
+        yield "acceleration", *_quantiles(motion.motor_acceleration_deg_s2[index], 40)
+    for name, values in (
+        ("load torque", motion.load_torque_nm),
+        ("motor torque", motion.motor_torque_nm),
+        ("temperature", motion.temperature_c),
+    ):
+        if values is not None and float(np.ptp(values)) > 0.0:
+            yield name, *_quantiles(values[index], 40)
+
+
+def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[NDArray[np.intp], FloatArray]:
+    low, span = float(np.min(values)), max(float(np.ptp(values)), 1e-12)
+    number = np.minimum(((values - low) / span * bins).astype(np.intp), bins - 1)
+    if alternate:  # bins of time that are wider than the stretches that are held out
+        number = number // 8
+        bins = -(-bins // 8)
+    return number, np.asarray(low + (np.arange(bins) + 0.5) * (span / bins), dtype=np.float64)
+
+
+def _quantiles(values: FloatArray, bins: int) -> tuple[NDArray[np.intp], FloatArray]:
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    if len(edges) < 2:
+        return np.zeros(len(values), dtype=np.intp), np.array([float(values[0])])
+    number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, len(edges) - 2)
+    return number.astype(np.intp), np.asarray(0.5 * (edges[1:] + edges[:-1]))
+
+
+def _since_change(workshop: Workshop) -> FloatArray:
+    motion = workshop.motion
+    assert motion.motor_speed_deg_s is not None
+    assert motion.time_s is not None
+    change = np.flatnonzero(np.diff(np.sign(motion.motor_speed_deg_s), prepend=np.nan) != 0.0)
+    last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
+    return np.asarray((motion.time_s - motion.time_s[last])[workshop.index])

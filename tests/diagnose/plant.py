@@ -1,0 +1,363 @@
+"""Records from formulas, for the tests of the diagnosis: it shares no code with the effects that are tested.
+
+An axis of ratio 50 goes through a bench plan (standstill, sweeps at two speeds, sines, nested reversals,
+steps, holds,
+sweeps again) at a fine time step; the elastic law is one of several, with a state that is carried through
+everything; effects are put in by formula; encoders are quantised; slow noise is added.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+ORDERS = (
+    (1, 4.9, -126.8),
+    (2, 9.33, -132.1),
+    (3, 2.09, -96.2),
+    (4, 12.21, 105.7),
+    (6, 3.18, -127.0),
+    (8, 1.87, 124.3),
+)
+RATIO = 50.0
+
+
+@dataclass
+class Plan:
+    """How long everything takes; ``scale`` shortens it."""
+
+    rate_hz: float = 25.0
+    scale: float = 1.0
+    load_turns: float = 1.3
+    steps: int = 120
+    step_deg: float = 43.56
+
+
+def path(plan: Plan, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, motor angle at ten times the sampling rate, and the number of the leg at each."""
+    dt = 1.0 / (plan.rate_hz * 10)
+    pieces: list[np.ndarray] = []
+    legs: list[np.ndarray] = []
+    here = 0.0
+    number = 0
+
+    def hold(seconds: float) -> None:
+        pieces.append(np.full(max(1, round(seconds / dt)), here))
+
+    def move(goal: float, speed: float) -> None:
+        """A smooth move: the speed rises and falls in a raised cosine."""
+        nonlocal here
+        way = abs(goal - here)
+        if way < 1e-9:
+            return
+        ramp = min(0.15, way / speed)
+        flat = way / speed - ramp
+        t = np.arange(dt, flat + 2 * ramp + dt, dt)
+        v = np.clip(np.minimum(t, flat + 2 * ramp - t) / ramp, 0, 1)
+        v = 0.5 - 0.5 * np.cos(np.pi * v)
+        s = np.cumsum(v)
+        pieces.append(here + (goal - here) * s / s[-1])
+        here = goal
+
+    def sine(amplitude: float, frequency: float, periods: float) -> None:
+        nonlocal here
+        t = np.arange(dt, periods / frequency, dt)
+        centre = here - amplitude
+        pieces.append(centre + amplitude * np.cos(2 * np.pi * frequency * t))
+        here = float(pieces[-1][-1])
+
+    def leg() -> None:
+        nonlocal number
+        done = sum(len(each) for each in legs)
+        now = sum(len(each) for each in pieces)
+        legs.append(np.full(now - done, number))
+        number += 1
+
+    way = plan.load_turns * 360 * RATIO
+    slow, quick = 203.0 * (1 + 0.05 * rng.random()), 617.0 * (1 + 0.05 * rng.random())
+    move(120.0, 60.0)
+    leg()
+    hold(30 * plan.scale)
+    leg()
+    for _ in range(2):
+        move(way, quick)
+        hold(1)
+        move(0.0, quick)
+        hold(1)
+    leg()
+    move(way, slow)
+    hold(1)
+    move(0.0, slow)
+    leg()
+    for amplitude in (180.0, 45.0, 5.0):
+        move(here + amplitude + 60, 40)
+        sine(amplitude, 0.05, 4)
+        leg()
+    for depth in (1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0):
+        move(here - 60, 40)
+        move(here + 60, 20)
+        top = here
+        for place in (-depth, -depth / 2, -1.5 * depth, 0):
+            move(top + place, 10)
+    leg()
+    move(0.0, quick)
+    move(-60.0, 40)
+    move(0.0, 40)
+    for sign in (1, -1):
+        for _ in range(plan.steps):
+            move(here + sign * plan.step_deg, 300)
+            hold(0.6)
+    leg()
+    for _ in range(3):
+        move(here + 400, 300)
+        hold(25 * plan.scale)
+        move(here - 400, 300)
+        hold(25 * plan.scale)
+    leg()
+    for speed in (slow, quick):
+        move(way, speed)
+        hold(1)
+        move(0.0, speed)
+    hold(5)
+    leg()
+    motor = np.concatenate(pieces)
+    return np.arange(len(motor)) * dt, motor, np.concatenate(legs)
+
+
+def rise(xi: np.ndarray | float, n: float) -> Any:
+    xi = np.clip(xi, 0, 1)
+    if abs(n - 2) < 1e-6:
+        return np.where(xi > 0, xi * (1 - np.log(np.maximum(xi, 1e-300))), 0.0)
+    return (xi ** (n - 1) - (n - 1) * xi) / (2 - n)
+
+
+def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> np.ndarray:
+    """The elastic part, from a saturated start forwards; carried through the whole motion."""
+    step = np.sign(np.diff(motor, prepend=motor[0] - 1e-9))
+    if law == "plain":
+        out = np.empty(len(motor))
+        held = step.copy()
+        for i in range(1, len(held)):
+            if held[i] == 0:
+                held[i] = held[i - 1]
+        turns = np.flatnonzero(np.diff(held)) + 1
+        edges = [0, *turns.tolist(), len(motor)]
+        value = offset
+        for a, b in pairwise(edges):
+            sign = held[a]
+            origin = motor[a - 1] if a else motor[0]
+            if a == 0:
+                out[a:b] = offset
+                continue
+            branch = value + sign * 2 * offset * rise(np.abs(motor[a:b] - origin) / width, n)
+            out[a:b] = sign * np.minimum(sign * branch, offset)
+            value = float(out[b - 1])
+        return out
+    if law == "memory":  # Masing's rule by many stop operators whose thresholds follow the branch
+        grid = width * np.linspace(0, 1, 161)[1:] ** 2 / 1.0
+        virgin = rise(grid / width, n)
+        slope = np.diff(np.concatenate([[0], virgin])) / np.diff(np.concatenate([[0], grid]))
+        slope = np.append(slope, 0.0)
+        weight = (slope[:-1] - slope[1:]) * grid
+        total = np.zeros(len(motor))
+        for w, g in zip(weight, grid, strict=True):
+            total += w * stop(motor, g)
+        return offset * total / weight.sum()
+    if law == "bouc_wen":
+        z = 1.0
+        out = np.empty(len(motor))
+        scale = width / 4.0
+        d = np.diff(motor, prepend=motor[0])
+        for i in range(len(motor)):
+            dx = d[i] / scale
+            if dx:
+                s = 1 if dx > 0 else -1
+                z += dx * (1 - abs(z) ** n * (0.6 * s * (1 if z > 0 else -1) + 0.4))
+                z = min(max(z, -1.0), 1.0)
+            out[i] = z
+        return offset * out
+    if law == "dahl":
+        z = 1.0
+        out = np.empty(len(motor))
+        scale = width / 5.0
+        d = np.diff(motor, prepend=motor[0])
+        for i in range(len(motor)):
+            if d[i]:
+                s = 1.0 if d[i] > 0 else -1.0
+                z = s + (z - s) * math.exp(-abs(d[i]) / scale)
+            out[i] = z
+        return offset * out
+    raise ValueError(law)
+
+
+def stop(motor: np.ndarray, width: float) -> np.ndarray:
+    """Stop operator of full crossing ``width``, saturated forwards at the start."""
+    turning = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(motor))) != 0) + 1).tolist(), len(motor) - 1]
+    value, out = 1.0, np.empty(len(motor))
+    out[0] = 1.0
+    for a, b in pairwise(turning):
+        out[a + 1 : b + 1] = np.clip(value + 2 * (motor[a + 1 : b + 1] - motor[a]) / width, -1, 1)
+        value = float(out[b])
+    return out
+
+
+@dataclass
+class Truth:
+    """What the axis is like."""
+
+    law: str = "plain"
+    offset: float = 40.0
+    width: float = 20.0
+    n: float = 1.6
+    orders: tuple[tuple[int, float, float], ...] = ORDERS
+    effects: dict[str, dict[str, Any]] = field(default_factory=dict)
+    noise: float = 0.3
+    slow_noise: float = 0.15
+    torque_nm: float = 0.0
+    temperature_rise_k: float = 0.0
+
+
+def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[str, np.ndarray]:
+    """Columns as in a CSV file."""
+    rng = np.random.default_rng(seed)
+    t, motor, _ = path(plan, rng)
+    dt = t[1] - t[0]
+    v = np.gradient(motor, dt)
+    v[np.abs(v) < 1e-9] = 0.0
+    a = np.gradient(v, dt)
+    d = np.sign(v)
+    for i in np.flatnonzero(d == 0):
+        d[i] = d[i - 1] if i else 1.0
+    load = motor / RATIO
+    elastic = loop(motor, truth.law, truth.offset, truth.width, truth.n)
+    e = truth.effects
+    torque = truth.torque_nm * np.sin(np.deg2rad(load + 33.0)) if truth.torque_nm else np.zeros(len(t))
+    shift = e.get("direction_phase", {}).get("shift", 0.0)
+    growth = 1 + e.get("torque_modulation", {}).get("growth", 0.0) * np.abs(torque)
+    warm = truth.temperature_rise_k * (1 - np.exp(-t / (0.35 * t[-1])))
+    amplitude = e.get("amplitude_drift", {})
+    ripple = sum(A * np.cos(np.deg2rad(k * (motor + d * shift) + p)) for k, A, p in truth.orders)
+    te = ripple * growth * (1 + amplitude.get("ripple", 0.0) * warm)
+    rate = e.get("rate_dependence", {})
+    factor = 1 + rate.get("growth", 0.0) * np.log10(1 + np.abs(v) / rate.get("reference", 20.0))
+    te = te + elastic * factor * (1 + amplitude.get("friction", 0.0) * warm)
+    for name, angle in (("motor_order", motor), ("load_order", load), ("flexspline_order", motor + load)):
+        for k, A, p in e.get(name, {}).get("orders", ()):
+            te = te + A * np.cos(np.deg2rad(k * angle + p))
+    for k, A, p in e.get("motor_encoder_eccentricity", {}).get("orders", ()):
+        te = te + A * np.cos(np.deg2rad(k * motor + p))
+    if "compliance" in e:
+        c = e["compliance"]
+        tau = np.abs(torque)
+        te = te + np.sign(torque) * (
+            c["c1"] * np.minimum(tau, c["t1"]) + c["c2"] * np.maximum(tau - c["t1"], 0)
+        )
+    if "inertial_windup" in e:
+        te = te - e["inertial_windup"]["s2"] * a / RATIO * 3600
+    if "velocity_windup" in e:
+        w = e["velocity_windup"]
+        te = te - d * (v != 0) * w["coulomb"] - w["viscous"] * v / (1 + (np.abs(v) / w["shear"]) ** 0.8)
+    if "backlash" in e:  # play operator on the load side: the load lags by half the gap
+        gap = e["backlash"]["gap"]
+        te = te - 0.5 * gap * stop(motor, gap * RATIO / 3600)
+    if "subdivisional_error" in e:
+        s = e["subdivisional_error"]
+        actual = load + te / 3600
+        for k, A, p in s["orders"]:
+            te = te + A * np.cos(np.deg2rad(k * s["lines"] * actual + p))
+    if "zero_drift" in e:
+        te = te + e["zero_drift"]["size"] * (1 - np.exp(-t / (e["zero_drift"]["tau"] * t[-1])))
+    if "wear" in e:
+        run = np.cumsum(np.abs(np.diff(motor, prepend=motor[0])))
+        te = te - 0.5 * e["wear"]["growth"] * run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
+    if "creep" in e:
+        c = e["creep"]
+        y, out = 0.0, np.empty(len(t))
+        going = np.sign(v)
+        up, down = math.exp(-dt / (c.get("build", 0.1) * c["tau"])), math.exp(-dt / c["tau"])
+        for i in range(len(t)):
+            y = going[i] + (y - going[i]) * up if going[i] else y * down
+            out[i] = y
+        te = te + c["size"] * out
+    if "ratio_error" in e:
+        te = te + e["ratio_error"]["ramp"] * motor / 360
+    if "count_loss" in e:
+        te = te + e["count_loss"]["size"] * (t > e["count_loss"]["at"] * t[-1])
+    if "vibration" in e:
+        te = te + e["vibration"]["size"] * np.cos(2 * np.pi * e["vibration"]["hz"] * t + 1.0)
+    if "local_defect" in e:
+        x = np.mod(load - e["local_defect"]["at"] + 180, 360) - 180
+        te = te + e["local_defect"]["size"] * np.exp(-0.5 * (x / e["local_defect"]["width"]) ** 2)
+    if "unknown" in e:
+        te = te + unknown(e["unknown"], t, motor, load, d, v)
+    measured_load = load + te / 3600
+    if "channel_skew" in e:
+        measured_load = np.interp(t - e["channel_skew"]["ms"] * -1e-3, t, measured_load)
+    pick = slice(None, None, 10)
+    ts = t[pick]
+    decay = math.exp(-(ts[1] - ts[0]) / 5.0)
+    slow = lfilter([math.sqrt(1 - decay**2)], [1, -decay], rng.normal(size=len(ts)))
+    noisy = measured_load[pick] + (truth.noise * rng.normal(size=len(ts)) + truth.slow_noise * slow) / 3600
+    follow = 2e-4 * v[pick]
+    columns = {
+        "time_s": ts,
+        "motor_position_deg": np.round((motor[pick]) * 8000 / 360) * 360 / 8000,
+        "load_position_deg": np.round(noisy * 8000) / 8000 + 17.3,
+    }
+    if command:
+        columns["motor_target_deg"] = motor[pick] + follow
+    if truth.torque_nm:
+        columns["load_torque_nm"] = torque[pick] + 0.01 * rng.normal(size=len(ts))
+    if truth.temperature_rise_k:
+        columns["temperature_c"] = (
+            20
+            + truth.temperature_rise_k * (1 - np.exp(-ts / (0.3 * ts[-1])))
+            + 0.02 * rng.normal(size=len(ts))
+        )
+    return columns
+
+
+def unknown(
+    kind: dict[str, Any], t: np.ndarray, motor: np.ndarray, load: np.ndarray, d: np.ndarray, v: np.ndarray
+) -> np.ndarray:
+    """Errors that no catalogue has."""
+    size = kind["size"]
+    if kind["kind"] == "saw":  # a saw tooth over the load angle, not periodic in the turn
+        return size * (np.mod(load, 137.0) / 68.5 - 1)
+    if kind["kind"] == "square":
+        return size * np.sign(np.sin(np.deg2rad(motor * 0.37)))
+    if kind["kind"] == "chirp":
+        return size * np.sin(np.deg2rad(0.0006 * motor**2 / 10))
+    if kind["kind"] == "one_way":  # a bump series met in one direction only
+        return size * (d > 0) * np.abs(np.sin(np.deg2rad(load * 3.3)))
+    if kind["kind"] == "beat":
+        return size * np.sin(2 * np.pi * t / 47.0) * np.cos(np.deg2rad(motor * 0.5))
+    if kind["kind"] == "bursts":
+        return size * (np.sin(2 * np.pi * t / 61.0) > 0.8) * np.sin(2 * np.pi * t / 1.7)
+    raise ValueError(kind["kind"])
+
+
+def model_text(seed: int, wrong: float = 0.03, truth: Truth | None = None) -> str:
+    """The model file, its parameters some per cent off."""
+    rng = np.random.default_rng(seed + 77)
+    truth = truth or Truth()
+
+    def off(value: float) -> float:
+        return value * (1 + wrong * float(rng.normal()))
+
+    orders = "".join(
+        f"        - {{order: {k}, amplitude_arcsec: {off(A):.5g}, "
+        f"phase_deg: {p + 2 * float(rng.normal()):.5g}}}\n"
+        for k, A, p in truth.orders
+    )
+    return (
+        "schema: hdbridge.model/1\nratio: 50\neffects:\n"
+        "  - effect: synchronous\n    parameters:\n      orders:\n"
+        f"{orders}  - effect: hysteresis\n    parameters: {{offset_arcsec: {off(truth.offset):.5g}, "
+        f"width_deg: {off(truth.width):.5g}, exponent: {min(max(1 + off(truth.n - 1), 1.1), 3):.4g}}}\n"
+    )

@@ -1,0 +1,149 @@
+"""Hidden effects are found by their names, and nothing is found where nothing is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
+
+Diagnosed = Callable[..., Diagnosis]
+
+
+def names(diagnosis: Diagnosis) -> list[str]:
+    return [each.cause for each in diagnosis.findings]
+
+
+def test_nothing_hidden_is_nothing_found(diagnosed: Diagnosed) -> None:
+    result = diagnosed()
+    assert names(result) == []
+    assert result.extended.rms_arcsec < result.baseline.rms_arcsec
+    assert result.as_dict()["findings"] == []
+
+
+def test_another_elastic_law_is_no_backlash(diagnosed: Diagnosed) -> None:
+    for law in ("memory", "dahl"):
+        found = names(diagnosed(law=law, seed=2))
+        assert set(found) <= {"hysteresis_memory", "hysteresis_parameters", "unexplained"}, law
+
+
+HIDDEN = [
+    ("motor_order", {"orders": [(5, 4.0, 30.0)]}, {}),
+    ("flexspline_order", {"orders": [(2, 4.0, 30.0)]}, {}),
+    ("direction_phase", {"shift": 3.0}, {}),
+    ("channel_skew", {"ms": 0.2}, {}),
+    ("count_loss", {"size": 4.0, "at": 0.4}, {}),
+    ("vibration", {"size": 3.0, "hz": 3.3}, {}),
+    ("local_defect", {"size": 5.0, "at": 200.0, "width": 2.0}, {}),
+    ("zero_drift", {"size": 8.0, "tau": 0.4}, {}),
+    ("creep", {"size": 4.0, "tau": 3.0}, {}),
+    ("compliance", {"c1": 1.5, "c2": 1.0, "t1": 4.0}, {"torque_nm": 9.0}),
+]
+
+
+@pytest.mark.parametrize(("cause", "effect", "axis"), HIDDEN, ids=[each[0] for each in HIDDEN])
+def test_a_hidden_effect_is_named(
+    diagnosed: Diagnosed, cause: str, effect: dict[str, Any], axis: dict[str, Any]
+) -> None:
+    result = diagnosed({cause: effect}, **axis)
+    assert names(result)[:1] == [cause]
+    found = result.findings[0]
+    assert found.after_arcsec < found.before_arcsec
+    assert found.probability > 0.8
+    assert result.extended.rms_arcsec < 1.5 * diagnosed().extended.rms_arcsec + 0.1
+
+
+def test_parameters_come_with_intervals_that_hold_the_truth(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"vibration": {"size": 3.0, "hz": 3.3}}).findings[0].parameters
+    assert found["frequency_hz"].value == pytest.approx(3.3, abs=1e-3)
+    assert found["amplitude_arcsec"].low < 3.0 < found["amplitude_arcsec"].high
+    assert found["amplitude_arcsec"].unit == "arcsec"
+
+
+def test_once_per_load_turn_without_a_torque_channel_may_be_gravity(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"load_order": {"orders": [(1, 8.0, 30.0)]}}).findings[0]
+    assert found.cause == "load_order"
+    assert "compliance" in found.aliases
+    assert "mass" in found.experiment
+
+
+def test_a_changed_encoder_cannot_be_told_from_the_first_motor_order(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"motor_encoder_eccentricity": {"orders": [(1, 4.0, 100.0)]}}).findings[0]
+    assert {found.cause, *found.aliases} == {"motor_encoder_eccentricity", "motor_order"}
+    assert "re-clock" in found.experiment
+
+
+def test_what_is_in_no_catalogue_is_unexplained_and_says_where(diagnosed: Diagnosed) -> None:
+    first = diagnosed({"unknown": {"kind": "one_way", "size": 6.0}}).findings[0]
+    assert first.cause == "unexplained"
+    assert first.lives_in
+    assert first.curve_arcsec is not None
+    assert len(first.curve_arcsec) > 10
+
+
+def test_two_effects_at_once(diagnosed: Diagnosed) -> None:
+    hidden = {"load_order": {"orders": [(1, 8.0, 30.0)]}, "count_loss": {"size": 5.0, "at": 0.55}}
+    assert set(names(diagnosed(hidden))) == set(hidden)
+
+
+def test_the_extended_model_predicts_what_was_found(
+    diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
+) -> None:
+    hidden = {"motor_order": {"orders": [(7, 4.0, 60.0)]}}
+    extended = diagnosed(hidden).model
+    assert [each.name for each in extended.effects][-1] == "motor_order"
+    assert extended.uncertainty["motor_order"]
+    again = diagnose(Record(columns(hidden, seed=9)), TransmissionModel.from_text(extended.dump()))
+    assert again.findings == ()
+
+
+def test_the_document_has_its_contract(diagnosed: Diagnosed) -> None:
+    data = diagnosed({"motor_order": {"orders": [(5, 4.0, 30.0)]}}).as_dict()
+    assert data["schema"] == "hdbridge.diagnosis/1"
+    assert set(data["baseline"]) == {"rms_arcsec", "three_sigma_arcsec"} == set(data["extended"])
+    finding = data["findings"][0]
+    assert {"cause", "probability", "aliases", "parameters", "gain", "experiment"} <= set(finding)
+    assert set(finding["gain"]) == {"held_out_rms_before_arcsec", "held_out_rms_after_arcsec"}
+    assert {"detectable", "detection_limit_arcsec", "aliases"} <= set(data["identifiability"]["backlash"])
+    assert data["identifiability"]["compliance"]["detectable"] is False
+
+
+def test_too_short_a_record_is_refused(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    few = {name: values[:30] for name, values in columns().items()}
+    with pytest.raises(InputError, match="too few"):
+        diagnose(Record(few), model)
+
+
+def test_a_model_that_needs_a_channel_says_so(columns: Callable[..., dict[str, Any]]) -> None:
+    text = (
+        "schema: hdbridge.model/1\nratio: 50\neffects:\n"
+        "  - effect: compliance\n    parameters: {c1_arcsec_per_nm: 9, "
+        "c2_arcsec_per_nm: 8, c3_arcsec_per_nm: 7, torque1_nm: 5, torque2_nm: 9}\n"
+    )
+    with pytest.raises(InputError, match="load_torque_nm"):
+        diagnose(Record(columns()), TransmissionModel.from_text(text))
+
+
+def test_the_same_record_gives_the_same_answer(diagnosed: Diagnosed) -> None:
+    one, other = (diagnosed({"creep": {"size": 4.0, "tau": 3.0}}).as_dict() for _ in range(2))
+    assert one == other
+
+
+def test_a_bare_short_record_gives_no_confident_wrong_name(model: TransmissionModel) -> None:
+    """One way, no command, no standstill, coarse counts, noise: hardly anything can be said."""
+    rng = np.random.default_rng(3)
+    time = np.arange(150) * 0.02
+    motor = np.round(400.0 * time / 0.045) * 0.045
+    load = motor / 50 + rng.normal(size=150) * 0.5 / 3600
+    bare = Record({"time_s": time, "motor_position_deg": motor, "load_position_deg": load})
+    result = diagnose(bare, TransmissionModel(50.0, ()))
+    assert not [each for each in result.findings if each.probability > 0.5]
+    assert any("reversal" in each for each in result.remarks)
