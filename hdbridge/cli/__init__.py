@@ -10,7 +10,20 @@ import sys
 
 import typer
 
-from hdbridge.cli import calibrate, check, demo, doctor, fit, latency, model, report, scan, simulate, step
+from hdbridge.cli import (
+    calibrate,
+    check,
+    demo,
+    diagnose,
+    doctor,
+    fit,
+    latency,
+    model,
+    report,
+    scan,
+    simulate,
+    step,
+)
 from hdbridge.errors import HdbridgeError
 
 app = typer.Typer(
@@ -25,7 +38,7 @@ app = typer.Typer(
         "5 stopped by supervision, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
-for command in (demo, check, scan, doctor, simulate, step, calibrate, fit, model, report, latency):
+for command in (demo, check, scan, doctor, simulate, step, calibrate, fit, diagnose, model, report, latency):
     command.register(app)
 
 
