@@ -154,7 +154,8 @@ def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) ->
             return part * (1.0 - math.log(part))
         return float((part ** (n - 1.0) - (n - 1.0) * part) / (2.0 - n))
 
-    points = [0.0] + [(1e-3) ** (1.0 - each / (elements - 1.0)) for each in range(elements)]
+    # Points between which the branch is straight, spaced so that it is nowhere further off than elsewhere.
+    points = [(each / elements) ** (2.0 / (n - 1.0)) for each in range(elements + 1)]
     heights = [0.0] + [crossed(each) for each in points[1:]]
     pairs = zip(zip(points, heights, strict=True), zip(points[1:], heights[1:], strict=False), strict=False)
     slopes = [(h1 - h0) / (x1 - x0) for (x0, h0), (x1, h1) in pairs] + [0.0]
