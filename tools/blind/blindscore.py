@@ -63,7 +63,7 @@ class Verdict:
     compared: tuple[Compared, ...] = ()
     recovered: float | None = None
     rms_over_noise: float | None = None
-    """What the extended model leaves, over the noise of a reading."""
+    """What the extended model leaves, over the noise floor that the diagnosis states."""
     failed: str = ""
     law: str = ""
 
@@ -104,8 +104,8 @@ def judged(hidden: Data, diagnosis: Data | None, seconds: float, failed: str = "
             (float(each["probability"]), hit) for each, hit in zip(named, right, strict=True)
         ),
         compared=tuple(_compared(hidden, named)),
-        recovered=_recovered(hidden, named, known),
-        rms_over_noise=_left(hidden, diagnosis),
+        recovered=_recovered(hidden, named, known, _floor(hidden, diagnosis)),
+        rms_over_noise=_left(diagnosis, _floor(hidden, diagnosis)),
         failed=failed,
         law=str(hidden.get("law", "")),
     )
@@ -119,22 +119,27 @@ def _meets(finding: Data, causes: Iterable[str]) -> bool:
     return any(cause in _names(finding) for cause in causes)
 
 
-def _recovered(hidden: Data, named: list[Data], known: tuple[str, ...]) -> float | None:
+def _floor(hidden: Data, diagnosis: Data | None) -> float:
+    """The noise floor as the diagnosis has it (it may work on means of samples), else that of a reading."""
+    return float((diagnosis or {}).get("noise_floor_arcsec") or hidden["noise_arcsec"])
+
+
+def _recovered(hidden: Data, named: list[Data], known: tuple[str, ...], floor_arcsec: float) -> float | None:
     """Share of the explainable variance on held-out data that a single right finding takes away."""
     if len(hidden["hidden"]) != 1 or not named or not _meets(named[0], known):
         return None
     gain = named[0].get("gain") or {}
     before = gain.get("held_out_rms_before_arcsec")
     after = gain.get("held_out_rms_after_arcsec")
-    floor = min(float(hidden["noise_arcsec"]), float(after or 0.0))
+    floor = min(floor_arcsec, float(after or 0.0))
     if before is None or after is None or before**2 - floor**2 <= 0.0:
         return None
     return float((before**2 - after**2) / (before**2 - floor**2))
 
 
-def _left(hidden: Data, diagnosis: Data | None) -> float | None:
+def _left(diagnosis: Data | None, floor_arcsec: float) -> float | None:
     left = ((diagnosis or {}).get("extended") or {}).get("rms_arcsec")
-    return None if left is None else float(left) / float(hidden["noise_arcsec"])
+    return None if left is None else float(left) / floor_arcsec
 
 
 Conversion = tuple[str, str, Callable[[float], float]]
