@@ -2,49 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, Final
 
 import numpy as np
 
 from hdbridge import __version__
 from hdbridge.calibration import Calibration
 from hdbridge.calibration.result import unit_of
+from hdbridge.calibration.validation import Validation
+from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
 from hdbridge.modeldiff import diff
-from hdbridge.report.page import Block, Chart, Facts, Mark, Page, Section, Series, Table
+from hdbridge.report.page import Block, Chart, Facts, Grid, Mark, Page, Section, Series, Table, histogram
 from hdbridge.units import DEG_PER_TURN
 
-SIGMA = "3\N{GREEK SMALL LETTER SIGMA}"
-HIGHEST_ORDER = 16.0
+BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
+
+SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
+X_LABEL: Final = "load target, deg"
+Y_LABEL: Final = "error, arcsec"
+TURN_LABEL: Final = "motor angle within its turn, deg"
+LOAD_LABEL: Final = "load angle, deg"
+R_LABEL: Final = "residual, arcsec"
+WAYS: Final = ("there (CW)", "back (CCW)")
+PAUSE_STEPS: Final = 20.0
+"""A gap in time of so many usual steps parts two runs."""
+HIGHEST_ORDER: Final = 16.0
 """Of the spectrum that is drawn."""
+ISO_FIGURES: Final = (
+    ("accuracy", "accuracy A"),
+    ("repeatability", "repeatability R"),
+    ("reversal", "reversal B"),
+    ("systematic", "systematic E"),
+    ("range", "range M"),
+)
 
 
 def calibration_page(result: Calibration) -> Page:
-    """The page of a calibration, or of a fit of somebody's records."""
+    """The page of a calibration, or of a fit of somebody's records: result first, then the evidence."""
     traces = result.fit.traces
-    sections = [
+    sections = []
+    if result.validation is not None:
+        sections.append(
+            Section("Stepping test", _stepping_text(result.validation), [*_stepping(result.validation)])
+        )
+        sections += _iso_section(result.validation)
+    sections += [
+        Section("Parameters", _parameters_text(result), [*_parameters(result)]),
         Section(
             "Transmission error",
             "What the load encoder showed beyond the motor angle divided by the ratio, the zero taken off; "
-            "dots are means over short stretches.",
-            [*_by_angle(traces)],
-        )
+            "dots are means over short stretches. Drag to enlarge a chart, double-click to go back.",
+            [Grid([*_by_angle(traces, result.model.ratio)])],
+        ),
     ]
     if loops := [*_loops(traces)]:
         sections.append(
             Section(
                 "Hysteresis loops",
                 "The error over the motor angle as it goes back and forth, measured and by the model.",
-                loops,
+                [Grid(loops, columns=3 if len(loops) > 2 else 2)],
             )
         )
     sections += [
-        Section("Spectrum", "Without hysteresis and zero.", [_spectrum(result)]),
-        Section("What the model leaves", result.fit.held_out.text.capitalize() + ".", [*_residual(result)]),
-        Section("Parameters", "", [_parameters(result)]),
+        Section(
+            "Spectrum",
+            "Amplitudes by least squares at the true angles, without hysteresis and zero. Bars: the orders "
+            "fitted together; those below the threshold cannot be told from noise. Line: each order alone, "
+            "which shows the side lobes of its neighbours too.",
+            [_spectrum(result)],
+        ),
+        Section("What the model leaves", _sentence(result.fit.held_out.text), [*_residual(result)]),
     ]
-    if result.validation is not None:
-        sections.append(Section("Stepping test", _stepping_text(result), [*_stepping(result)]))
+    if len(result.drift) > 1:
+        sections.append(Section("Reference pose", _drift_text(result), [_drift(result)]))
     sections.append(Section("Where it comes from", "", [_provenance(result)]))
     return Page(
         title=f"Calibration of axis '{result.axis}'"
@@ -58,77 +92,130 @@ def calibration_page(result: Calibration) -> Page:
 
 
 def _verdict(result: Calibration) -> str:
-    text = result.offer.reason if result.offer is not None else result.fit.held_out.text
-    if result.fit.warnings:
-        count = len(result.fit.warnings)
-        text += ". Read the note below" if count == 1 else f". Read the {count} notes below"
-    return text[:1].upper() + text[1:] + "."
+    text = _sentence(result.offer.reason if result.offer is not None else result.fit.held_out.text)
+    if notes := len(result.fit.warnings):
+        text += f" Read the {'note' if notes == 1 else f'{notes} notes'} under 'What the model leaves'."
+    return text
 
 
-def _by_angle(traces: Traces) -> Iterator[Chart]:
-    for angle, label in (
-        (np.mod(traces.motor_deg, DEG_PER_TURN), "motor angle within its turn, deg"),
-        (traces.load_deg, "load angle, deg"),
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
+    """Over the motor angle with the model; over the load angle with means of whole motor turns."""
+    sweeps = _of_kind(traces, "sweep")
+    chosen = (sweeps if np.any(sweeps) else np.ones_like(sweeps)) & (traces.direction != 0.0)
+    if not np.any(chosen):
+        return
+    motor, load = np.mod(traces.motor_deg, DEG_PER_TURN), traces.load_deg
+    for angle, drawn, width_deg, middle, kind, name, unit in (
+        (motor, traces.predicted_arcsec, 2.0, np.median, "model", "motor angle", TURN_LABEL),
+        (load, traces.error_arcsec, DEG_PER_TURN / ratio, np.mean, "mean", "load angle", LOAD_LABEL),
     ):
-        sweeps = _of_kind(traces, "sweep")
-        chosen = sweeps if np.any(sweeps) else traces.direction != 0.0
-        series = []
-        for sign, name in ((1.0, "forward"), (-1.0, "backward")):
+        series = _both_ways(traces, angle, traces.error_arcsec, chosen)
+        for sign, way in ((1.0, "forward"), (-1.0, "backward")):
             rows = chosen & (traces.direction == sign)
             if np.any(rows):
-                series.append(
-                    Series(f"{name}, measured", angle[rows], traces.error_arcsec[rows], Mark.POINTS)
-                )
-        rows = chosen & (traces.direction != 0.0)
-        if np.any(rows):
-            series.append(Series("model", angle[rows], traces.predicted_arcsec[rows], Mark.POINTS))
-            yield Chart(f"Error over the {label.split(',')[0]}", label, "error, arcsec", series)
+                x, y = _over(angle[rows], drawn[rows], width_deg, middle)
+                series.append(Series(f"{kind}, {way}", x, y))
+        yield Chart(f"Error over the {name}", unit, Y_LABEL, series)
+
+
+def _over(
+    x: FloatArray, y: FloatArray, width: float, middle: Callable[[FloatArray], Any]
+) -> tuple[FloatArray, FloatArray]:
+    """The middle of y over stretches of x of a given width; a stretch without samples is a gap."""
+    first = float(np.min(x))
+    place = ((x - first) / width).astype(np.intp)
+    values: FloatArray = np.full(int(np.max(place)) + 1, np.nan)
+    order = np.argsort(place, kind="stable")
+    present, starts = np.unique(place[order], return_index=True)
+    for each, inside in zip(present.tolist(), np.split(y[order], starts[1:]), strict=True):
+        values[each] = middle(inside)
+    centres: FloatArray = first + width * (np.arange(len(values), dtype=np.float64) + 0.5)
+    return centres, values
+
+
+def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:
+    """The chosen samples of the forward and of the backward direction, those that there are."""
+    ways = (("forward", chosen & (traces.direction > 0.0)), ("backward", chosen & (traces.direction < 0.0)))
+    return [Series(name, x[rows], y[rows], Mark.POINTS) for name, rows in ways if np.any(rows)]
 
 
 def _loops(traces: Traces) -> Iterator[Chart]:
     """One chart for each sine or run of reversals, in the order measured."""
-    for kind in ("sine", "reversal"):
-        for rows in _runs(_of_kind(traces, kind)):
+    for kind, words in (("sine", "Sine"), ("reversal", "Reversals")):
+        runs = [rows for rows in _runs(_of_kind(traces, kind)) if _is_loop(traces.motor_deg[rows])]
+        for number, rows in enumerate(runs, 1):
             motor = traces.motor_deg[rows]
             reach = 0.5 * float(np.ptp(motor))
-            if reach < 0.5 or len(motor) < 8:
-                continue
             centre = float(np.min(motor)) + reach
+            caption = f"{words} of \N{PLUS-MINUS SIGN}{reach:.0f} deg"
+            if kind == "reversal" and len(runs) > 1:
+                caption += f", {number} of {len(runs)}"
             series = [
                 Series("measured", motor - centre, traces.error_arcsec[rows], Mark.POINTS),
-                Series("model", motor - centre, traces.predicted_arcsec[rows]),
+                Series("model", motor - centre, _parted(traces.predicted_arcsec[rows], traces.time_s[rows])),
             ]
-            caption = f"{kind.capitalize()} of {reach:.0f} deg about {centre:.0f} deg of the motor"
-            yield Chart(caption, "motor angle, deg", "error, arcsec", series, height_px=280)
+            label = f"motor angle \N{MINUS SIGN} {centre:.0f}, deg" if round(centre) else "motor angle, deg"
+            yield Chart(caption, label.replace("\N{MINUS SIGN} -", "+ "), Y_LABEL, series, height_px=230)
+
+
+def _parted(y: FloatArray, time_s: FloatArray) -> FloatArray:
+    """With a gap at the first sample after a pause: what was not measured in between is not drawn."""
+    steps = np.diff(time_s, prepend=time_s[0])
+    return np.where(steps > PAUSE_STEPS * float(np.median(steps)), np.nan, y)
+
+
+def _is_loop(motor_deg: FloatArray) -> bool:
+    return len(motor_deg) >= 8 and float(np.ptp(motor_deg)) >= 1.0
 
 
 def _spectrum(result: Calibration) -> Chart:
     spectrum = result.fit.spectrum
     curve = spectrum.curve
     shown = curve.order <= HIGHEST_ORDER
-    series = [Series("amplitude", curve.order[shown], curve.amplitude_arcsec[shown])]
+    series = [Series("one order alone", curve.order[shown], curve.amplitude_arcsec[shown])]
+    lines = sorted(
+        (each for each in spectrum.lines if each.order.per_motor_turn <= HIGHEST_ORDER),
+        key=lambda each: each.order.per_motor_turn,
+    )
+    if lines:
+        orders = [each.order.per_motor_turn for each in lines]
+        together = [each.amplitude_arcsec for each in lines]
+        series.append(Series("orders together", orders, together, Mark.BARS, bar_width=0.12))
+        thresholds = [each.threshold_arcsec for each in lines]
+        series.append(Series("threshold", orders, thresholds, Mark.DASHED))
     chosen = [each for each in result.fit.orders if each.order.per_motor_turn <= HIGHEST_ORDER]
     if chosen:
         orders = [each.order.per_motor_turn for each in chosen]
         series.append(Series("in the model", orders, [each.amplitude_arcsec for each in chosen], Mark.POINTS))
-    lines = [each for each in spectrum.lines if each.order.per_motor_turn <= HIGHEST_ORDER]
-    if lines:
-        orders = [each.order.per_motor_turn for each in lines]
-        thresholds = [each.threshold_arcsec for each in lines]
-        series.append(Series("threshold of noise", orders, thresholds, Mark.POINTS))
     caption = (
         f"Orders per motor turn; {spectrum.resolution.turns:.0f} motor turns tell orders apart that are "
         f"{spectrum.resolution.nearest_orders:.3f} or more from each other"
     )
-    return Chart(caption, "order, per motor turn", "amplitude, arcsec", series)
+    return Chart(caption, "order, per motor turn", "amplitude, arcsec", series, y_log=True)
 
 
 def _residual(result: Calibration) -> Iterator[Block]:
     traces, fit = result.fit.traces, result.fit
-    for x, label in ((traces.time_s, "time, s"), (traces.load_deg, "load angle, deg")):
-        series = [Series("residual", x, traces.residual_arcsec, Mark.POINTS)]
-        caption = f"Residual over the {label.split(',')[0]}"
-        yield Chart(caption, label, "residual, arcsec", series, height_px=240)
+    left = traces.residual_arcsec
+    yield Chart(
+        "Residual over time", "time, s", R_LABEL, [Series("residual", traces.time_s, left, Mark.POINTS)], 220
+    )
+    moving = traces.direction != 0.0
+    motor = np.mod(traces.motor_deg, DEG_PER_TURN)
+    yield Grid(
+        [
+            Chart(f"Residual over the {name}", label, R_LABEL, _both_ways(traces, angle, left, moving), 240)
+            for name, angle, label in (
+                ("motor angle", motor, TURN_LABEL),
+                ("load angle", traces.load_deg, LOAD_LABEL),
+            )
+        ]
+    )
+    yield histogram("How often which residual", R_LABEL, {"residual": left}, height_px=200)
     noise = fit.noise
     yield Facts(
         [
@@ -149,64 +236,131 @@ def _residual(result: Calibration) -> Iterator[Block]:
         [each.name.replace("_", " "), "passed" if each.passed else "look", each.text]
         for each in fit.residual_tests
     ]
-    yield Table(["test of the residual", "", ""], rows)
+    yield Table(["test of the residual", "", "what it found"], rows)
     if fit.warnings:
         yield Facts([("note", each) for each in fit.warnings])
 
 
-def _parameters(result: Calibration) -> Table:
-    before = (
-        {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
-        if result.active is not None
-        else {}
-    )
-    header = ["parameter", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit", *(["active model"] if before else [])]
+def _parameters_text(result: Calibration) -> str:
+    if all(each.identifiable for each in result.fit.intervals):
+        return ""
+    return "In brackets: what these data cannot say."
+
+
+def _parameters(result: Calibration) -> Iterator[Block]:
+    changes = diff(result.active, result.model) if result.active is not None else []
+    before = {(each.effect, each.parameter): each.before for each in changes}
+    header = ["parameter", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"]
+    if before:
+        header += ["active model", "change"]
     rows: list[list[str | float]] = []
     for each in result.fit.intervals:
-        row: list[str | float] = [f"{each.effect}: {each.parameter}"]
+        row: list[str | float] = [_parameter_words(each.effect, each.parameter)]
         if each.identifiable:
-            row += [_number(each.value), _number(each.half_width)]
+            row += _with_interval(each.value, each.half_width)
         else:
             row += [f"({_number(each.value)})", "not known"]
         row.append(unit_of(each.parameter))
         if before:
             was = before.get((each.effect, each.parameter))
-            row.append(_number(was) if was is not None else "new")
+            row += ["new", ""] if was is None else [_number(was), _change(each.value - was, each.parameter)]
         rows.append(row)
-    return Table(header, rows)
+    yield Table(header, rows)
+    if result.fit.nuisances:
+        fitted: list[list[str | float]] = [
+            [each.text, *_with_interval(each.value, each.half_width), each.unit]
+            for each in result.fit.nuisances
+        ]
+        yield Table(
+            ["beside the model", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"],
+            fitted,
+            "Fitted too, so that it does not bend the parameters; not part of the model.",
+        )
 
 
-def _stepping_text(result: Calibration) -> str:
-    checked = result.validation
-    assert checked is not None
+def _parameter_words(effect: str, parameter: str) -> str:
+    """``orders[2].amplitude_arcsec`` of synchronous: "synchronous, order 2: amplitude"."""
+    unit = unit_of(parameter)
+    words = parameter.removesuffix(f"_{unit}") if unit else parameter
+    words = re.sub(r"^orders\[(\d+)\]\.", r"order \1: ", words).replace("_", " ")
+    return f"{effect.replace('_', ' ')}, {words}" if ": " in words else f"{effect.replace('_', ' ')}: {words}"
+
+
+def _change(change: float, parameter: str) -> str:
+    if parameter.endswith("phase_deg"):
+        change = math.remainder(change, DEG_PER_TURN)
+    return f"{change:+.3g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _stepping_text(checked: Validation) -> str:
     share = checked.after.pooled.three_sigma_arcsec / checked.floor.three_sigma_arcsec
     return (
         f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
-        f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is at "
-        f"{share:.2f} of that."
+        f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
+        "that."
     )
 
 
-def _stepping(result: Calibration) -> Iterator[Block]:
-    checked = result.validation
-    assert checked is not None
+def _stepping(checked: Validation) -> Iterator[Block]:
     rows: list[list[str | float]] = []
-    for each in (checked.before, checked.after):
-        row: list[str | float] = [each.model]
+    charts, remains = [], {}
+    reach = 1.08 * max(
+        (
+            abs(error)
+            for each in (checked.before, checked.after)
+            for way in each.errors_arcsec
+            for error in way
+        ),
+        default=1.0,
+    )
+    for when, each in (("before", checked.before), ("after", checked.after)):
+        row: list[str | float] = [f"{when}: {each.model}"]
         for part in (each.cw, each.ccw, each.pooled):
             row += [part.three_sigma_arcsec, part.mean_arcsec]
         rows.append(row)
+        series = [
+            Series(name, targets, errors, Mark.POINTS)
+            for name, targets, errors in zip(WAYS, each.targets_deg, each.errors_arcsec, strict=True)
+        ]
+        caption = f"{when.capitalize()}: {each.model}"
+        charts.append(Chart(caption, X_LABEL, Y_LABEL, series, height_px=240, y_range=(-reach, reach)))
+        remains = {one.label: one.y for one in series}
+    after = Chart("After, enlarged", X_LABEL, Y_LABEL, charts[-1].series, height_px=240)
     yield Table(
         ["with", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean", f"pooled {SIGMA}", "mean"], rows, "arcsec"
     )
-    for each in (checked.before, checked.after):
-        series = [
-            Series(name, targets, errors, Mark.POINTS)
-            for name, targets, errors in zip(
-                ("there (CW)", "back (CCW)"), each.targets_deg, each.errors_arcsec, strict=True
-            )
-        ]
-        yield Chart(f"With {each.model}", "load target, deg", "load error, arcsec", series, height_px=240)
+    yield Grid([*charts, after, histogram("After: how often which error", Y_LABEL, remains, height_px=240)])
+
+
+def _iso_section(checked: Validation) -> list[Section]:
+    given = [
+        (when, each)
+        for when, each in (("before", checked.accuracy_before), ("after", checked.accuracy_after))
+        if each is not None
+    ]
+    if not given:
+        return []
+    rows = [[when, *(getattr(each, name) for name, _ in ISO_FIGURES)] for when, each in given]
+    tested = given[-1][1]
+    text = (
+        f"The figures of ISO 230-2 for a rotary axis, arcsec: {tested.targets} targets, each approached "
+        f"{tested.runs} times from either side."
+    )
+    return [Section("Accuracy and repeatability", text, [Table(["", *(w for _, w in ISO_FIGURES)], rows)])]
+
+
+def _drift_text(result: Calibration) -> str:
+    errors = [error for _, error in result.drift]
+    return (
+        f"The axis came back to one pose {len(errors)} times, always from the same side: its zero moved by "
+        f"{max(errors) - min(errors):.2f} arcsec."
+    )
+
+
+def _drift(result: Calibration) -> Chart:
+    times, errors = zip(*result.drift, strict=True)
+    series = [Series("error at the pose", times, errors), Series("visits", times, errors, Mark.POINTS)]
+    return Chart("Error at the reference pose", "time, s", Y_LABEL, series, height_px=200)
 
 
 def _provenance(result: Calibration) -> Facts:
@@ -233,14 +387,22 @@ def _number(value: float) -> str:
     return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
 
 
-def _of_kind(traces: Traces, kind: str) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _with_interval(value: float, half_width: float) -> tuple[str, str]:
+    """The half width with two digits, the value with as many decimals."""
+    if not (math.isfinite(half_width) and half_width > 0.0):
+        return _number(value), _number(half_width)
+    decimals = max(1 - math.floor(math.log10(half_width)), 0)
+    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}"), f"{half_width:.{decimals}f}"
+
+
+def _of_kind(traces: Traces, kind: str) -> BoolArray:
     if kind not in traces.kind:
         return np.zeros(len(traces.time_s), dtype=np.bool_)
-    chosen: np.ndarray[tuple[int], np.dtype[np.bool_]] = traces.kind_index == traces.kind.index(kind)
+    chosen: BoolArray = traces.kind_index == traces.kind.index(kind)
     return chosen
 
 
-def _runs(chosen: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Iterator[slice]:
+def _runs(chosen: BoolArray) -> Iterator[slice]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         yield slice(first, last)

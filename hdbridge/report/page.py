@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
@@ -24,7 +25,9 @@ from hdbridge.effects import FloatArray
 
 POINTS_MAXIMUM: Final = 4000
 """Points of one series in a page; longer ones are thinned so that a page stays below a megabyte."""
-DIGITS: Final = 6
+_FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
+DIGITS: Final = 5
+"""Of a series' span: a hundredth of what a screen can show; more would only make the page larger."""
 
 
 class Mark(Enum):
@@ -32,18 +35,30 @@ class Mark(Enum):
 
     LINE = "line"
     """Joined in the order given: also loops, whose x goes back and forth."""
+    DASHED = "dashed"
     POINTS = "points"
     BARS = "bars"
+    """From zero (or, on a logarithmic axis, from its lower end) to y."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One set of points."""
+    """One set of points; x and y of one length, in the units that the chart's labels name. NaN is a gap."""
 
     label: str
     x: FloatArray | Sequence[float]
     y: FloatArray | Sequence[float]
     mark: Mark = Mark.LINE
+    bar_width: float | None = None
+    """Of `Mark.BARS`, in units of x; else what looks right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """A horizontal line at a value of y, for example a threshold."""
+
+    label: str
+    value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +72,22 @@ class Chart:
     height_px: int = 320
     y_range: tuple[float, float] | None = None
     """Given where several charts are to be compared; else what the series need."""
+    levels: Sequence[Level] = ()
+    y_log: bool = False
+    """Logarithmic; values that are not positive are gaps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Charts side by side where the window is wide enough."""
+
+    charts: Sequence[Chart]
+    columns: int = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells; numbers are aligned to the right."""
+    """Rows of cells. Columns of figures are aligned to the right; numbers are shown with two decimals."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str | float]]
@@ -75,12 +101,12 @@ class Facts:
     rows: Sequence[tuple[str, str]]
 
 
-Block = Chart | Table | Facts
+Block = Chart | Grid | Table | Facts
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading, a text and what it speaks of."""
+    """A heading, a text (blank lines part its paragraphs) and what it speaks of."""
 
     title: str
     text: str = ""
@@ -98,13 +124,13 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document."""
-    charts = [block for section in page.sections for block in section.blocks if isinstance(block, Chart)]
+    """The page as one HTML document; ValueError where a series' x and y are not of one length."""
+    charts = [chart for section in page.sections for block in section.blocks for chart in _charts_of(block)]
     return _template().render(
         page=page,
         kind=lambda block: type(block).__name__.lower(),
         number=charts.index,
-        is_number=lambda cell: isinstance(cell, (int, float)),
+        is_words=_is_words,
         text_of=_text_of,
         charts=Markup(_script_safe([_chart_data(chart) for chart in charts])),
         uplot_script=Markup(_asset("uPlot.iife.min.js")),
@@ -114,50 +140,132 @@ def render(page: Page) -> str:
     )
 
 
+def histogram(
+    caption: str,
+    x_label: str,
+    groups: Mapping[str, FloatArray | Sequence[float]],
+    *,
+    bins: int | None = None,
+    height_px: int = 320,
+) -> Chart:
+    """How often values fall into bins of equal width, common to all groups; NaN and infinity are left out.
+
+    ``bins``: how many; else by the square root of the number of values, between 5 and 60.
+    """
+    finite = {name: np.asarray(each, dtype=np.float64) for name, each in groups.items()}
+    finite = {name: each[np.isfinite(each)] for name, each in finite.items()}
+    everything = np.concatenate([*finite.values()]) if finite else np.empty(0)
+    count = bins or min(max(math.ceil(math.sqrt(len(everything) / max(len(finite), 1))), 5), 60)
+    edges = np.histogram_bin_edges(everything, bins=count)
+    width = float(edges[1] - edges[0])
+    centres = 0.5 * (edges[:-1] + edges[1:])
+    series = [
+        Series(name, centres, np.histogram(each, edges)[0].astype(float), Mark.BARS, bar_width=width)
+        for name, each in finite.items()
+    ]
+    return Chart(caption, x_label, "number", series, height_px=height_px)
+
+
 def thinned(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """At most ``most`` points in the same order: of each run of samples those of least and greatest y.
+    """At most ``most`` points of a line in their order: of each run those of least and greatest y.
 
     What would be seen at this size stays: peaks are kept, whatever falls between them is not drawn apart.
     """
-    count = len(x)
-    if count <= most:
+    keep = _extremes(y, most)
+    return (x, y) if keep is None else (x[keep], y[keep])
+
+
+def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
+    """At most ``most`` points of a cloud in their order: three in four evenly spaced, the rest peaks.
+
+    Peaks alone, as a line needs them, would make a cloud look wider than it is.
+    """
+    if len(x) <= most:
         return x, y
-    edges = np.linspace(0, count, most // 2 + 1).astype(int)
-    keep: list[int] = []
-    for first, last in pairwise(edges.tolist()):
-        run = y[first:last]
-        keep += sorted({first + int(np.argmin(run)), first + int(np.argmax(run))})
+    peaks = _extremes(y, most // 4)
+    regular = np.linspace(0, len(x) - 1, most - most // 4).astype(int)
+    keep = np.union1d(regular, regular if peaks is None else peaks)
     return x[keep], y[keep]
+
+
+def _extremes(y: FloatArray, most: int) -> list[int] | None:
+    """Where the least and greatest of each of ``most / 2`` runs are; None where nothing needs thinning."""
+    if len(y) <= most:
+        return None
+    low, high = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
+    keep: list[int] = []
+    for first, last in pairwise(np.linspace(0, len(y), most // 2 + 1).astype(int).tolist()):
+        keep += sorted({first + int(np.argmin(low[first:last])), first + int(np.argmax(high[first:last]))})
+    return keep
+
+
+def _charts_of(block: Block) -> Sequence[Chart]:
+    if isinstance(block, Grid):
+        return block.charts
+    return (block,) if isinstance(block, Chart) else ()
 
 
 def _chart_data(chart: Chart) -> dict[str, Any]:
     series = []
+    most_left_out = 0.0
     for each in chart.series:
         x, y = np.asarray(each.x, dtype=np.float64), np.asarray(each.y, dtype=np.float64)
         if x.shape != y.shape or x.ndim != 1:
             raise ValueError(f"series '{each.label}': x and y must be of one length")
+        if chart.y_log:
+            y = np.where(y > 0.0, y, np.nan)
+        count = len(x)
         if each.mark is not Mark.BARS:
-            x, y = thinned(x, y)
-        series.append({"label": each.label, "mark": each.mark.value, "x": _rounded(x), "y": _rounded(y)})
+            x, y = (sampled if each.mark is Mark.POINTS else thinned)(x, y)
+        most_left_out = max(most_left_out, count / max(len(x), 1))
+        series.append(
+            {
+                "label": each.label,
+                "mark": each.mark.value,
+                "bar": each.bar_width,
+                "x": _rounded(x),
+                "y": _significant(y) if chart.y_log else _rounded(y),
+            }
+        )
     return {
         "x_label": chart.x_label,
         "y_label": chart.y_label,
         "height": chart.height_px,
         "y_range": chart.y_range,
+        "y_log": chart.y_log,
+        "levels": [{"label": each.label, "value": each.value} for each in chart.levels],
+        "note": f"every {most_left_out:.0f}th point is drawn, and the peaks" if most_left_out >= 1.5 else "",
         "series": series,
     }
 
 
 def _rounded(values: FloatArray) -> list[float | None]:
-    """Six significant digits of the largest value: more cannot be seen, and would double the page."""
+    """To a fixed number of decimals: `DIGITS` digits of the span."""
     finite = values[np.isfinite(values)]
-    largest = float(np.max(np.abs(finite))) if len(finite) else 1.0
-    decimals = DIGITS - 1 - math.floor(math.log10(largest)) if largest > 0.0 else DIGITS
-    return [round(value, decimals) if math.isfinite(value) else None for value in values.tolist()]
+    span = float(np.ptp(finite)) or float(np.max(np.abs(finite))) if len(finite) else 1.0
+    decimals = DIGITS - 1 - math.floor(math.log10(span)) if span > 0.0 else DIGITS
+    # + 0.0 makes -0.0 a plain zero
+    return [round(value, decimals) + 0.0 if math.isfinite(value) else None for value in values.tolist()]
+
+
+def _significant(values: FloatArray) -> list[float | None]:
+    """For logarithmic axes: every value to the same relative precision."""
+    return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
 def _text_of(cell: str | float) -> str:
-    return cell if isinstance(cell, str) else f"{cell:.2f}".replace("-", "\N{MINUS SIGN}")
+    if isinstance(cell, str):
+        return cell
+    text = f"{cell:.2f}"
+    return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
+
+
+def _is_words(table: Table, column: int) -> bool:
+    """Whether a column holds words, which begin at the left, and no figures."""
+    cells = [row[column] for row in table.rows if column < len(row)]
+    return column == 0 or not any(
+        isinstance(cell, int | float) or _FIGURE.match(cell) is not None for cell in cells
+    )
 
 
 def _script_safe(data: object) -> str:

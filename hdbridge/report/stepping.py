@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Final
 
 from hdbridge import __version__
-from hdbridge.report.page import Chart, Facts, Mark, Page, Section, Series, Table
+from hdbridge.report.page import Chart, Facts, Grid, Level, Mark, Page, Section, Series, Table, histogram
 from hdbridge.stepping import Scheme, SchemeResult
+
+SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
+X_LABEL: Final = "load target, deg"
+Y_LABEL: Final = "load error, arcsec"
+NAMES: Final = {
+    Scheme.NONE: "no compensation",
+    Scheme.SYNCHRONOUS: "synchronous compensation",
+    Scheme.HYSTERESIS: "hysteresis compensation",
+    Scheme.BOTH: "both compensations",
+    Scheme.EXTENDED: "the extended model's compensation",
+}
 
 ARTICLE_TABLE_3 = {
     "none": (75.0, 34.2),
@@ -36,23 +49,26 @@ def stepping_page(
         title=f"Stepping test of axis '{axis_name}'",
         verdict=_verdict(results, floor_arcsec),
         sections=[
+            Section("Figures", blocks=[_table(results, beside_article)]),
             Section(
                 "Load error at rest",
                 "Each point is one step: what the load encoder read at rest, minus the target. The way there "
                 "and the way back are apart where the gear's hysteresis is not compensated; the wave along "
-                "the angle is the synchronous error. All schemes are drawn to one scale.",
-                [_errors(scheme, result, reach) for scheme, result in results.items()],
+                "the angle is the synchronous error. All schemes are drawn to one scale. Drag to enlarge a "
+                "chart, double-click to go back.",
+                [Grid([_errors(scheme, result, reach) for scheme, result in results.items()])],
             ),
             Section(
-                "What remains",
-                f"Scheme '{best.value}' again, enlarged. Drag to enlarge any chart, double-click to go back.",
-                [_errors(best, results[best], None)],
+                f"What remains: {_name(best)}",
+                "The same points, enlarged. A motor target is a whole number of counts, so even a perfect "
+                "compensation leaves errors spread evenly over one count, from minus half a count to half a "
+                "count.",
+                [Grid(_remaining(results[best], floor_arcsec))],
             ),
-            Section("Figures", blocks=[_table(results, beside_article)]),
             Section("What was done", blocks=[Facts([*facts.items()])]),
         ],
-        footer=f"hdbridge {__version__}. Errors are arcseconds at the load; 3\N{GREEK SMALL LETTER SIGMA} is "
-        "three standard deviations about the mean.",
+        footer=f"hdbridge {__version__}. Errors are arcseconds at the load; {SIGMA} is three standard "
+        "deviations about the mean.",
     )
 
 
@@ -60,39 +76,62 @@ def _best(results: Mapping[Scheme, SchemeResult]) -> Scheme:
     return min(results, key=lambda scheme: results[scheme].pooled.three_sigma_arcsec)
 
 
+def _name(scheme: Scheme) -> str:
+    return NAMES[scheme]
+
+
 def _verdict(results: Mapping[Scheme, SchemeResult], floor_arcsec: float) -> str:
     best = _best(results)
-    three_sigma = results[best].pooled.three_sigma_arcsec
+    pooled = results[best].pooled
     text = (
-        f"With compensation '{best.value}' the load stands within 3\N{GREEK SMALL LETTER SIGMA} = "
-        f"{three_sigma:.2f} arcsec of its target, {three_sigma / floor_arcsec:.2f} times the "
-        f"{floor_arcsec:.2f} arcsec that one motor count allows"
+        f"With {_name(best)}, the load's error at rest is {pooled.three_sigma_arcsec:.2f} arcsec ({SIGMA}) "
+        f"about a mean of {_signed(pooled.mean_arcsec)}: {pooled.three_sigma_arcsec / floor_arcsec:.2f} "
+        f"times the {floor_arcsec:.2f} that one motor count allows"
     )
     if Scheme.NONE in results and best is not Scheme.NONE:
         before = results[Scheme.NONE].pooled.three_sigma_arcsec
-        text += f"; without compensation it is {before:.1f} arcsec"
+        text += f". Without compensation it is {before:.1f} arcsec"
     return text + "."
 
 
-def _errors(scheme: Scheme, result: SchemeResult, reach_arcsec: float | None) -> Chart:
-    series = [
+def _errors(scheme: Scheme, result: SchemeResult, reach_arcsec: float) -> Chart:
+    pooled = result.pooled
+    caption = (
+        f"{_name(scheme).capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f}, "
+        f"mean {_signed(pooled.mean_arcsec)}"
+    )
+    return Chart(
+        caption, X_LABEL, Y_LABEL, _by_way(result), height_px=250, y_range=(-reach_arcsec, reach_arcsec)
+    )
+
+
+def _remaining(result: SchemeResult, floor_arcsec: float) -> list[Chart]:
+    half_count = floor_arcsec / math.sqrt(3.0)
+    levels = [Level("\N{PLUS-MINUS SIGN} half a motor count", half_count), Level("", -half_count)]
+    ways = _by_way(result)
+    return [
+        Chart("Error of each step", X_LABEL, Y_LABEL, ways, height_px=280, levels=levels),
+        histogram("How often which error", Y_LABEL, {each.label: each.y for each in ways}, height_px=280),
+    ]
+
+
+def _by_way(result: SchemeResult) -> list[Series]:
+    return [
         Series(label, [s.target_deg for s in stands], [s.error_arcsec for s in stands], Mark.POINTS)
         for label, stands in (("there (CW)", result.outcome.cw), ("back (CCW)", result.outcome.ccw))
     ]
-    pooled = result.pooled
-    caption = (
-        f"{scheme.value}: pooled 3\N{GREEK SMALL LETTER SIGMA} {pooled.three_sigma_arcsec:.2f}, "
-        f"mean {pooled.mean_arcsec:.2f} arcsec"
-    )
-    y_range = None if reach_arcsec is None else (-reach_arcsec, reach_arcsec)
-    return Chart(caption, "load target, deg", "load error, arcsec", series, height_px=240, y_range=y_range)
+
+
+def _signed(value: float) -> str:
+    """Two decimals, a real minus sign, and no minus before a zero."""
+    text = f"{value:.2f}"
+    return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
 
 def _table(results: Mapping[Scheme, SchemeResult], beside_article: bool) -> Table:
-    sigma = "3\N{GREEK SMALL LETTER SIGMA}"
-    header = ["compensation", f"CW {sigma}", "mean", f"CCW {sigma}", "mean", f"pooled {sigma}", "mean"]
+    header = ["compensation", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean", f"pooled {SIGMA}", "mean"]
     if beside_article:
-        header += [f"article {sigma}", "mean"]
+        header += [f"article {SIGMA}", "mean"]
     rows: list[list[str | float]] = []
     for scheme, result in results.items():
         row: list[str | float] = [scheme.value]

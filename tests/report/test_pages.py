@@ -12,7 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.procedures.stepping import Standing, SteppingOutcome
-from hdbridge.report.page import Chart, Facts, Mark, Page, Section, Series, Table, render, thinned
+from hdbridge.report.page import (
+    Chart,
+    Facts,
+    Grid,
+    Level,
+    Mark,
+    Page,
+    Section,
+    Series,
+    Table,
+    histogram,
+    render,
+    sampled,
+    thinned,
+)
 from hdbridge.report.stepping import stepping_page
 from hdbridge.stepping import Scheme, SchemeResult
 
@@ -66,10 +80,10 @@ def test_text_stays_text(words):
     assert charts_in(text)[0]["series"][0]["label"] == evil
 
 
-def test_values_go_in_with_six_digits_and_gaps_stay_gaps():
+def test_values_go_in_with_five_digits_of_their_span_and_gaps_stay_gaps():
     chart = Chart("c", "x", "y", [Series("s", [0, 1, 2], [123.4567891, np.nan, -1 / 3])])
     series = charts_in(render(page_of(chart)))[0]["series"][0]
-    assert series["y"] == [123.457, None, -0.333]
+    assert series["y"] == [123.46, None, -0.33]
 
 
 def test_series_of_unequal_length_are_refused():
@@ -77,13 +91,94 @@ def test_series_of_unequal_length_are_refused():
         render(page_of(Chart("c", "x", "y", [Series("s", [0, 1], [0])])))
 
 
-@given(st.integers(1, 50_000), st.integers(0, 2**32 - 1))
-def test_thinning_keeps_order_and_peaks(count, seed):
+def test_a_small_travel_far_from_zero_keeps_its_digits():
+    x = 36_000.0 + np.array([0.0, 0.001, 0.002])
+    series = charts_in(render(page_of(Chart("c", "x", "y", [Series("s", x, x)]))))[0]["series"][0]
+    assert np.diff(series["x"]) == pytest.approx([0.001, 0.001], rel=1e-3)
+
+
+@pytest.mark.parametrize("thin", [thinned, sampled])
+@given(count=st.integers(1, 50_000), seed=st.integers(0, 2**32 - 1))
+def test_thinning_keeps_order_and_peaks(thin, count, seed):
     y = np.random.default_rng(seed).normal(size=count)
-    x, thin = thinned(np.arange(count, dtype=float), y, 100)
-    assert len(x) <= max(100, 1)
+    x, kept = thin(np.arange(count, dtype=float), y, 100)
+    assert len(x) <= 100
     assert np.all(np.diff(x) > 0)
-    assert (thin.min(), thin.max()) == (y.min(), y.max())
+    assert (kept.min(), kept.max()) == (y.min(), y.max())
+
+
+def test_gaps_do_not_hide_peaks_from_thinning():
+    y = np.zeros(10_000)
+    y[5000], y[5001] = np.nan, 7.0
+    assert np.nanmax(thinned(np.arange(10_000.0), y, 100)[1]) == 7.0
+
+
+def test_a_thinned_cloud_is_about_as_wide_as_the_whole():
+    y = np.random.default_rng(1).normal(size=100_000)
+    x = np.arange(100_000.0)
+    assert np.std(sampled(x, y, 4000)[1]) < 1.8
+    assert np.std(thinned(x, y, 4000)[1]) > 2.0
+
+
+def test_what_was_thinned_says_so():
+    time = np.arange(20_000.0)
+    short, long = charts_in(
+        render(
+            page_of(
+                Chart("c", "x", "y", [Series("s", [0, 1], [0, 1])]),
+                Chart("c", "x", "y", [Series("s", time, time, Mark.POINTS)]),
+            )
+        )
+    )
+    assert short["note"] == ""
+    assert long["note"].startswith("every 5th point")
+
+
+def test_charts_of_a_grid_stand_in_the_order_of_the_page():
+    one, two, three = (Chart(name, "x", "y", [Series(name, [0], [0])]) for name in "abc")
+    text = render(page_of(Grid([one, two], columns=3), three))
+    assert [each["series"][0]["label"] for each in charts_in(text)] == ["a", "b", "c"]
+    holders = [attributes for _, attributes in Reader(text).tags if "data-chart" in attributes]
+    assert [each["data-chart"] for each in holders] == ["0", "1", "2"]
+    assert [each["aria-label"][0] for each in holders] == ["a", "b", "c"]
+
+
+def test_levels_and_scales_go_with_their_chart():
+    chart = Chart("c", "x", "y", [Series("s", [0, 1], [0, 5e-7])], levels=[Level("limit", 2.5)], y_log=True)
+    (data,) = charts_in(render(page_of(chart)))
+    assert data["levels"] == [{"label": "limit", "value": 2.5}]
+    assert data["y_log"] is True
+    assert data["series"][0]["y"] == [None, 5e-7]
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300),
+    st.lists(st.floats(-1e6, 1e6), max_size=300),
+)
+def test_a_histogram_counts_every_value_once(one, two):
+    chart = histogram("c", "x", {"one": [*one, np.nan, np.inf], "two": two})
+    assert [sum(each.y) for each in chart.series] == [len(one), len(two)]
+    assert {tuple(each.x) for each in chart.series} == {tuple(chart.series[0].x)}
+
+
+def test_a_histogram_of_nothing_is_empty():
+    chart = histogram("c", "x", {"one": []})
+    assert sum(chart.series[0].y) == 0
+    assert render(page_of(chart))
+
+
+def test_columns_of_words_are_not_set_like_figures():
+    table = Table(
+        ["name", "figure", "text"], [["a", 1.5, "passed"], ["b", "(\N{MINUS SIGN}2.5)", "40 of 50"]]
+    )
+    cells = [(tag, attributes.get("class")) for tag, attributes in Reader(render(page_of(table))).tags]
+    body = [kind for tag, kind in cells if tag == "td"]
+    assert body == [None, "words", None, "words"]
+
+
+def test_a_rounded_zero_has_no_sign():
+    words = Reader(render(page_of(Table(["a", "b"], [["x", -0.001]])))).text
+    assert "0.00" in words
 
 
 def test_a_page_of_long_series_stays_below_a_megabyte():
@@ -114,9 +209,20 @@ def test_the_stepping_page_says_the_result_in_one_sentence():
     }
     text = render(stepping_page("a<b", results, 2.8, {"gear ratio": "50"}, beside_article=True))
     words = " ".join(Reader(text).text)
-    assert "3σ = 2.37 arcsec" in words
-    assert "0.85 times the 2.80 arcsec" in words
-    assert "without compensation it is 120.1 arcsec" in words
+    assert "the load's error at rest is 2.37 arcsec (3σ) about a mean of 0.00" in words
+    assert "0.85 times the 2.80" in words
+    assert "Without compensation it is 120.1 arcsec" in words
     for figure in ("42.00", "\N{MINUS SIGN}38.00", "75.00", "30.20"):
         assert figure in words
-    assert len(charts_in(text)) == 3
+    none, both, remaining, counts = charts_in(text)
+    assert none["y_range"] == both["y_range"] == [pytest.approx(-47.52), pytest.approx(47.52)]
+    assert none["series"][1]["y"] == [-40, -36]
+    assert [each["value"] for each in remaining["levels"]] == pytest.approx([1.6166, -1.6166], abs=1e-4)
+    assert sum(counts["series"][0]["y"]) == 2
+
+
+def test_without_compensation_the_verdict_speaks_of_none():
+    results = {Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36]))}
+    text = render(stepping_page("a", results, 2.8, {}))
+    assert "With no compensation, the load's error at rest is 120.15 arcsec" in " ".join(Reader(text).text)
+    assert "article" not in " ".join(Reader(text).text)

@@ -1,17 +1,20 @@
 "use strict";
-// Each chart has its own x for each series (uPlot's mode 2), so that loops, whose x goes back and forth,
-// and scatter plots are drawn as they are.
+// Each series has its own x (uPlot's mode 2), so that loops, whose x goes back and forth, and clouds of points
+// are drawn as they are. Drag enlarges, double-click goes back, the nearest point is read out.
 (function () {
   const dark = matchMedia("(prefers-color-scheme: dark)");
+  let printing = false;
   // Okabe and Ito's palette: told apart by colour-blind readers too.
-  const palette = () => dark.matches
-    ? ["#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#d55e00"]
-    : ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9"];
+  const palette = () => dark.matches && !printing
+    ? ["#56b4e9", "#e69f00", "#2fbf94", "#cc79a7", "#f0e442", "#d55e00"]
+    : ["#0072b2", "#d55e00", "#009e73", "#b0568a", "#8a6d00", "#2b8fc9"];
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const text = value => String(Number(value.toPrecision(5))).replace("-", "\u2212");
 
-  function draw(mark, colour) {
+  function draw(series, colour, floor) {
+    const mark = series.mark;
     return (u, index) => {
-      uPlot.orient(u, index, (series, dx, dy, sx, sy, posX, posY, left, top, width, height) => {
+      uPlot.orient(u, index, (_, dx, dy, sx, sy, posX, posY, left, top, width, height) => {
         const [xs, ys] = u.data[index];
         const ctx = u.ctx, dpr = devicePixelRatio || 1;
         const x = value => posX(value, sx, width, left), y = value => posY(value, sy, height, top);
@@ -20,9 +23,11 @@
         ctx.rect(left, top, width, height);
         ctx.clip();
         ctx.strokeStyle = ctx.fillStyle = colour;
-        ctx.lineWidth = 1.4 * dpr;
+        ctx.lineWidth = 1.5 * dpr;
+        ctx.lineJoin = "round";
         if (mark === "points") {
-          const radius = (xs.length > 600 ? 1.3 : 2.2) * dpr;
+          const radius = (xs.length > 1500 ? 1.1 : xs.length > 500 ? 1.5 : xs.length > 40 ? 2 : 3.2) * dpr;
+          ctx.globalAlpha = xs.length > 500 ? 0.75 : 0.9;
           for (let i = 0; i < xs.length; i++) {
             if (ys[i] === null) continue;
             ctx.beginPath();
@@ -30,12 +35,20 @@
             ctx.fill();
           }
         } else if (mark === "bars") {
-          const bar = Math.max(2 * dpr, Math.min(14 * dpr, 0.6 * width / Math.max(xs.length, 1)));
-          const zero = y(0);
+          const bar = series.bar ? Math.abs(x(series.bar) - x(0)) : Math.max(2, Math.min(12, 0.5 * width / dpr / Math.max(xs.length, 1))) * dpr;
+          const base = y(floor);
           for (let i = 0; i < xs.length; i++) {
-            if (ys[i] !== null) ctx.fillRect(x(xs[i]) - bar / 2, Math.min(zero, y(ys[i])), bar, Math.abs(y(ys[i]) - zero));
+            if (ys[i] === null || ys[i] === floor) continue;
+            const from = Math.min(base, y(ys[i])), size = Math.abs(y(ys[i]) - base);
+            ctx.globalAlpha = series.bar ? 0.28 : 0.85;
+            ctx.fillRect(x(xs[i]) - bar / 2, from, bar, size);
+            if (series.bar) {
+              ctx.globalAlpha = 1;
+              ctx.strokeRect(x(xs[i]) - bar / 2, from, bar, size);
+            }
           }
         } else {
+          if (mark === "dashed") ctx.setLineDash([5 * dpr, 4 * dpr]);
           ctx.beginPath();
           let pen = false;
           for (let i = 0; i < xs.length; i++) {
@@ -51,55 +64,163 @@
     };
   }
 
-  function range(chart, key) {
-    let low = Infinity, high = -Infinity;
-    for (const series of chart.series) {
-      for (const value of series[key]) {
-        if (value === null) continue;
-        if (value < low) low = value;
-        if (value > high) high = value;
-      }
-      if (key === "y" && series.mark === "bars" && low > 0) low = 0;
+  function drawLevels(u, levels) {
+    const ctx = u.ctx, dpr = devicePixelRatio || 1, { left, top, width, height } = u.bbox;
+    ctx.save();
+    ctx.strokeStyle = ctx.fillStyle = css("--ink");
+    ctx.lineWidth = dpr;
+    ctx.font = `${11 * dpr}px ${getComputedStyle(document.body).fontFamily}`;
+    ctx.textAlign = "right";
+    for (const level of levels) {
+      const y = u.valToPos(level.value, "y", true);
+      if (!(y >= top && y <= top + height)) continue;
+      ctx.setLineDash([2 * dpr, 3 * dpr]);
+      ctx.beginPath();
+      ctx.moveTo(left, y);
+      ctx.lineTo(left + width, y);
+      ctx.stroke();
+      if (!level.label) continue;
+      const above = y - top > 16 * dpr;
+      ctx.textBaseline = above ? "bottom" : "top";
+      const w = ctx.measureText(level.label).width + 6 * dpr, h = 14 * dpr;
+      ctx.globalAlpha = 0.8;
+      ctx.fillStyle = css("--ground");
+      ctx.fillRect(left + width - w, above ? y - h - dpr : y + dpr, w, h);
+      ctx.globalAlpha = 1;
+      ctx.fillStyle = css("--ink");
+      ctx.fillText(level.label, left + width - 3 * dpr, above ? y - 2 * dpr : y + 2 * dpr);
     }
-    if (!(low <= high)) return [0, 1];
-    const margin = 0.04 * (high - low) || Math.abs(high) || 1;
-    return [low === 0 && key === "y" ? 0 : low - margin, high + margin];
+    ctx.restore();
+  }
+
+  function range(chart, key) {
+    let low = Infinity, high = -Infinity, bars = false;
+    const see = value => { if (value !== null) { low = Math.min(low, value); high = Math.max(high, value); } };
+    for (const series of chart.series) {
+      for (const value of series[key]) see(value);
+      if (series.mark !== "bars") continue;
+      if (key === "x" && series.bar) for (const value of series.x) { see(value - series.bar / 2); see(value + series.bar / 2); }
+      if (key === "y" && !chart.y_log) { see(0); bars = true; }
+    }
+    if (key === "y") for (const level of chart.levels) see(level.value);
+    if (!(low <= high)) return chart.y_log && key === "y" ? [0.1, 1] : [0, 1];
+    if (key === "y" && chart.y_log) return [low / 1.4, high * 1.4];
+    const margin = (key === "y" && chart.levels.length ? 0.12 : 0.05) * (high - low) || 0.1 * Math.abs(high) || 1;
+    return [bars && low === 0 ? 0 : low - margin, bars && high === 0 ? 0 : high + margin];
+  }
+
+  function swatch(mark, colour) {
+    const shape = {
+      points: `<circle cx="11" cy="5" r="3.4" fill="${colour}"/>`,
+      bars: `<rect x="5" y="0" width="12" height="10" fill="${colour}" fill-opacity=".55" stroke="${colour}"/>`,
+      dashed: `<path d="M0 5h22" stroke="${colour}" stroke-width="2" stroke-dasharray="5 3"/>`,
+      line: `<path d="M0 5h22" stroke="${colour}" stroke-width="2"/>`,
+    };
+    return `<svg viewBox="0 0 22 10" aria-hidden="true">${shape[mark]}</svg>`;
+  }
+
+  function legend(chart, colours) {
+    const row = document.createElement("div");
+    row.className = "legend";
+    chart.series.forEach((series, i) => {
+      if (!series.label) return;
+      const item = document.createElement("span");
+      item.innerHTML = swatch(series.mark, colours[i % colours.length]);
+      item.append(series.label);
+      row.append(item);
+    });
+    if (chart.note) {
+      const note = document.createElement("span");
+      note.className = "note";
+      note.textContent = chart.note;
+      row.append(note);
+    }
+    return row;
+  }
+
+  function readout(u, chart, tip, dot) {
+    const { left, top } = u.cursor;
+    let nearest = null, distance = 24 * 24;
+    if (left >= 0) chart.series.forEach(series => {
+      for (let i = 0; i < series.x.length; i++) {
+        if (series.y[i] === null) continue;
+        const px = u.valToPos(series.x[i], "x"), py = u.valToPos(series.y[i], "y");
+        const away = (px - left) ** 2 + (py - top) ** 2;
+        if (away < distance) { distance = away; nearest = { series, i, px, py }; }
+      }
+    });
+    tip.style.display = dot.style.display = nearest ? "block" : "none";
+    if (!nearest) return;
+    const { series, i, px, py } = nearest;
+    tip.textContent = `${series.label}: ${text(series.y[i])} at ${text(series.x[i])}`;
+    dot.style.left = `${px}px`;
+    dot.style.top = `${py}px`;
+    tip.style.left = `${Math.max(0, Math.min(px + 10, u.over.clientWidth - tip.offsetWidth))}px`;
+    tip.style.top = `${py > 34 ? py - 34 : py + 10}px`;
   }
 
   function plot(holder) {
     const chart = CHARTS[holder.dataset.chart];
     const colours = palette(), ink = css("--faint"), line = css("--line");
-    const axis = label => ({ label, stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 } });
+    const font = `12px ${getComputedStyle(document.body).fontFamily}`;
+    const axis = label => ({
+      label, font, labelFont: font, labelGap: 2, labelSize: 20, stroke: ink,
+      grid: { stroke: line, width: 1 }, ticks: { show: false }, gap: 6,
+    });
     const xRange = range(chart, "x"), yRange = chart.y_range || range(chart, "y");
-    holder.replaceChildren();
+    const values = (u, splits) => splits.map(value => value === null ? "" : text(value));
+    const decades = (u, splits) => values(u, splits.map(value => value > 0 && Math.abs(Math.log10(value) % 1) < 1e-6 ? value : null));
+    const tip = document.createElement("div"), dot = document.createElement("div");
+    tip.className = "tip";
+    dot.className = "dot";
+    holder.replaceChildren(legend(chart, colours));
+    holder.width_drawn = holder.clientWidth;
+    let enlarged = false;
     return new uPlot({
       mode: 2,
       width: holder.clientWidth,
       height: chart.height,
-      cursor: { drag: { x: true, y: true } },
-      legend: { live: false },
+      padding: [8, 10, 0, 0],
+      cursor: { drag: { x: true, y: true, uni: 12 }, points: { show: false } },
+      legend: { show: false },
       scales: {
-        x: { time: false, range: (u, low, high) => u.zoomed ? [low, high] : xRange },
-        y: { range: (u, low, high) => u.zoomed ? [low, high] : yRange },
+        x: { time: false, range: (u, low, high) => enlarged ? [low, high] : xRange },
+        y: { distr: chart.y_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : yRange },
       },
-      axes: [axis(chart.x_label), { ...axis(chart.y_label), size: 62 }],
+      axes: [{ ...axis(chart.x_label), values, size: 28 }, { ...axis(chart.y_label), values: chart.y_log ? decades : values, size: 52 }],
       series: [null, ...chart.series.map((series, i) => ({
         label: series.label,
         stroke: colours[i % colours.length],
         fill: colours[i % colours.length],
         facets: [{ scale: "x", auto: true }, { scale: "y", auto: true }],
-        paths: draw(series.mark, colours[i % colours.length]),
+        paths: draw(series, colours[i % colours.length], chart.y_log ? yRange[0] : 0),
       }))],
       hooks: {
-        setSelect: [u => { u.zoomed = u.select.width > 0 || u.select.height > 0; }],
-        ready: [u => u.over.addEventListener("dblclick", () => { u.zoomed = false; u.redraw(true, true); })],
+        setSelect: [u => { enlarged = u.select.width > 0 || u.select.height > 0; }],
+        setCursor: [u => readout(u, chart, tip, dot)],
+        draw: [u => drawLevels(u, chart.levels)],
+        ready: [u => {
+          u.over.append(tip, dot);
+          u.over.addEventListener("dblclick", () => {
+            enlarged = false;
+            u.batch(() => {
+              u.setScale("x", { min: xRange[0], max: xRange[1] });
+              u.setScale("y", { min: yRange[0], max: yRange[1] });
+            });
+          });
+        }],
       },
     }, [null, ...chart.series.map(series => [series.x, series.y])], holder);
   }
 
-  function plotAll() { document.querySelectorAll("[data-chart]").forEach(plot); }
+  const holders = [...document.querySelectorAll("[data-chart]")];
+  const plotAll = () => holders.forEach(plot);
   let pending = 0;
-  addEventListener("resize", () => { clearTimeout(pending); pending = setTimeout(plotAll, 150); });
+  new ResizeObserver(() => {
+    clearTimeout(pending);
+    pending = setTimeout(() => holders.forEach(each => { if (each.clientWidth !== each.width_drawn) plot(each); }), 120);
+  }).observe(document.querySelector("main"));
   dark.addEventListener("change", plotAll);
+  matchMedia("print").addEventListener("change", event => { printing = event.matches; plotAll(); });
   plotAll();
 })();

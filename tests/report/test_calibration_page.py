@@ -1,0 +1,189 @@
+"""The page of a calibration shows what was found, and what could not be."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from hdbridge.calibration import Calibration, Offer
+from hdbridge.calibration.validation import Floor, Stepped, Validation
+from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.identify.intervals import Interval
+from hdbridge.identify.noise import NoiseModel
+from hdbridge.identify.orders import Order
+from hdbridge.identify.result import (
+    ChosenOrder,
+    FitResult,
+    HeldOut,
+    NoiseFigures,
+    Nuisance,
+    Outliers,
+    ResidualTest,
+    Traces,
+)
+from hdbridge.identify.spectrum import Curve, Line, Resolution, Spectrum
+from hdbridge.model import TransmissionModel
+from hdbridge.report.calibration import calibration_page
+from hdbridge.report.page import render
+from hdbridge.stepping import Scatter
+
+
+def model(amplitude, phase, offset):
+    return TransmissionModel(
+        50.0,
+        (
+            Synchronous(orders=(MotorOrder(order=2, amplitude_arcsec=amplitude, phase_deg=phase),)),
+            Hysteresis(offset_arcsec=offset, width_deg=20.0, exponent=1.6),
+        ),
+    )
+
+
+def traces():
+    """A sweep there and back over one load turn, then two sines with a pause in between."""
+    there = np.linspace(0.0, 18_000.0, 4000)
+    sine = 45.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400))
+    motor = np.concatenate([there, there[::-1], sine])
+    direction = np.concatenate([np.ones(4000), -np.ones(4000), np.sign(np.gradient(sine))])
+    kind = np.concatenate([np.zeros(8000), np.ones(400)]).astype(np.intp)
+    time = np.arange(8400) * 0.05
+    time[8200:] += 100.0
+    error = 30.0 * direction + 5.0 * np.cos(np.radians(2 * motor))
+    residual = np.random.default_rng(1).normal(size=len(motor))
+    return Traces(
+        time, motor, motor / 50.0, direction, ("sweep", "sine"), kind, error + residual, error, residual
+    )
+
+
+def fitted():
+    second = Order.motor(2)
+    return FitResult(
+        model=model(5.0, 170.0, 30.0),
+        intervals=(
+            Interval("synchronous", "orders[2].amplitude_arcsec", 5.0, 0.0312),
+            Interval("synchronous", "orders[2].phase_deg", 170.0, 1.2),
+            Interval("hysteresis", "offset_arcsec", 30.0, 0.5),
+            Interval("hysteresis", "width_deg", 20.0, 100.0, identifiable=False),
+        ),
+        zeros_arcsec=(0.0,),
+        nuisances=(Nuisance("delay_ms", "the load encoder is read later by", 0.25, 0.02, "ms"),),
+        noise=NoiseFigures(None, 0.4, NoiseModel(0.3, 0.4), 1.0, 8400, 800.0),
+        outliers=Outliers(3, 1),
+        orders=(ChosenOrder(second, 5.0, 900.0, 16.0),),
+        spectrum=Spectrum(
+            (
+                Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05),
+                Line(second, 5.0, 170.0, 0.01, 0.05),
+            ),
+            Resolution(50.0, 1.0, 0.02, 1.0, ()),
+            Curve(np.linspace(0.0, 30.0, 301), np.linspace(0.0, 3.0, 301)),
+        ),
+        residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),
+        held_out=HeldOut(20.0, 1.0, 1.0, 2, "motor turns", True, "improves on no model: 20.0 to 1.0 arcsec"),
+        traces=traces(),
+        warnings=("the width <cannot> be known: no small reversals",),
+    )
+
+
+def result(**more):
+    fit = fitted()
+    return Calibration(recordings=("rec",), fit=fit, model=fit.model, active=None, **more)
+
+
+def read(calibration):
+    text = render(calibration_page(calibration))
+    charts = json.loads(re.search(r"const CHARTS = (.*);\n", text).group(1))
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", text)
+    return text, dict(zip(captions, charts, strict=True))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return read(result())
+
+
+def labels(chart):
+    return [each["label"] for each in chart["series"]]
+
+
+def test_error_is_shown_over_both_angles_in_both_directions(plain):
+    _, charts = plain
+    assert labels(charts["Error over the motor angle"])[:2] == ["forward", "backward"]
+    mean = dict(
+        zip(
+            labels(charts["Error over the load angle"]),
+            charts["Error over the load angle"]["series"],
+            strict=True,
+        )
+    )
+    # the wave has two periods in a motor turn, so means of whole motor turns are the hysteresis alone
+    assert mean["mean, forward"]["y"][2:-2] == pytest.approx(
+        [30.0] * (len(mean["mean, forward"]["y"]) - 4), abs=0.6
+    )
+    assert mean["mean, backward"]["y"][5] == pytest.approx(-30.0, abs=0.6)
+
+
+def test_a_loop_is_parted_where_nothing_was_measured(plain):
+    _, charts = plain
+    measured, predicted = charts["Sine of ±45 deg"]["series"]
+    assert None not in measured["y"]
+    assert [i for i, y in enumerate(predicted["y"]) if y is None] == [200]
+
+
+def test_the_spectrum_sets_the_threshold_against_the_orders_that_it_is_for(plain):
+    _, charts = plain
+    (chart,) = (each for each in charts.values() if each["y_log"])
+    alone, together, threshold, chosen = chart["series"]
+    assert together["x"] == threshold["x"] == [2, 3]
+    assert together["y"] == [5, 0.02]
+    assert chosen["x"] == [2]
+    assert max(alone["x"]) <= 16
+
+
+def test_figures_have_the_digits_that_their_interval_allows(plain):
+    text, _ = plain
+    row = re.search(r"synchronous, order 2: amplitude.*?</tr>", text).group(0)
+    assert re.findall(r">([^<>]+)</td>", row) == ["5.000", "0.031", "arcsec"]
+
+
+def test_what_cannot_be_known_stands_in_brackets(plain):
+    text, _ = plain
+    row = re.search(r"hysteresis: width.*?</tr>", text).group(0)
+    assert "(20)" in row
+    assert "not known" in row
+    assert "In brackets: what these data cannot say." in text
+
+
+def test_notes_are_announced_at_the_top_and_stay_text(plain):
+    text, _ = plain
+    assert "Read the note under" in text
+    assert "the width &lt;cannot&gt; be known" in text
+
+
+def test_a_change_of_phase_goes_the_short_way_round():
+    text, _ = read(dataclasses.replace(result(), active=model(4.0, -170.0, 30.0)))
+    row = re.search(r"synchronous, order 2: phase.*?</tr>", text).group(0)
+    assert "\N{MINUS SIGN}20" in row
+
+
+def test_before_and_after_are_drawn_to_one_scale():
+    errors = ((30.0, 32.0), (-30.0, -28.0))
+    targets = ((1.0, 2.0), (2.0, 1.0))
+    before = Stepped("no compensation", *[Scatter(90.0, 1.0)] * 3, errors, targets)
+    after = Stepped("the new model", *[Scatter(5.68, 0.1)] * 3, ((1.0, -1.0), (0.5, 0.0)), targets)
+    checked = Validation(before, after, Floor(2.84, 0.0))
+    text, charts = read(
+        result(axis="demo", validation=checked, offer=Offer(True, "stepping 3 sigma 90 to 5.68 arcsec"))
+    )
+    assert "2.00 times that" in text
+    assert charts["Before: no compensation"]["y_range"] == charts["After: the new model"]["y_range"]
+    assert charts["After, enlarged"]["y_range"] is None
+    assert '<p class="verdict">Stepping 3 sigma 90 to 5.68 arcsec. Read the note' in text
+
+
+def test_a_fit_without_stepping_and_reference_pose_has_a_page_too(plain):
+    text, charts = plain
+    assert "Stepping test" not in text
+    assert "Reference pose" not in charts
+    assert len(text) < 1_000_000
