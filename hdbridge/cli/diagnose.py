@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, write_json
+from hdbridge.cli.options import JsonOption, console, notes, write_json
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.planned import plan_report
 from hdbridge.errors import InputError
@@ -31,7 +31,6 @@ def run(
         Path | None, typer.Option("--model", metavar="MODEL.yaml", help="The model that is put to the test.")
     ] = None,
     json_file: JsonOption = None,
-    html_file: HtmlOption = None,
     extend: Annotated[
         Path | None, typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model.")
     ] = None,
@@ -81,17 +80,6 @@ def run(
     if extend is not None:
         result.model.save(extend)
         notes.print(f"wrote {extend}")
-    if html_file is not None:
-        write_page(html_file, result)
-
-
-def write_page(path: Path, result: Diagnosis) -> None:
-    """The page for people, where the reports have one."""
-    try:
-        from hdbridge.report.diagnosis import write_diagnosis  # type: ignore[import-not-found]  # noqa: PLC0415
-    except ImportError:
-        raise InputError(f"{path}: this version writes no page for a diagnosis; use --json") from None
-    write_diagnosis(path, result)
 
 
 def _print(result: Diagnosis) -> None:
