@@ -96,6 +96,7 @@ class Firmware:
             0x60F4: lambda: wrap_int32(motion.user(motion.demand_counts) - motion.user(motion.motor_counts)),
             0x60FC: lambda: wrap_int32(round(motion.demand_counts)),
             0x2100: lambda: round(10.0 * motion.machine.temperature_c),
+            0x2101: lambda: round(1000.0 * motion.machine.load_torque_nm),
         }.items():
             entry[key, 0].bind(read)
         entry[0x60E4, 1].bind(lambda: wrap_int32(motion.load_counts))

@@ -28,6 +28,7 @@ class IdealMotor:
         self.velocity_counts_s = 0.0
         self.torque_permille = 0
         self.temperature_c = 23.4
+        self.load_torque_nm = -1.25
         self.stuck = False
         self.elapsed_s = 0.0
         self.powered = False

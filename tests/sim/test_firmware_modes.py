@@ -331,6 +331,7 @@ def test_feedback_objects(master, motor):
     assert master.read(0x6063) == 100
     assert master.read(0x6077) == -12
     assert master.read(0x2100) == 234
+    assert master.read(0x2101) == -1250
     master.enable_csp()
     target = master.cruise(10, 20)
     assert master.read(0x60E5, 1) == pytest.approx(7.2 * 2500, rel=0.02)
