@@ -151,6 +151,16 @@ def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
     return Floor(quantisation, 3.0 * math.hypot(noise, count))
 
 
+def validation_s(plan: Plan, axis: AxisConfig) -> float:
+    """How long a plan's validation takes at an ideal axis."""
+    view = axis_view(axis)
+    stepping, positioning = plan.stepping(view), plan.positioning(view)
+    each_s = rehearse(stepping, view, stepping.start_deg).duration_s
+    if positioning:
+        each_s += rehearse(positioning, view, positioning.targets_deg[0]).duration_s
+    return 2.0 * each_s
+
+
 def validate(
     drive: Drive,
     plan: Plan,
@@ -169,10 +179,7 @@ def validate(
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
     positioning = plan.positioning(axis_view(axis))
-    each_s = rehearse(stepping, axis_view(axis), stepping.start_deg).duration_s
-    if positioning:
-        each_s += rehearse(positioning, axis_view(axis), positioning.targets_deg[0]).duration_s
-    pace = Pace(2.0 * each_s, axis.drive.cycle_s, progress, interrupted)
+    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, progress, interrupted)
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
     for name, model, words in (

@@ -14,6 +14,7 @@ from rich.markup import escape
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import Calibration, Journal, calibrate, start_journal
 from hdbridge.calibration.measure import identity_of, outlook
+from hdbridge.calibration.validation import validation_s
 from hdbridge.cli.findings import print_calibration, write_calibration_page
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
@@ -137,7 +138,9 @@ def _announce(plan: Plan, axis: AxisConfig, journal: Journal | None) -> None:
         notes.print(escape(f"plan '{plan.name}': {each}"))
     done = f" ({len(journal.done)} tasks are there already)" if journal else ""
     notes.print(
-        f"plan '{plan.name}': {len(left.tasks)} tasks, {left.duration_s / 60:.1f} min of the axis{done}"
+        f"plan '{plan.name}': {len(left.tasks)} tasks{done}, {left.duration_s / 60:.1f} min of the axis, and "
+        f"{validation_s(plan, axis) / 60:.1f} min to test the model",
+        soft_wrap=True,
     )
 
 
