@@ -60,21 +60,22 @@ def compliance(site: Site) -> Hidden:
 
 
 def inertial_windup(site: Site) -> Hidden:
-    """A heavier load on a softer spring."""
+    """A heavier load on a softer spring; no less wind-up than the axis has already."""
     acceleration = math.radians(site.run.load_acceleration_deg_s2)
     inertia = site.truth.load_.whole_inertia_kg_m2
     present = inertia * acceleration / site.truth.gear.stiffness_nm_per_rad * ARCSEC_PER_RAD
-    more = site.size_arcsec / present
+    size = max(site.size_arcsec, present)
+    more = size / present
     heavier = more ** site.uniform(0.2, 0.5)
     site.load["inertia_kg_m2"] += (heavier - 1.0) * inertia
     site.gear["stiffness_nm_per_rad"] *= heavier / more
     # The same damping ratio as before.
     site.gear["damping_nm_s_per_rad"] *= heavier / math.sqrt(more)
-    frequency_hz = math.sqrt(acceleration / site.size_arcsec * ARCSEC_PER_RAD) / math.tau
+    frequency_hz = math.sqrt(acceleration / size * ARCSEC_PER_RAD) / math.tau
     _tell_servo(site, heavier, frequency_hz)
     return Hidden(
         "inertial_windup",
-        site.size_arcsec,
+        size,
         f"wind-up at {site.run.load_acceleration_deg_s2:g} deg/s^2",
         f"load on its spring at {frequency_hz:.1f} Hz",
         {"frequency_hz": frequency_hz, "seconds_squared": 1.0 / (math.tau * frequency_hz) ** 2},
