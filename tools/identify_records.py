@@ -103,6 +103,7 @@ def plan(
     """Legs of load targets: pre-conditioning, rest, sweeps, sines, nested reversals, steps."""
     legs: list[tuple[str, np.ndarray]] = []
     at = 0.0
+    speed *= 1.00713  # or it may keep step with the encoder's counts
 
     def go(kind: str, end: float, velocity: float) -> None:
         nonlocal at

@@ -10,7 +10,7 @@ vanish by themselves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -30,10 +30,15 @@ TEXTS = {
     ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts"}
-MOST_TURNS = 120
+MOST_TURNS = 80
+SMALLEST_TURN = 1e-3
 COUNTS = 0.29
 """Standard deviation that an unknown place within a count has."""
-SPEEDS_COUNTS_S = (0.0, 50.0, 200.0, 800.0, 3200.0, np.inf)
+DIFFERENT_COUNTS = 0.15
+"""The same for how much rounding differs from one speed to another."""
+LOCKED_COUNTS = 0.03
+"""At least so much there may be at any speed: it may keep step with the counts."""
+SPEEDS_COUNTS_S = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0, np.inf)
 """Edges of the classes of speed that round alike; at rest is a class of its own."""
 AVERAGED_COUNTS_S = 200.0
 """Faster than this a servo passes several counts before it answers, and rounding averages out."""
@@ -59,6 +64,12 @@ class Beside:
             np.concatenate([self.prior, np.zeros(columns.shape[1])]),
         )
 
+    def without(self, left_out: Callable[[str], bool]) -> Beside:
+        """Without the columns whose names answer."""
+        keep = np.array([not left_out(each) for each in self.names])
+        names = tuple(each for each in self.names if not left_out(each))
+        return Beside(self.columns[:, keep], names, self.prior[keep])
+
     def rows(self, index: IntArray) -> Beside:
         """For some of the blocks."""
         return Beside(self.columns[index], self.names, self.prior)
@@ -78,21 +89,23 @@ def delay_column(design: Design) -> FloatArray:
 
 
 def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
-    """A count in the direction of motion, arcsec, at rest and per class of speed; how many there may be.
+    """A count in the direction of motion, arcsec: at rest, per class of speed, and in all of them together.
 
-    Columns (b, classes), and standard deviations in counts (classes,).
+    Columns (b, classes + 2), and how many counts there may be of each (standard deviations).
     """
     blocks, samples = design.blocks, design.samples
     count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
     rate = np.abs(blocks.speed_deg_s) / max(samples.count_deg, 1e-12)
-    columns = [-blocks.heading * ~blocks.moving * count_arcsec]
-    sizes = [COUNTS]
+    share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
+    columns = [~blocks.moving, np.where(blocks.moving, share, 1.0)]
+    sizes = [DIFFERENT_COUNTS, COUNTS]
     for low, high in pairwise(SPEEDS_COUNTS_S):
         inside = blocks.moving & (rate >= low) & (rate < high)
         if inside.any():
-            columns.append(-blocks.heading * inside * count_arcsec)
-            sizes.append(COUNTS * min(1.0, AVERAGED_COUNTS_S / max(float(np.median(rate[inside])), 1.0)))
-    return np.stack(columns, axis=1), np.array(sizes)
+            columns.append(inside)
+            sizes.append(max(DIFFERENT_COUNTS * float(np.median(share[inside])), LOCKED_COUNTS))
+    against = -blocks.heading * count_arcsec
+    return np.stack([against * each for each in columns], axis=1), np.array(sizes)
 
 
 def turn_columns(design: Design, effects: Sequence[Effect]) -> FloatArray:
@@ -100,7 +113,7 @@ def turn_columns(design: Design, effects: Sequence[Effect]) -> FloatArray:
     change, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
     most = np.argsort(weight)[::-1][:MOST_TURNS]
-    chosen = np.sort(most[weight[most] > 0])
+    chosen = np.sort(most[weight[most] > SMALLEST_TURN * np.max(weight, initial=0.0)])
     return np.asarray((turn[:, np.newaxis] == chosen) * change[:, np.newaxis])
 
 

@@ -20,7 +20,7 @@ from hdbridge.identify.residuals import residual_tests
 from hdbridge.identify.result import ChosenOrder, FitResult, NoiseFigures, Nuisance, Outliers, Traces
 from hdbridge.identify.samples import KINDS, Samples
 from hdbridge.identify.spectrum import Curve, Spectrum, assemble, plain_spectrum
-from hdbridge.identify.state import State
+from hdbridge.identify.state import State, System
 from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -30,11 +30,12 @@ def conclude(
     solution: Solution,
     cov: FloatArray,
     selection: Selection,
+    system: System,
     outliers: Outliers,
     options: FitOptions,
     warnings: list[str],
 ) -> FitResult:
-    """The result of an identification."""
+    """The result of an identification; ``system`` is the state's, with the final noise."""
     design, blocks, samples = state.design, state.design.blocks, state.design.samples
     problem = state.problem(selection)
     precision = state.precision()
@@ -61,7 +62,7 @@ def conclude(
         (_predicted(design, each) for each in solution.effects if isinstance(each, Synchronous)),
         start=np.zeros(len(blocks)),
     )
-    lines = _lines(state, selection, clean, options)
+    lines = _lines(state, selection, system, clean, options)
     _describe_limits(selection, lines, outliers, samples, warnings)
     active = _sum(design, options.active.effects if options.active else ())
     return FitResult(
@@ -110,9 +111,11 @@ def _sum(design: Design, effects: tuple[Effect, ...]) -> FloatArray:
     return sum((_predicted(design, each) for each in effects), start=np.zeros(len(design.blocks)))
 
 
-def _lines(state: State, selection: Selection, clean: FloatArray, options: FitOptions) -> Spectrum:
+def _lines(
+    state: State, selection: Selection, system: System, clean: FloatArray, options: FitOptions
+) -> Spectrum:
     """Each candidate's line beside everything that is in the fit: what it is, or what it would add."""
-    information, right = state.information()
+    information, right = system
     waves = 2 * len(state.candidates)
     inside = [
         2 * index + part

@@ -16,7 +16,7 @@ from hdbridge.effects import FloatArray
 
 LAG_SAMPLES = 5
 """Samples over which the lag of the motor behind its command is averaged."""
-CHATTER_COUNTS = 1.6
+CHATTER_COUNTS = 2.6
 """A measured angle counts as turned round when it has come back by more than this many counts."""
 
 SMALLEST_COUNT_DEG = 1e-5

@@ -22,7 +22,7 @@ from hdbridge.identify.orders import Selection
 from hdbridge.identify.result import FitResult, Outliers
 from hdbridge.identify.samples import Samples, gather
 from hdbridge.identify.segment import Segment
-from hdbridge.identify.state import State, candidate_orders
+from hdbridge.identify.state import State, System, candidate_orders
 
 MINIMUM_USABLE = 50
 EFFECT_SHARE = 1e-3
@@ -49,9 +49,9 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
         )
     state = _prepare(samples, options, warnings)
     state = _search(state, warnings)
-    state, solution, selection, outliers = _settle(state, options)
+    state, solution, selection, system, outliers = _settle(state, options)
     solution, cov = _hold_what_is_unknown(state, solution, selection, options, warnings)
-    return conclude(state, solution, cov, selection, outliers, options, warnings)
+    return conclude(state, solution, cov, selection, system, outliers, options, warnings)
 
 
 def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> State:
@@ -124,7 +124,7 @@ def _search(state: State, warnings: list[str]) -> State:
     return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
 
 
-def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selection, Outliers]:
+def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selection, System, Outliers]:
     """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
     selection = state.selected(options)
     problem = state.problem(selection)
@@ -142,12 +142,13 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
         solution = joint_fit(state.problem(selection), state.precision())
         noise = fit_noise(solution.residual, state.design.blocks, solution.jacobian.shape[1], state.noise)
         state = state.after(solution)._replace(noise=noise)
-        again = state.selected(options)
+        system = state.information()
+        again = state.selected(options, system)
         if again.chosen == selection.chosen and turn:
             break
         selection = again
     solution = joint_fit(state.problem(selection), state.precision())
-    return state.after(solution), solution, selection, outliers
+    return state.after(solution), solution, selection, system, outliers
 
 
 def _hold_what_is_unknown(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,8 +34,9 @@ def held_out(
     """
     blocks = problem.design.blocks
     fold, over = folds(problem)
-    # Turns and rounding are noise of the fit, not something that an active model could be given.
-    shift = problem.beside.columns[:, [not is_rounding(each) for each in problem.beside.names]]
+    # Turns and rounding are noise of the fit, not something that a model could be given.
+    problem = replace(problem, beside=problem.beside.without(is_rounding))
+    shift = problem.beside.columns
     before = np.zeros(len(blocks))
     after = np.zeros(len(blocks))
     used = np.zeros(len(blocks), dtype=bool)

@@ -281,9 +281,12 @@ class JointFit:
         columns += [Column(index, name, shape=True) for index, name in where]
         linear_columns = np.concatenate([self._static, linear.dynamic], axis=1)[:, order]
         jacobian = np.concatenate([linear_columns, shapes], axis=1)
-        prior = np.concatenate([self._prior, np.zeros(jacobian.shape[1] - len(self._prior))])
-        prior[: len(order)] = np.concatenate([self._prior, np.zeros(linear.dynamic.shape[1])])[order]
-        information = jacobian.T @ self._precision.apply(jacobian) + np.diag(prior)
+        weighted = self._precision.apply(shapes)
+        cross = jacobian.T @ weighted
+        information = np.empty((jacobian.shape[1],) * 2)
+        information[: len(order), : len(order)] = linear.information[np.ix_(order, order)]
+        information[:, len(order) :] = cross
+        information[len(order) :, :] = cross.T
         residual = self._residual(linear)
         edge = [
             (index, shape.name)

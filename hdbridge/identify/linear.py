@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from hdbridge.effects import FloatArray
 
+RIDGE = 1e-11
+"""Share of each column's square that is added to it, so that what is singular has a small solution."""
+
+NOTHING = 1e-20
+"""Information below this is none."""
+
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Least-norm solution of a positive semi-definite system, columns scaled to one."""
+    """Solution of a positive semi-definite system, columns scaled to one; small where it is singular."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    keep = values > 1e-11 * values[-1] if len(values) else values > 0
-    scaled = right / (scale if right.ndim == 1 else scale[:, np.newaxis])
-    inner = vectors[:, keep].T @ scaled
-    inner = inner / (values[keep] if right.ndim == 1 else values[keep][:, np.newaxis])
-    solved = vectors[:, keep] @ inner
-    return np.asarray(solved / (scale if right.ndim == 1 else scale[:, np.newaxis]))
+    spread = scale if right.ndim == 1 else scale[:, np.newaxis]
+    if not len(matrix):
+        return np.zeros_like(right)
+    scaled = matrix / np.outer(scale, scale)
+    ridge = RIDGE
+    while True:
+        _, solved, failed = dposv(scaled + ridge * np.eye(len(scaled)), right / spread, lower=1)
+        if not failed:
+            return np.asarray(solved / spread).reshape(right.shape)
+        ridge *= 100.0  # rounding has made it indefinite
 
 
 def inverse_symmetric(matrix: FloatArray) -> FloatArray:
     """Inverse of a positive semi-definite matrix by its scaled eigenvalues; huge where it has none."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scale = np.sqrt(np.maximum(np.diag(matrix), NOTHING))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     inverse = vectors @ ((1.0 / np.maximum(values, 1e-12 * values[-1]))[:, np.newaxis] * vectors.T)
     return np.asarray(inverse / np.outer(scale, scale))

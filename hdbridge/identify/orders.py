@@ -86,11 +86,18 @@ def select(
     amplitude is at least ``smallest_arcsec``; it leaves again when later ones take its place.
     """
     pairs = [np.array([2 * index, 2 * index + 1]) for index in range(len(candidates))]
-    always = np.arange(2 * len(candidates), len(information))
+    split = 2 * len(candidates)
+    own = np.diag(information)[:split]
+    twins = _twins(pairs, information)
+    # What is in the fit anyway is eliminated once; the search works on what is left of the candidates.
+    cross = information[split:, :split]
+    explained = solve_symmetric(information[split:, split:], cross)
+    information = information[:split, :split] - cross.T @ explained
+    right = right[:split] - explained.T @ right[split:]
     needed = threshold(len(candidates), family_wise)
     inside: list[int] = []
     for _ in range(2 * len(candidates)):
-        scores = _scores(inside, pairs, always, information, right)
+        scores = _scores(inside, pairs, own, information, right)
         best = max(
             (index for index in range(len(pairs)) if index not in inside),
             key=lambda index: scores[index][0],
@@ -109,16 +116,16 @@ def select(
         inside.append(best)
         for index in list(inside[:-1]):
             rest = [each for each in inside if each != index]
-            score, amplitude, _ = _scores(rest, pairs, always, information, right, only=index)[index]
+            score, amplitude, _ = _scores(rest, pairs, own, information, right, only=index)[index]
             if score <= needed or amplitude < 0.5 * smallest_arcsec:
                 inside.remove(index)
-    scores = _scores(inside, pairs, always, information, right)
+    scores = _scores(inside, pairs, own, information, right)
     unresolved = [
         index for index in range(len(pairs)) if index not in inside and scores[index][2] < 1.0 - NOT_APART**2
     ]
     return Selection(
         tuple(candidates[index] for index in sorted(inside)),
-        tuple((candidates[a], candidates[b]) for a, b in _twins(pairs, information)),
+        tuple((candidates[a], candidates[b]) for a, b in twins),
         tuple(candidates[index] for index in unresolved),
     )
 
@@ -126,13 +133,13 @@ def select(
 def _scores(
     inside: Sequence[int],
     pairs: Sequence[IntArray],
-    always: IntArray,
+    own: FloatArray,
     information: FloatArray,
     right: FloatArray,
     only: int | None = None,
 ) -> dict[int, tuple[float, float, float]]:
     """For each candidate: fall in chi square, amplitude, and the share of it that those inside leave over."""
-    active = np.concatenate([always, *(pairs[index] for index in inside)]).astype(np.intp)
+    active = np.concatenate([np.zeros(0), *(pairs[index] for index in inside)]).astype(np.intp)
     wanted = range(len(pairs)) if only is None else [only]
     columns = np.concatenate([pairs[index] for index in wanted]).astype(np.intp)
     explained = solve_symmetric(information[np.ix_(active, active)], information[np.ix_(active, columns)])
@@ -141,8 +148,7 @@ def _scores(
     result = {}
     for at, index in enumerate(wanted):
         two = slice(2 * at, 2 * at + 2)
-        own = information[np.ix_(pairs[index], pairs[index])]
-        share = float(np.min(np.diag(left[two, two]) / np.maximum(np.diag(own), 1e-300)))
+        share = float(np.min(np.diag(left[two, two]) / np.maximum(own[pairs[index]], 1e-300)))
         if share < 1.0 - NOT_APART**2:
             result[index] = (0.0, 0.0, share)
             continue

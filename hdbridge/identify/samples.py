@@ -21,6 +21,9 @@ SPEED_WINDOW_S = 0.02
 """The speed of a sample is taken over this much time on either side."""
 SETTLE_S = 0.1
 """After a fast move the load is left this much time to come to rest."""
+STANDING_DEG_S = 1e-3
+"""Load speed below which an axis stands."""
+ON_THE_WAY = (Kind.MOVE, Kind.STEP)
 SLOW = (Kind.SWEEP, Kind.SINE, Kind.REVERSAL)
 """Kinds whose own speed is what is meant by slow."""
 
@@ -167,7 +170,11 @@ def _speed(motion: Motion) -> FloatArray:
 
 
 def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s: float | None) -> BoolArray:
-    """Samples that are slow, and not within `SETTLE_S` after fast ones."""
+    """Samples at rest and in slow motions, not within `SETTLE_S` after fast ones.
+
+    A motion counts as a whole, from rest to rest: the start of a fast move is no slow motion. Of moves and
+    steps only the rests are used.
+    """
     moving = np.abs(load_speed)
     slow_kinds = np.isin(kind, [KINDS.index(each) for each in SLOW])
     if slow_deg_s is None:
@@ -179,7 +186,13 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
             slow_deg_s = 3.0 * float(np.median(unknown))
         else:
             slow_deg_s = 0.05
-    fast = moving > slow_deg_s
+    under_way = moving > STANDING_DEG_S
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], under_way, [False]]).astype(np.int8)))
+    fast = under_way & np.isin(kind, [KINDS.index(each) for each in ON_THE_WAY])
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        # Legs that follow one another without a rest are told apart by their kind.
+        for part in np.split(np.arange(begin, end), np.flatnonzero(np.diff(kind[begin:end])) + 1):
+            fast[part] |= bool(np.max(moving[part]) > slow_deg_s)
     last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
     return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))
 

@@ -17,6 +17,9 @@ from hdbridge.identify.orders import Family, Order, Selection, select
 from hdbridge.identify.samples import Samples
 from hdbridge.units import DEG_PER_TURN
 
+System = tuple[FloatArray, FloatArray]
+"""J' K^-1 J and J' K^-1 y."""
+
 
 class State(NamedTuple):
     """Where an identification stands."""
@@ -40,7 +43,7 @@ class State(NamedTuple):
         """Of the present noise model."""
         return Precision(self.noise, self.design.blocks)
 
-    def information(self) -> tuple[FloatArray, FloatArray]:
+    def information(self) -> System:
         """J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
 
         With the tangents in, shapes are refitted with every order that is tried.
@@ -58,9 +61,9 @@ class State(NamedTuple):
         gram[inside, inside] += extra.prior
         return gram, weighted.T @ self.design.blocks.error_arcsec
 
-    def selected(self, options: FitOptions) -> Selection:
-        """The orders that this noise lets one see."""
-        information, right = self.information()
+    def selected(self, options: FitOptions, system: System | None = None) -> Selection:
+        """The orders that this noise lets one see; ``system`` is `information`, where it is at hand."""
+        information, right = system or self.information()
         return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
 
     def problem(self, selection: Selection) -> Problem:
