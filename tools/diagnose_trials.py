@@ -136,7 +136,8 @@ def _words(finding: dict[str, object]) -> str:
 
 
 def main() -> None:
-    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 2
+    given = sys.argv[1] if len(sys.argv) > 1 else "2"
+    first, last = (int(each) for each in given.split("-")) if "-" in given else (0, int(given) - 1)
     names = [*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS]
     if len(sys.argv) > 2:
         names = [
@@ -149,7 +150,7 @@ def main() -> None:
         ]
     counts: dict[str, list[int]] = {}
     for name in names:
-        for seed in range(seeds):
+        for seed in range(first, last + 1):
             there, findings, seconds, result = trial(name, seed)
             found = {str(each["cause"]): set(each["aliases"]) for each in findings}  # type: ignore[call-overload]
             right = sum(

@@ -17,7 +17,7 @@ from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.probability import probability
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import PENALTY, REPEATED, Search, Trail
+from hdbridge.diagnose.search import FLOORS_ARCSEC, PENALTY, REPEATED, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, rest
 from hdbridge.effects import Channel, ChannelSkew, FloatArray, InertialWindup, Start, unmet
@@ -141,6 +141,8 @@ class _Judge:
             plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
             if speed < INERTIA_SHARE * acceleration:
                 trial = self.workshop.fit(fitted.theory.instead(place, plain))
+                if self.search.peak(trial, place) < FLOORS_ARCSEC["inertial_windup"]:
+                    return self.workshop.fit(fitted.theory.without(place))
                 if not trial.theory.effects[place].violations():
                     return trial
         return fitted

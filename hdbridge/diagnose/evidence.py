@@ -29,6 +29,8 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 MOST_POINTS = 50_000
+CHATTER_COUNTS = 1.6
+"""Turns of the driving angle smaller than this are no turns: a servo that settles, not a move."""
 LEAST_SAMPLES = 60
 SPEED_WINDOW_S = 0.03
 SETTLE_S = 0.15
@@ -261,7 +263,7 @@ def _driving(
     rest = lag - line
     if float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    return steadied(target + line, target + line, 0.05 * count)
+    return steadied(target + line, target + line, CHATTER_COUNTS * count)
 
 
 def _smooth(values: FloatArray, window: int) -> FloatArray:

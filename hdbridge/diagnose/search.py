@@ -44,6 +44,12 @@ KIN = (
 """Causes of which one's wrong form leaves a rest that looks like the other."""
 SLOW = 0.8
 """A third pick that leaves more than this of a large rest is the last."""
+EXTRAPOLATED = 2.0
+"""An order is not named on an arc of it whose span is so much smaller than the order itself."""
+ORDER_SHARE_LEFT = 0.03
+"""An order of which the others leave less is a twin of one of them: together they would only cancel."""
+SHORT_TRAVEL = 0.9
+"""Over less than a load turn a flexspline order has to be so much better than an order of the motor."""
 REPEATED = frozenset(
     {
         "motor_order",
@@ -61,6 +67,8 @@ KIN_SHARE = 0.05
 """... so that the second needs this share of the first one's evidence."""
 FLOOR_ARCSEC = 0.5
 """Findings whose peak is smaller than this are of no use to anybody, however certain."""
+FLOORS_ARCSEC = {"inertial_windup": 1.5}
+"""Every axis winds up a little in its fastest moves; it is a finding when it is more than that."""
 LEFTOVER = 2e-5
 """Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
 
@@ -148,6 +156,8 @@ class Search:
             trial = self.workshop.fit(joined(fitted.theory, score.candidate.effect, self.base))
             added = trial.count() - fitted.count()
             net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
+            if score.candidate.cause == "flexspline_order" and self._travel_turns() < 1.0:
+                net *= SHORT_TRAVEL  # not told from the motor's order there, which is the commoner
             key = _key(score.candidate.effect)
             if net <= 0.0 or not self._counts(trial, score.candidate):
                 self._refused.add(key)
@@ -155,6 +165,10 @@ class Search:
             if best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
+
+    def _travel_turns(self) -> float:
+        """Turns of the load that the record covers."""
+        return float(np.ptp(self.workshop.motion.motor_deg)) / 360.0 / self.workshop.evidence.ratio
 
     def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
         """Whether what was added is large enough, physical, and really seen."""
@@ -169,7 +183,14 @@ class Search:
             return False
         if isinstance(effect, LocalDefect) and not seek.is_met(effect, self.workshop):
             return False
-        return self.peak(trial, place) >= FLOOR_ARCSEC
+        if isinstance(effect, CountLoss) and self.workshop.evidence.reversals < 2:
+            return False  # nowhere twice: a step in time may as well be one at a place
+        peak = self.peak(trial, place)
+        if isinstance(effect, OrderSeries):
+            largest = max(each.amplitude_arcsec for each in effect.orders)
+            if largest > EXTRAPOLATED * peak:
+                return False
+        return peak >= FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC)
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
@@ -184,7 +205,9 @@ class Search:
         scores = [
             each
             for each in self._scores(fitted)
-            if _key(each.candidate.effect) not in self._refused and each.candidate.cause not in present
+            if _key(each.candidate.effect) not in self._refused
+            and each.candidate.cause not in present
+            and not (isinstance(each.candidate.effect, OrderSeries) and each.share < ORDER_SHARE_LEFT)
         ]
         net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
         best: dict[str, Score] = {}
@@ -264,8 +287,8 @@ class Search:
             largest = max(gain for gain, _ in gains.values())
             place = min(gains, key=lambda each: gains[each][0] - self._toll(fitted, each))
             gain, without = gains[place]
-            small = self.peak(fitted, place) < FLOOR_ARCSEC
             name = fitted.theory.effects[place].name
+            small = self.peak(fitted, place) < FLOORS_ARCSEC.get(name, FLOOR_ARCSEC)
             kin = [
                 gains[other][0]
                 for other in gains

@@ -1,0 +1,86 @@
+"""`hdbridge diagnose` from files to files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from hdbridge.cli import app
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+RUN = CliRunner()
+
+
+@pytest.fixture
+def files(
+    tmp_path: Path, columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> tuple[Path, Path]:
+    hidden = {"motor_order": {"orders": [(5, 4.0, 30.0)]}}
+    Record(columns(hidden)).write_csv(tmp_path / "record.csv.gz")
+    model.save(tmp_path / "model.yaml")
+    return tmp_path / "record.csv.gz", tmp_path / "model.yaml"
+
+
+def test_it_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_path: Path) -> None:
+    out, new = tmp_path / "out.json", tmp_path / "new.yaml"
+    command = ["diagnose", str(files[0]), "--model", str(files[1]), "--json", str(out), "--extend", str(new)]
+    result = RUN.invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0
+    data = json.loads(out.read_text())
+    assert [each["cause"] for each in data["findings"]] == ["motor_order"]
+    assert "motor_order" in [each.name for each in TransmissionModel.load(new).effects]
+    assert "motor_order" in result.output
+
+
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--model", "nowhere.yaml"], ["--plan", "nowhere"]],
+    ids=["no model", "no file", "no plan"],
+)
+def test_bad_input_is_refused(options: list[str], files: tuple[Path, Path]) -> None:
+    records = [] if "--plan" in options else [str(files[0])]
+    options = [*options, "--model", str(files[1])] if "--plan" in options else options
+    with pytest.raises(InputError):
+        RUN.invoke(app, ["diagnose", *records, *options], catch_exceptions=False)
+
+
+def test_a_plan_is_judged_before_anything_moves(files: tuple[Path, Path], tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(
+        "schema: hdbridge.plan/1\nname: small\nprocedures:\n"
+        "  - {procedure: standstill, duration_s: 5}\n"
+        "  - {procedure: sweep, motor_turns: 6, motor_turns_per_s: 0.5}\n"
+    )
+    out = tmp_path / "plan.json"
+    command = ["diagnose", "--plan", str(plan), "--model", str(files[1]), "--json", str(out)]
+    assert RUN.invoke(app, command, catch_exceptions=False).exit_code == 0
+    found = json.loads(out.read_text())["identifiability"]
+    assert found["motor_order"]["detectable"]
+    # Six motor turns are an eighth of a load turn: nothing tells these apart.
+    assert set(found["load_order"]["aliases"]) & {"ratio_error", "compliance"}
+
+
+@pytest.mark.skipif(not (DATA / "cobot").is_dir(), reason="no ../shared/data/cobot beside the repository")
+@pytest.mark.parametrize(("joint", "expected"), [(4, {"motor_order"}), (5, {"compliance"})])
+def test_a_real_robot_joint(joint: int, expected: set[str], tmp_path: Path) -> None:
+    """Four short one-way moves, no command: useful, but nothing is certain."""
+    model = tmp_path / "model.yaml"
+    model.write_text("schema: hdbridge.model/1\nratio: 100\neffects: []\n")
+    records = sorted(str(each) for each in (DATA / "cobot").glob(f"joint{joint}-*.csv"))
+    out = tmp_path / "out.json"
+    command = ["diagnose", *records, "--model", str(model), "--independent-zeros", "--json", str(out)]
+    assert RUN.invoke(app, command, catch_exceptions=False).exit_code == 0
+    data = json.loads(out.read_text())
+    found = {each["cause"]: each for each in data["findings"]}
+    assert expected <= set(found)
+    assert not set(found) & {"local_defect", "count_loss", "vibration", "backlash", "load_order"}
+    assert all(each["probability"] <= 0.6 for name, each in found.items() if name != "unexplained")
+    assert data["extended"]["rms_arcsec"] < 0.4 * data["baseline"]["rms_arcsec"]
