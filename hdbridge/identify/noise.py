@@ -18,8 +18,8 @@ from hdbridge.effects import FloatArray
 from hdbridge.identify.blocks import Blocks
 from hdbridge.identify.samples import BoolArray, IntArray
 
-PIECES = 24
-PIECE_BLOCKS = 300
+PIECES = 16
+PIECE_BLOCKS = 250
 SMALLEST_ARCSEC = 1e-3
 
 

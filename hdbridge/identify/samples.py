@@ -23,6 +23,8 @@ SETTLE_S = 0.1
 """After a fast move the load is left this much time to come to rest."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis stands."""
+GENTLE_DEG_S2 = 5.0
+"""Load acceleration that a motion of which nothing is known may have."""
 ON_THE_WAY = (Kind.MOVE, Kind.STEP)
 SLOW = (Kind.SWEEP, Kind.SINE, Kind.REVERSAL)
 """Kinds whose own speed is what is meant by slow."""
@@ -115,7 +117,7 @@ def gather(
     )
     load = np.concatenate([each.load_deg for each in segments])
     kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
-    speed = np.concatenate([_speed(each.motion) for each in chains])
+    speed = np.concatenate([_rate(time[each.rows], each.motion.motor_deg) for each in chains])
     zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
     _check_ratio(measured, load, zero, ratio, segments[0].name)
     error = load - measured / ratio
@@ -157,41 +159,34 @@ def _motion(segments: Sequence[Segment]) -> Motion:
     )
 
 
-def _speed(motion: Motion) -> FloatArray:
-    """Motor speed over a short window about each sample, degrees per second."""
-    time = motion.time_s
-    if time is None or len(time) < 2:
-        return np.zeros(len(motion))
+def _rate(time: FloatArray, angle: FloatArray) -> FloatArray:
+    """Rate of change over a short window about each sample, per second."""
+    if len(time) < 2:
+        return np.zeros(len(time))
     later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW_S, "right"), len(time) - 1)
     earlier = np.maximum(np.searchsorted(time, time - SPEED_WINDOW_S, "left") - 1, 0)
     span = time[later] - time[earlier]
-    travel = motion.motor_deg[later] - motion.motor_deg[earlier]
-    return np.divide(travel, span, out=np.zeros(len(time)), where=span > 0)
+    return np.divide(angle[later] - angle[earlier], span, out=np.zeros(len(time)), where=span > 0)
 
 
 def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s: float | None) -> BoolArray:
     """Samples at rest and in slow motions, not within `SETTLE_S` after fast ones.
 
-    A motion counts as a whole, from rest to rest: the start of a fast move is no slow motion. Of moves and
-    steps only the rests are used.
+    A motion counts as a whole, from rest or turn to the next: the start of a fast move is no slow motion. Of
+    moves and steps only the rests are used. Where nothing is known of a record, what accelerates is left out.
     """
     moving = np.abs(load_speed)
-    slow_kinds = np.isin(kind, [KINDS.index(each) for each in SLOW])
+    own = moving[np.isin(kind, [KINDS.index(each) for each in SLOW]) & (moving > 0)]
     if slow_deg_s is None:
-        own = moving[slow_kinds & (moving > 0)]
-        unknown = moving[(kind == KINDS.index(Kind.UNKNOWN)) & (moving > 0)]
-        if len(own):
-            slow_deg_s = 1.2 * float(np.quantile(own, 0.995))
-        elif len(unknown):
-            slow_deg_s = 3.0 * float(np.median(unknown))
-        else:
-            slow_deg_s = 0.05
+        slow_deg_s = 1.2 * float(np.quantile(own, 0.995)) if len(own) else np.inf
     under_way = moving > STANDING_DEG_S
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], under_way, [False]]).astype(np.int8)))
     fast = under_way & np.isin(kind, [KINDS.index(each) for each in ON_THE_WAY])
+    fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(_rate(time, load_speed)) > GENTLE_DEG_S2)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], under_way, [False]]).astype(np.int8)))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        # Legs that follow one another without a rest are told apart by their kind.
-        for part in np.split(np.arange(begin, end), np.flatnonzero(np.diff(kind[begin:end])) + 1):
+        # Motions that follow one another without a rest are told apart by their kind and direction.
+        other = (np.diff(kind[begin:end]) != 0) | (np.diff(np.sign(load_speed[begin:end])) != 0)
+        for part in np.split(np.arange(begin, end), np.flatnonzero(other) + 1):
             fast[part] |= bool(np.max(moving[part]) > slow_deg_s)
     last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
     return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))

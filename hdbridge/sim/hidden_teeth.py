@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from hdbridge.sim.hidden_elastic import hang_mass
-from hdbridge.sim.hidden_site import ARCSEC_PER_TURN, Hidden, Site, solve
+from hdbridge.sim.hidden_site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, solve
+from hdbridge.sim.loaded_plant import GRAVITY_M_S2
 
 
 def motor_order(site: Site) -> Hidden:
@@ -43,19 +44,22 @@ def direction_phase(site: Site) -> Hidden:
 
 def torque_modulation(site: Site) -> Hidden:
     """A tooth error that grows with the torque of a mass on the axis."""
-    load = site.truth.load_
-    torque_nm = site.uniform(2.0, 4.0)
+    load, size = site.truth.load_, site.size_arcsec
+    nm_per_arcsec = site.truth.gear.stiffness_nm_per_rad / ARCSEC_PER_RAD
     brings: tuple[str, ...] = ("compliance",)
     if load.gravity is None:
+        # Teeth give way by less than the spring behind them.
+        torque_nm = site.uniform(3.0, 6.0) * size * nm_per_arcsec
         hang_mass(site, torque_nm)
     else:
-        torque_nm = load.gravity.mass_kg * load.gravity.arm_m * 9.80665
+        torque_nm = load.gravity.mass_kg * load.gravity.arm_m * GRAVITY_M_S2
+        size = min(size, 0.5 * torque_nm / nm_per_arcsec)
         brings = ()
-    per_nm = site.size_arcsec / torque_nm / site.tooth_peak_arcsec()
+    per_nm = size / torque_nm / site.tooth_peak_arcsec()
     site.gear["torque_growth_per_nm"] = per_nm
     return Hidden(
         "torque_modulation",
-        site.size_arcsec,
+        size,
         "peak of the change at the highest torque",
         f"tooth error grows by {100 * per_nm:.2f} % per Nm, under a mass of {torque_nm:.2f} Nm",
         {"growth_per_nm": per_nm, "torque_nm": torque_nm},
@@ -73,7 +77,7 @@ def ratio_error(site: Site) -> Hidden:
         site.size_arcsec,
         "error after one turn of the load",
         f"ratio {site.gear['ratio']:.7g} in place of {ratio:.7g}",
-        {"ratio": site.gear["ratio"], "arcsec_per_load_turn": part * ARCSEC_PER_TURN},
+        {"ratio": site.gear["ratio"], "arcsec_per_motor_turn": part * ARCSEC_PER_TURN / ratio},
     )
 
 

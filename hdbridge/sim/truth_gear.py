@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Self
 
 from pydantic import Field, model_validator
 
 from hdbridge.sim.truth_hysteresis import Hysteresis, TrueOrder
 from hdbridge.sim.truth_part import Part
+from hdbridge.units import ARCSEC_PER_DEG
 from hdbridge.yamlfile import wrong
 
 
@@ -144,6 +146,18 @@ class TrueGear(Part):
         return max(
             self.stiffness_nm_per_rad, later.second_stiffness_nm_per_rad, later.third_stiffness_nm_per_rad
         )
+
+    @model_validator(mode="after")
+    def _teeth_give_way_by_less_than_the_spring(self) -> Self:
+        tooth_arcsec = sum(each.amplitude_arcsec for each in self.motor_orders)
+        per_nm = math.radians(tooth_arcsec / ARCSEC_PER_DEG) * abs(self.torque_growth_per_nm)
+        if per_nm * self.stiffest_nm_per_rad >= 1.0:
+            raise wrong(
+                f"{self.torque_growth_per_nm:g} makes the teeth give way more than the spring does; expected "
+                f"less than {abs(self.torque_growth_per_nm) / per_nm / self.stiffest_nm_per_rad:.2g}",
+                "torque_growth_per_nm",
+            )
+        return self
 
     @model_validator(mode="after")
     def _each_order_once(self) -> Self:

@@ -135,6 +135,7 @@ def test_every_cause_is_off_unless_the_file_says_so() -> None:
             "third_stiffness_nm_per_rad: 3.0e4}\n  hysteresis:  ",
             "4 Nm is not above first_torque_nm, 5",
         ),
+        ("  hysteresis:  ", "  torque_growth_per_nm: 0.5\n  hysteresis:  ", "expected less than 0.38"),
         (
             "    direction: 1",
             "    disc: {radius_mm: 10, eccentricity_um: 2000}\n    direction: 1",

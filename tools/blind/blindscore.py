@@ -153,18 +153,16 @@ def _thousandfold(value: float) -> float:
     return 1000.0 * value
 
 
-# By cause: a parameter's name in a finding, its name in hidden.yaml, and what makes the finding's number one
-# of the same unit. Names that are not in a finding are passed over, so spellings may stand side by side.
+# By cause: a parameter's name in a finding (in braces a number of the secret), its name in hidden.yaml, and
+# what makes the finding's number one of the same unit. Names that are not in a finding are passed over, so
+# spellings may stand side by side.
 COMPARABLE: Mapping[str, tuple[Conversion, ...]] = {
-    "motor_order": (("amplitude_arcsec", "amplitude_arcsec", _same),),
-    "flexspline_order": (("amplitude_arcsec", "amplitude_arcsec", _same),),
-    "motor_encoder_eccentricity": (
-        ("amplitude_arcsec", "amplitude_arcsec", _same),
-        ("first_arcsec", "amplitude_arcsec", _same),
-    ),
+    "motor_order": (("order_{order:.0f}_amplitude_arcsec", "amplitude_arcsec", _same),),
+    "flexspline_order": (("order_{order:.0f}_amplitude_arcsec", "amplitude_arcsec", _same),),
+    "motor_encoder_eccentricity": (("order_1_amplitude_arcsec", "amplitude_arcsec", _same),),
     "load_order": (
-        ("amplitude_arcsec", "amplitude_arcsec", _same),
-        ("first_arcsec", "amplitude_arcsec", _same),
+        ("order_1_amplitude_arcsec", "amplitude_arcsec", _same),
+        ("order_2_amplitude_arcsec", "second_arcsec", _same),
     ),
     "direction_phase": (("shift_deg", "shift_deg", _same),),
     "torque_modulation": (("growth_per_nm", "growth_per_nm", _same),),
@@ -192,7 +190,7 @@ COMPARABLE: Mapping[str, tuple[Conversion, ...]] = {
     ),
     "ratio_error": (
         ("ratio", "ratio", _same),
-        ("arcsec_per_load_turn", "arcsec_per_load_turn", _same),
+        ("ramp_arcsec_per_turn", "arcsec_per_motor_turn", _same),
     ),
     "count_loss": (("time_s", "time_s", _same), ("step_arcsec", "step_arcsec", _same)),
     "vibration": (("frequency_hz", "frequency_hz", _same), ("amplitude_arcsec", "amplitude_arcsec", _same)),
@@ -205,9 +203,10 @@ def _compared(hidden: Data, named: list[Data]) -> Iterable[Compared]:
     for finding in named:
         cause = finding["cause"]
         for name, true_name, convert in COMPARABLE.get(cause, ()):
-            there = (finding.get("parameters") or {}).get(name)
-            if there is None or true_name not in truths.get(cause, {}):
+            known = truths.get(cause, {})
+            there = (finding.get("parameters") or {}).get(name.format(**known) if known else name)
+            if there is None or not known.get(true_name):
                 continue
             low, high = sorted(convert(float(each)) for each in there.get("ci95") or (math.nan, math.nan))
-            true = float(truths[cause][true_name])
+            true = float(known[true_name])
             yield Compared(cause, name, convert(float(there["value"])), low, high, true)

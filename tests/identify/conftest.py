@@ -1,0 +1,125 @@
+"""Records of made-up axes, written from the formulas: nothing here is shared with what is tested."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from hdbridge.effects import Start
+from hdbridge.identify import FitOptions, FitResult, Kind, Segment, fit
+
+RATE_HZ = 50.0
+
+
+@dataclass
+class Axis:
+    """An ideal axis with the article's kind of error, read by noisy, counting encoders."""
+
+    ratio: float = 20.0
+    orders: dict[int, tuple[float, float]] = field(
+        default_factory=lambda: {1: (5.0, -120.0), 2: (9.0, 30.0), 6: (3.0, 100.0)}
+    )
+    offset: float = 40.0
+    width: float = 18.0
+    exponent: float = 1.7
+    noise: float = 0.5
+    load_first: float = 0.0
+    motor_counts: float = 65536.0
+    zero_arcsec: float = 700.0
+
+    def error(self, motor_deg: np.ndarray, state: float = 1.0) -> np.ndarray:
+        """Transmission error, branch by branch; ``state`` is the sense of saturation at first."""
+        radians = np.deg2rad(motor_deg)
+        total = sum(
+            amplitude * np.cos(order * radians + np.deg2rad(phase))
+            for order, (amplitude, phase) in self.orders.items()
+        )
+        total = total + self.load_first * np.cos(radians / self.ratio + 0.4)
+        loop, begin, before, sign = np.empty(len(motor_deg)), motor_deg[0], state, state
+        loop[0] = state
+        for index in range(1, len(motor_deg)):
+            step = np.sign(motor_deg[index] - motor_deg[index - 1])
+            if step and step != sign:
+                begin, before, sign = motor_deg[index - 1], loop[index - 1], step
+            xi = min(abs(motor_deg[index] - begin) / self.width, 1.0)
+            n = self.exponent
+            rise = (xi ** (n - 1) - (n - 1) * xi) / (2 - n) if n != 2 else xi * (1 - np.log(xi or 1))
+            loop[index] = sign * min(sign * before + 2 * rise, 1.0)
+        return total + self.offset * loop
+
+    def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0) -> list[Segment]:
+        """Legs of motor angles, one after the other at `RATE_HZ`, as segments."""
+        rng = np.random.default_rng(seed)
+        motor = np.concatenate([each for _, each in legs])
+        count = 360.0 / self.motor_counts
+        motor = np.round(motor / count) * count
+        error = self.error(motor) + self.zero_arcsec + rng.normal(size=len(motor)) * self.noise
+        load = motor / self.ratio + error / 3600.0
+        time = np.arange(len(motor)) / RATE_HZ
+        segments, at = [], 0
+        for kind, leg in legs:
+            part = slice(at, at + len(leg))
+            segments.append(Segment(time[part], motor[part], load[part], Kind.named(kind), name=kind))
+            at += len(leg)
+        return segments
+
+
+def ramp(begin: float, end: float, motor_deg_s: float) -> np.ndarray:
+    """Constant speed, without the first point."""
+    count = max(round(abs(end - begin) / motor_deg_s * RATE_HZ), 1)
+    return np.linspace(begin, end, count + 1)[1:]
+
+
+def wave(amplitude_deg: float, periods: float = 2.0, period_s: float = 10.0) -> np.ndarray:
+    """A sine about zero that begins at its upper extreme."""
+    time = np.arange(1, int(periods * period_s * RATE_HZ) + 1) / RATE_HZ
+    return amplitude_deg * np.cos(2 * np.pi * time / period_s)
+
+
+def bench_plan(turns: float = 20.0, speed: float = 200.3) -> list[tuple[str, np.ndarray]]:
+    """Rest, sweeps both ways, sines of three amplitudes, nested reversals; motor degrees."""
+    end = 360.0 * turns
+    legs = [
+        ("standstill", np.zeros(int(10 * RATE_HZ))),
+        ("sweep", ramp(0.0, end, speed)),
+        ("sweep", ramp(end, 0.0, speed)),
+    ]
+    for amplitude in (180.0, 45.0, 5.0):
+        legs += [("move", ramp(0.0, amplitude, 400.0)), ("sine", wave(amplitude))]
+        legs += [("move", ramp(amplitude, -60.0, 400.0)), ("move", ramp(-60.0, 0.0, 400.0))]
+    for depth in (4.0, 8.0, 16.0):
+        legs += [("move", ramp(0.0, -60.0, 400.0))]
+        for begin, to in (
+            (-60.0, 0.0),
+            (0.0, -depth),
+            (-depth, -depth / 2),
+            (-depth / 2, -depth),
+            (-depth, 0.0),
+        ):
+            legs.append(("reversal", ramp(begin, to, 10.3)))
+    return legs
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What tests need of this file."""
+
+    axis = Axis
+    ramp = staticmethod(ramp)
+    wave = staticmethod(wave)
+    plan = staticmethod(bench_plan)
+    rate_hz = RATE_HZ
+    options = FitOptions(start=Start.FORWARD, highest_order=12)
+
+
+@pytest.fixture(scope="session")
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.fixture(scope="session")
+def standard(bench: Bench) -> FitResult:
+    """The fit of the standard axis on the standard plan, with no model active."""
+    return fit(Axis().record(bench_plan()), 20.0, bench.options)

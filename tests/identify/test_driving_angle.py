@@ -1,0 +1,55 @@
+"""The angle that the hysteresis sees: without chatter, turned round only where the motor turned."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.identify.driving import driving_angle, quantum_deg
+
+
+def turns(path):
+    steps = np.sign(np.diff(path))
+    steps = steps[steps != 0]
+    return np.count_nonzero(np.diff(steps))
+
+
+@given(st.sampled_from([1000, 4096, 8000, 65536, 1_000_000]), st.integers(0, 100))
+def test_the_count_is_found_at_any_speed(counts, seed):
+    count = 360.0 / counts
+    rng = np.random.default_rng(seed)
+    path = np.cumsum(rng.uniform(0.0, 40.0 * count, 3000))
+    assert quantum_deg(np.round(path / count) * count) == pytest.approx(count, rel=1e-6)
+    even = np.arange(3000) * 2.37 * count
+    assert quantum_deg(np.round(even / count) * count) == pytest.approx(count, rel=1e-6)
+
+
+def test_what_has_no_counts_has_none():
+    assert quantum_deg(np.cumsum(np.random.default_rng(1).uniform(0.0, 1.0, 3000))) == 0.0
+    assert quantum_deg(np.zeros(100)) == 0.0
+
+
+def test_a_command_is_taken_as_it_is():
+    path = np.array([0.0, 1.0, 0.999, 2.0])
+    assert driving_angle(path, None, True) is path
+
+
+def test_chatter_of_a_count_makes_no_turns():
+    rng = np.random.default_rng(2)
+    count = 0.045
+    true = np.concatenate([np.linspace(0.0, 20.0, 2000), np.full(500, 20.0), np.linspace(20.0, 5.0, 2000)])
+    measured = np.round((true + rng.normal(size=len(true)) * 0.3 * count) / count) * count
+    assert turns(measured) > 100
+    path = driving_angle(measured, None, False)
+    assert turns(path) == 1
+    assert np.max(np.abs(path - true)) < 2.5 * count
+
+
+def test_a_lagging_motor_turns_where_it_turned_and_not_where_it_was_told_to():
+    time = 0.5 + np.arange(3000) / 250.0
+    command = 30.0 * np.cos(2 * np.pi * time / 4.0)
+    motor = 29.0 * np.cos(2 * np.pi * time / 4.0 - 0.05)
+    count = 0.045
+    path = driving_angle(command, np.round(motor / count) * count, True)
+    assert turns(path) == turns(motor)
+    assert np.max(np.abs(path - motor)) < 1.5 * count

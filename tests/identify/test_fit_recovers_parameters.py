@@ -1,0 +1,188 @@
+"""A fit finds what a made-up axis has, and says how well."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hdbridge.effects import Hysteresis, MotorOrder, Start, Synchronous
+from hdbridge.identify import FitOptions, Segment, fit
+from hdbridge.model import TransmissionModel
+
+
+def off(result, effect, parameter, true):
+    """Error in half widths of the interval."""
+    found = result.interval(effect, parameter)
+    return abs(found.value - true) / found.half_width
+
+
+def test_every_parameter_of_an_axis_is_found_within_its_interval(standard, bench):
+    axis = bench.axis()
+    assert {each.order.number for each in standard.orders} == set(axis.orders)
+    assert off(standard, "hysteresis", "offset_arcsec", axis.offset) < 2.0
+    assert off(standard, "hysteresis", "width_deg", axis.width) < 2.0
+    assert off(standard, "hysteresis", "exponent", axis.exponent) < 2.0
+    for order, (amplitude, phase) in axis.orders.items():
+        assert off(standard, "synchronous", f"orders[{order}].amplitude_arcsec", amplitude) < 2.0
+        assert off(standard, "synchronous", f"orders[{order}].phase_deg", phase) < 2.0
+
+
+def test_intervals_are_narrow_enough_to_be_of_use(standard):
+    assert standard.interval("hysteresis", "offset_arcsec").half_width < 0.4
+    assert standard.interval("hysteresis", "width_deg").half_width < 0.04 * 18.0
+    assert standard.interval("hysteresis", "exponent").half_width < 0.04
+    assert standard.interval("synchronous", "orders[6].amplitude_arcsec").half_width < 0.1
+
+
+def test_the_residual_is_the_noise_and_no_more(standard):
+    assert standard.noise.residual_arcsec == pytest.approx(0.5, rel=0.05)
+    assert standard.noise.standing.rms_arcsec == pytest.approx(0.5, rel=0.1)
+    assert standard.noise.standing.effective_samples > 0.7 * standard.noise.standing.samples
+    assert all(each.passed for each in standard.residual_tests), standard.residual_tests
+
+
+def test_the_fitted_model_goes_through_its_file_with_its_uncertainty(standard):
+    again = TransmissionModel.from_text(standard.model.dump())
+    assert again.effects == standard.model.effects
+    assert again.uncertainty == standard.model.uncertainty
+    orders = again.uncertainty["synchronous"]["orders"]
+    assert [each["order"] for each in orders] == [1, 2, 6]
+    assert all(0.0 < each["amplitude_arcsec"] < 0.2 for each in orders)
+
+
+def test_held_out_data_speak_for_the_new_model_against_none(standard):
+    assert standard.held_out.improves
+    assert standard.held_out.before_arcsec > 20.0
+    assert standard.held_out.after_arcsec == pytest.approx(0.5, rel=0.1)
+
+
+def test_against_the_true_model_nothing_improves(bench):
+    axis = bench.axis()
+    orders = tuple(
+        MotorOrder(order=order, amplitude_arcsec=amplitude, phase_deg=phase)
+        for order, (amplitude, phase) in axis.orders.items()
+    )
+    truth = TransmissionModel(
+        axis.ratio,
+        (
+            Synchronous(orders=orders),
+            Hysteresis(offset_arcsec=axis.offset, width_deg=axis.width, exponent=axis.exponent),
+        ),
+    )
+    result = fit(axis.record(bench.plan()), axis.ratio, replace(bench.options, active=truth))
+    assert not result.held_out.improves
+    assert result.held_out.before_arcsec == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize(("width", "exponent"), [(7.0, 2.0), (35.0, 2.6), (30.0, 1.25)])
+def test_shapes_far_from_the_typical_one_are_found(bench, width, exponent):
+    axis = bench.axis(width=width, exponent=exponent)
+    result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
+    assert result.interval("hysteresis", "width_deg").value == pytest.approx(width, rel=0.04)
+    assert result.interval("hysteresis", "exponent").value == pytest.approx(exponent, abs=0.05)
+    assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
+
+
+def test_an_elastic_state_that_is_not_told_is_found(bench):
+    axis = bench.axis()
+    plan = [
+        ("reversal", bench.ramp(0.0, 6.0, 3.0)),
+        ("standstill", np.full(200, 6.0)),
+        *bench.plan(turns=8.0),
+    ]
+    segments = axis.record(plan)
+    shift = 2.0 * axis.offset / 3600.0  # the first segment as if it had begun saturated backwards
+    backward = axis.error(segments[0].motor_deg, -1.0) - axis.error(segments[0].motor_deg, 1.0)
+    first = replace(segments[0], load_deg=segments[0].load_deg + backward / 3600.0)
+    rest = axis.error(np.concatenate([first.motor_deg, segments[1].motor_deg]), -1.0)[len(first) :]
+    plain = axis.error(np.concatenate([first.motor_deg, segments[1].motor_deg]), 1.0)[len(first) :]
+    second = replace(segments[1], load_deg=segments[1].load_deg + (rest - plain) / 3600.0)
+    assert shift > 0
+    known = fit([first, second, *segments[2:]], 20.0, replace(bench.options, start=Start.BACKWARD))
+    found = fit([first, second, *segments[2:]], 20.0, replace(bench.options, start=None))
+    assert found.noise.residual_arcsec == pytest.approx(known.noise.residual_arcsec, rel=1e-3)
+    wrong = fit([first, second, *segments[2:]], 20.0, bench.options)
+    assert wrong.noise.residual_arcsec > 1.2 * found.noise.residual_arcsec
+
+
+def test_an_error_once_per_load_turn_bends_nothing_and_is_told(bench):
+    axis = bench.axis(load_first=15.0)
+    result = fit(axis.record(bench.plan(turns=40.0)), axis.ratio, bench.options)
+    assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0
+    load = next(each for each in result.nuisances if each.name == "load order 1")
+    assert load.value == pytest.approx(15.0, abs=0.3)
+    assert any("load order 1 shows" in each for each in result.warnings)
+
+
+def test_recordings_with_zeros_of_their_own(bench):
+    axis = bench.axis()
+    one = axis.record(bench.plan(turns=8.0), seed=1)
+    other = bench.axis(zero_arcsec=-300.0).record(bench.plan(turns=8.0), seed=2)
+    other = [replace(each, zero=1, time_s=each.time_s + 1000.0) for each in other]
+    result = fit([*one, *other], axis.ratio, replace(bench.options, start=None))
+    assert len(result.zeros_arcsec) == 2
+    assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0
+    assert result.noise.residual_arcsec == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_measured_motor_angle_that_chatters_does_as_well(bench):
+    axis = bench.axis(motor_counts=8000.0)
+    rng = np.random.default_rng(3)
+    segments = []
+    for each in axis.record(bench.plan(turns=8.0)):
+        flutter = rng.choice([-1.0, 0.0, 1.0], len(each), p=[0.05, 0.9, 0.05]) * 360.0 / 8000.0
+        segments.append(
+            Segment(each.time_s, each.motor_deg + flutter, each.load_deg, each.kind, commanded=False)
+        )
+    result = fit(segments, axis.ratio, bench.options)
+    assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.03)
+    assert result.interval("hysteresis", "width_deg").value == pytest.approx(18.0, rel=0.06)
+
+
+def test_spikes_are_left_out_and_counted(standard, bench):
+    axis = bench.axis()
+    rng = np.random.default_rng(4)
+    segments = []
+    for each in axis.record(bench.plan()):
+        spikes = (rng.random(len(each)) < 0.005) * rng.choice([-60.0, 90.0], len(each))
+        segments.append(replace(each, load_deg=each.load_deg + spikes / 3600.0))
+    result = fit(segments, axis.ratio, bench.options)
+    total = sum(len(each) for each in segments)
+    assert result.outliers.samples == pytest.approx(0.005 * total, rel=0.4)
+    assert any("stand out" in each for each in result.warnings)
+    for name in ("offset_arcsec", "width_deg", "exponent"):
+        clean, spiked = standard.interval("hysteresis", name), result.interval("hysteresis", name)
+        assert abs(spiked.value - clean.value) < clean.half_width
+        assert spiked.half_width < 1.5 * clean.half_width
+
+
+def test_a_delay_between_the_encoders_is_told_from_the_offset(bench):
+    axis = bench.axis()
+    segments = axis.record(bench.plan())
+    motor = np.concatenate([each.motor_deg for each in segments])
+    time = np.concatenate([each.time_s for each in segments])
+    late = np.interp(time - 0.002, time, motor)
+    error = axis.error(late) + np.random.default_rng(5).normal(size=len(motor)) * 0.5
+    load, at, delayed = late / axis.ratio + error / 3600.0, 0, []
+    for each in segments:
+        delayed.append(replace(each, load_deg=load[at : at + len(each)]))
+        at += len(each)
+    result = fit(delayed, axis.ratio, bench.options)
+    delay = next(each for each in result.nuisances if each.name == "delay_ms")
+    assert delay.value == pytest.approx(2.0, abs=0.05)
+    assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
+
+
+def test_default_options_suit_a_bare_record(bench):
+    axis = bench.axis()
+    parts = axis.record(bench.plan(turns=8.0))
+    whole = Segment(
+        np.concatenate([each.time_s for each in parts]),
+        np.concatenate([each.motor_deg for each in parts]),
+        np.concatenate([each.load_deg for each in parts]),
+        name="someone.csv",
+    )
+    result = fit([whole], axis.ratio, FitOptions())
+    assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
+    assert result.interval("hysteresis", "width_deg").value == pytest.approx(18.0, rel=0.04)
+    assert {each.order.number for each in result.orders} == {1, 2, 6}

@@ -1,0 +1,100 @@
+"""Noise that is not white: the banded algebra is the dense one, and its parameters are found."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdbridge.identify.blocks import make_blocks
+from hdbridge.identify.figures import outlying, standing
+from hdbridge.identify.noise import NoiseModel, Precision, fit_noise
+from hdbridge.identify.samples import gather
+from hdbridge.identify.segment import Kind, Segment
+
+
+def blocks_of(count, rng, motor=None, error=None, kind=Kind.SWEEP):
+    time = np.cumsum(rng.uniform(0.3, 1.0, count))  # longer than a block lasts: each sample is a block
+    motor = np.cumsum(rng.uniform(5.0, 30.0, count)) if motor is None else motor
+    error = np.zeros(count) if error is None else error
+    segment = Segment(time, motor, motor / 50.0 + error / 3600.0, kind)
+    samples = gather([segment], 50.0, slow_deg_s=1e9)
+    return make_blocks(samples), samples
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.5, 50.0), st.floats(0.0, 2.0), st.floats(1.0, 50.0),
+    st.integers(0, 1000),
+)  # fmt: skip
+def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, seed):
+    rng = np.random.default_rng(seed)
+    blocks, _ = blocks_of(40, rng)
+    noise = NoiseModel(white, white, slow, slow_s, place, place_deg)
+    dense = np.diag(noise.white_variance(blocks))
+    for size, length, at in ((slow, slow_s, blocks.time_s), (place, place_deg, blocks.travel_deg)):
+        dense += size**2 * np.exp(-np.abs(at[:, np.newaxis] - at) / length)
+    columns = rng.normal(size=(40, 3))
+    precision = Precision(noise, blocks)
+    assert precision.apply(columns) == pytest.approx(np.linalg.solve(dense, columns), rel=1e-5, abs=1e-6)
+    expected = -0.5 * (np.linalg.slogdet(dense)[1] + columns[:, 0] @ np.linalg.solve(dense, columns[:, 0]))
+    assert precision.log_likelihood(columns[:, 0]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+def test_blocks_left_out_have_no_say():
+    rng = np.random.default_rng(1)
+    blocks, _ = blocks_of(30, rng)
+    out = np.zeros(30, dtype=bool)
+    out[10:20] = True
+    noise = NoiseModel(1.0, 1.0, 0.8, 5.0)
+    told = Precision(noise, blocks, out).apply(np.where(out, 1e6, 1.0))
+    assert told[out] == pytest.approx(np.zeros(10))
+    assert told == pytest.approx(Precision(noise, blocks, out).apply(np.ones(30)))
+
+
+def test_a_wander_is_found_beside_white_noise():
+    rng = np.random.default_rng(2)
+    blocks, samples = blocks_of(6000, rng)
+    wander = np.zeros(6000)
+    for index in range(1, 6000):
+        keep = np.exp(-(samples.time_s[index] - samples.time_s[index - 1]) / 8.0)
+        wander[index] = keep * wander[index - 1] + rng.normal() * np.sqrt(1.0 - keep**2)
+    noise = fit_noise(wander + 0.5 * rng.normal(size=6000), blocks, 1)
+    assert noise.slow_arcsec == pytest.approx(1.0, rel=0.15)
+    assert noise.slow_s == pytest.approx(8.0, rel=0.35)
+    # What forgets within a step and what is white are the same to this record.
+    assert np.hypot(noise.moving_arcsec, noise.place_arcsec) == pytest.approx(0.5, rel=0.15)
+
+
+def test_the_noise_at_rest_tells_how_many_samples_are_worth_one():
+    rng = np.random.default_rng(3)
+    time = np.arange(20_000) / 250.0
+    error = np.zeros(20_000)
+    for index in range(1, 20_000):
+        error[index] = 0.9 * error[index - 1] + rng.normal()
+    segment = Segment(time, np.zeros(20_000), error / 3600.0, Kind.STANDSTILL)
+    found = standing(gather([segment], 50.0))
+    assert found.rms_arcsec == pytest.approx(np.sqrt(1.0 / (1.0 - 0.81)), rel=0.1)
+    assert found.samples / found.effective_samples == pytest.approx(19.0, rel=0.3)  # (1 + r) / (1 - r)
+
+
+def test_a_spike_is_an_outlier_and_a_step_that_stays_is_not():
+    rng = np.random.default_rng(4)
+    residual = rng.normal(size=5000)
+    residual[2500:] += 40.0
+    residual[[100, 900, 901]] += 30.0
+    weight, outliers = outlying(residual)
+    assert set(np.flatnonzero(weight == 0.0)) == {100, 900, 901}
+    assert (outliers.samples, outliers.longest_run) == (3, 2)
+
+
+def test_blocks_average_a_column_exactly():
+    rng = np.random.default_rng(5)
+    time = np.arange(4000) / 250.0
+    motor = np.concatenate([np.linspace(0.0, 300.0, 2000), np.linspace(300.0, 0.0, 2000)])
+    samples = gather([Segment(time, motor, motor / 50.0, Kind.SWEEP)], 50.0)
+    blocks = make_blocks(samples)
+    values = rng.normal(size=4000)
+    assert blocks.count @ blocks.mean(values) == pytest.approx(np.sum(values[samples.usable]))
+    assert len(blocks) < 1500
+    near = (blocks.motor_deg > 297.0) & (blocks.heading < 0)
+    assert np.max(blocks.extent_deg[near]) < 0.5 < np.max(blocks.extent_deg)

@@ -1,0 +1,112 @@
+"""Where a record cannot tell something, the fit says so in words and does not make it up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hdbridge.effects import Hysteresis
+from hdbridge.errors import InputError
+from hdbridge.identify import FitOptions, Kind, Segment, fit
+
+
+def test_without_a_reversal_hysteresis_is_left_out(bench):
+    axis = bench.axis()
+    plan = [("standstill", np.zeros(300)), ("sweep", bench.ramp(0.0, 3600.0, 200.3))]
+    result = fit(axis.record(plan), axis.ratio, bench.options)
+    assert [each.name for each in result.model.effects] == ["synchronous"]
+    assert any("hysteresis: left out" in each and "both directions" in each for each in result.warnings)
+    found = {each.order.number: each.amplitude_arcsec for each in result.orders}
+    assert found == pytest.approx({1: 5.0, 2: 9.0, 6: 3.0}, abs=0.15)
+
+
+def test_a_stepping_test_tells_the_offset_but_not_the_shape(bench):
+    axis = bench.axis(noise=1.0)
+    plan = []
+    places = [*range(1, 61), *range(59, -1, -1)]
+    for before, index in zip([0, *places[:-1]], places, strict=True):
+        plan += [
+            ("step", bench.ramp(before * 43.56, index * 43.56, 600.0)),
+            ("settle", np.full(25, index * 43.56)),
+        ]
+    held = Hysteresis(offset_arcsec=1.0, width_deg=25.0, exponent=1.5)
+    result = fit(axis.record(plan), axis.ratio, replace(bench.options, effects=(held,)))
+    assert any("cannot be identified" in each and "nested reversals" in each for each in result.warnings)
+    width = result.interval("hysteresis", "width_deg")
+    assert (width.value, width.identifiable) == (25.0, False)
+    assert width.low <= 0.5
+    assert width.high >= 120.0
+    assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.02)
+
+
+def test_one_speed_cannot_tell_a_delay_and_says_what_it_would_be_worth(bench):
+    axis = bench.axis()
+    plan = [("sweep", bench.ramp(0.0, 3600.0, 200.3)), ("sweep", bench.ramp(3600.0, 0.0, 200.3))]
+    result = fit(axis.record(plan), axis.ratio, bench.options)
+    assert any("one millisecond would be" in each and "second speed" in each for each in result.warnings)
+    assert not any(each.name == "delay_ms" for each in result.nuisances)
+
+
+def test_a_short_record_says_that_it_saw_no_load_turn(bench):
+    axis = bench.axis()
+    result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
+    assert any("0.4" in each and "load turns" in each for each in result.warnings)
+
+
+def test_noise_alone_brings_no_order(bench):
+    axis = bench.axis(orders={}, offset=0.0, noise=2.0)
+    axis.error = lambda motor, state=1.0: np.zeros(len(motor))
+    result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
+    assert result.orders == ()
+    assert not result.held_out.improves
+
+
+def test_an_order_below_what_matters_is_not_put_in(bench):
+    axis = bench.axis(orders={1: (5.0, 0.0), 4: (0.05, 0.0)}, noise=0.2)
+    result = fit(axis.record(bench.plan()), axis.ratio, bench.options)
+    assert [each.order.number for each in result.orders] == [1]
+
+
+def segment(**changes):
+    time = np.arange(400) / 50.0
+    motor = 100.0 * time
+    whole = {
+        "time_s": time,
+        "motor_deg": motor,
+        "load_deg": motor / 20.0,
+        "kind": Kind.SWEEP,
+        "name": "a.csv",
+    }
+    return Segment(**(whole | changes))
+
+
+@pytest.mark.parametrize(
+    ("make", "ratio", "complaint"),
+    [
+        (lambda: segment(load_deg=np.zeros(399)), 20.0, r"a\.csv: load_deg has shape \(399,\)"),
+        (lambda: segment(load_deg=np.full(400, np.nan)), 20.0, r"a\.csv: load_deg of sample 0 is nan"),
+        (
+            lambda: segment(time_s=np.arange(400)[::-1] / 50.0),
+            20.0,
+            r"a\.csv: time_s of sample 1 lies before",
+        ),
+        (segment, 21.0, r"a\.csv: the load follows the motor with a ratio of 20, expected 21"),
+        (segment, -20.0, "ratio"),
+        (lambda: segment(load_deg=-np.arange(400) / 10.0), 20.0, "direction round"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(make, ratio, complaint):
+    with pytest.raises(InputError, match=complaint) as caught:
+        fit([make()], ratio)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_record_of_nothing_but_fast_moves_is_refused():
+    time = np.arange(400) / 50.0
+    with pytest.raises(InputError, match="slow enough to be used"):
+        fit([segment(kind=Kind.STEP, time_s=time)], 20.0, FitOptions())
+
+
+def test_no_samples_at_all_are_refused():
+    with pytest.raises(InputError, match="expected at least"):
+        fit([], 20.0)
