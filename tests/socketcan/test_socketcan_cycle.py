@@ -18,11 +18,11 @@ from hdbridge.drive.supervision import Fault, Reaction
 from hdbridge.errors import BusError, DriveError
 
 
-def test_the_axis_follows_over_500_cycles(master) -> None:
-    feedback = master.run(500)
-    assert sum(each.fresh for each in feedback) >= 450
-    assert feedback[-1].motor_counts - feedback[0].motor_counts == pytest.approx(4990, abs=100)
-    assert feedback[-1].cycle - feedback[0].cycle <= 700
+def test_the_axis_follows_over_200_cycles(master) -> None:
+    feedback = master.run(200)
+    assert sum(each.fresh for each in feedback) >= 180
+    assert feedback[-1].motor_counts - feedback[0].motor_counts == pytest.approx(1990, abs=100)
+    assert feedback[-1].cycle - feedback[0].cycle <= 280
 
 
 def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path) -> None:
@@ -42,8 +42,9 @@ def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path
     orders = [tuple(can_id for _, can_id in cyclic[a:b]) for a, b in pairwise(syncs[-150:])]
     assert orders.count(("080", "181", "281", "201")) >= 0.9 * len(orders)
     periods = sorted(cyclic[b][0] - cyclic[a][0] for a, b in pairwise(syncs[-150:]))
-    assert periods[len(periods) // 2] == pytest.approx(0.004, abs=0.0005)
-    assert periods[0] > 0.0015  # late ones are skipped, never made up for by a burst
+    expected = master.cycle.period_s
+    assert periods[len(periods) // 2] == pytest.approx(expected, rel=0.1)
+    assert periods[0] > 0.4 * expected  # late ones are skipped, never made up for by a burst
 
 
 def test_frames_that_canopen_does_not_use_harm_nothing(master, intruder) -> None:

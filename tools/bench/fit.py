@@ -1,7 +1,9 @@
-"""Time of an identification against the number of samples: `.venv/bin/python tools/bench/fit.py [samples ...]`.
+"""Time of an identification against the number of samples.
 
-One axis (ratio 50), sweeps over whole load turns both ways, sines, nested reversals, steps and rests at 250 Hz, laid
-end to end until there are enough samples. Prints seconds per fit and how they grow.
+.venv/bin/python tools/bench/fit.py [samples ...]
+
+One axis (ratio 50): sweeps over whole load turns both ways, sines, nested reversals, steps and rests at
+250 Hz, laid end to end until there are enough samples. Prints seconds per fit and how they grow.
 """
 
 from __future__ import annotations
