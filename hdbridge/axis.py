@@ -14,10 +14,10 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
-from hdbridge.bundled import bundled_folder
 from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wrong
 from hdbridge.units import ARCSEC_PER_DEG
-from hdbridge.yamlfile import Document, document_from_text, read_yaml, wrong
 
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity, Teeth
 from hdbridge.effects import CATALOGUE, Effect, conflicts
-from hdbridge.expectation import nearest
-from hdbridge.yamlfile import Document, Hex, dump_yaml
+from hdbridge.files.expectation import nearest
+from hdbridge.files.yamlfile import Document, Hex, dump_yaml
 
 _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.md describes its keys.\n"
 

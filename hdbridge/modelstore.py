@@ -28,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import dump_yaml, read_yaml, write_atomically
 from hdbridge.model import TransmissionModel
-from hdbridge.yamlfile import dump_yaml, read_yaml, write_atomically
 
 PENDING = "pending"
 ACTIVE = "active"

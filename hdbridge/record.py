@@ -14,9 +14,9 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from hdbridge.csvfile import Column, line_of_row, read_columns, write_columns
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
+from hdbridge.files.csvfile import Column, line_of_row, read_columns, write_columns
 from hdbridge.units import ARCSEC_PER_DEG
 
 REQUIRED: Final[Mapping[str, str]] = MappingProxyType(

@@ -23,10 +23,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bundled import bundled_profile
 from hdbridge.comparison import compare_schemes
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench

@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
-from hdbridge.expectation import Field, field_at, key_of, type_words
+from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.modelfile import ModelFile
 from hdbridge.modelstore import LogFile
 from hdbridge.record import OPTIONAL, REQUIRED

@@ -18,10 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.bench import Leg
 from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 from hdbridge.procedures.plan import Plan
 from hdbridge.record import Record
 from hdbridge.recording import ABOUT_NAME, Recording, RecordingFile, versions_here
-from hdbridge.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 
 _HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
 PAUSE_S = 1.0

@@ -8,7 +8,6 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from hdbridge.atomic import write_atomically
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
 from hdbridge.calibration.journal import Journal
@@ -17,6 +16,7 @@ from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
 from hdbridge.model import TransmissionModel
 from hdbridge.modelstore import propose
 from hdbridge.recording import Recording

@@ -7,10 +7,10 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.atomic import write_atomically
 from hdbridge.calibration import Calibration, Validation
 from hdbridge.calibration.result import unit_of
 from hdbridge.cli.options import console
+from hdbridge.files.atomic import write_atomically
 from hdbridge.modeldiff import diff
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render

@@ -14,12 +14,12 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from hdbridge.atomic import write_atomically
 from hdbridge.axis import AxisConfig
-from hdbridge.bundled import bundled_profile
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.realtime import prepare_realtime
 from hdbridge.sim.lockstep import simulated_bench
 

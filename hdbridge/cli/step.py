@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from hdbridge.atomic import write_atomically
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Run
 from hdbridge.cli.interrupt import deferred_interrupt
@@ -33,6 +32,7 @@ from hdbridge.cli.options import (
 from hdbridge.comparison import Comparison, compare_schemes
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.report.page import render

@@ -18,9 +18,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from hdbridge.bundled import bundled_folder
 from hdbridge.errors import InputError
-from hdbridge.expectation import nearest
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.expectation import nearest
+from hdbridge.files.yamlfile import read_yaml, wrong
 from hdbridge.procedures.chain import Chain
 from hdbridge.procedures.moves import AxisView, Procedure
 from hdbridge.procedures.positioning import Positioning, targets
@@ -30,7 +31,6 @@ from hdbridge.procedures.standstill import Precondition, Reference, Standstill
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.procedures.sweep import Sweep
 from hdbridge.units import DEG_PER_TURN
-from hdbridge.yamlfile import read_yaml, wrong
 
 SPEED_SHARE = 0.95
 """Share of the axis's highest speed that a plan uses at most."""

@@ -13,6 +13,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from hdbridge.files.yamlfile import document_from_text, read_yaml, wrong
 from hdbridge.sim.truth_gear import TrueGear
 from hdbridge.sim.truth_hysteresis import (
     BoucWen,
@@ -26,7 +27,6 @@ from hdbridge.sim.truth_hysteresis import (
 from hdbridge.sim.truth_load import TrueLoad
 from hdbridge.sim.truth_motor import TrueMotor, TrueServo
 from hdbridge.sim.truth_part import Part
-from hdbridge.yamlfile import document_from_text, read_yaml, wrong
 
 __all__ = [
     "BoucWen", "Dahl", "Hysteresis", "MaxwellSlip", "RollingFriction", "SlipElement", "TrueGear", "TrueLoad",

@@ -6,8 +6,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from hdbridge.files.yamlfile import wrong
 from hdbridge.sim.truth_part import Part
-from hdbridge.yamlfile import wrong
 
 Direction = Literal[1, -1]
 

@@ -15,8 +15,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.bringup.checks import Row, Verdict, run_checks
 from hdbridge.bringup.doctor import CHECKS
 from hdbridge.bringup.patient import Patient
-from hdbridge.bundled import bundled_profile
 from hdbridge.clock import Clock
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.node import SimulatedDrive

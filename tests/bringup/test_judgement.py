@@ -21,8 +21,8 @@ from hdbridge.bringup.judge import (
 )
 from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO, Turned, accuse, judge_turn
 from hdbridge.bringup.slow import plan_travel
-from hdbridge.bundled import bundled_profile
 from hdbridge.errors import DriveError
+from hdbridge.files.bundled import bundled_profile
 
 ARTICLE = (bundled_profile("article") / "axis.yaml").read_text()
 TEETH = "  teeth: {flexspline: 100, circular_spline: 102, output: flexspline}\n"

@@ -12,9 +12,9 @@ import pytest
 from hdbridge.axis import AxisConfig
 from hdbridge.bringup.match import axis_lines, compare
 from hdbridge.bringup.scan import Node, Scan, scan_bus
-from hdbridge.bundled import bundled_folder, bundled_profile
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
+from hdbridge.files.bundled import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.node import SimulatedDrive

@@ -5,11 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import document_from_text
 from hdbridge.procedures.moves import AxisView, MotionLimits, MoveTo, Sample
 from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.sweep import Sweep
-from hdbridge.yamlfile import document_from_text
 
 WIDE = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
 from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import load_yaml
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 from hdbridge.recording import RecordingFile
-from hdbridge.yamlfile import load_yaml
 
 PIECES = [
     "schema: ", "hdbridge.axis/1", "hdbridge.model/1", "ratio: ", "effects:", "effect: ", "hysteresis", "\n", "\n  ",

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig, MotorEncoder
-from hdbridge.bundled import bundled_folder, bundled_profile
 from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_folder, bundled_profile
 
 GOOD = """\
 schema: hdbridge.axis/1

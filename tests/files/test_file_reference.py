@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bundled import bundled_profile
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "file_reference.py"

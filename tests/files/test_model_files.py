@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.bundled import bundled_profile
 from hdbridge.effects import CATALOGUE, Hysteresis, Motion, MotorOrder, Start, Synchronous
 from hdbridge.errors import InputError
-from hdbridge.expectation import expected_words, field_at
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.expectation import expected_words, field_at
 from hdbridge.model import TransmissionModel
 
 GOOD = """\

@@ -215,5 +215,5 @@ def test_a_long_record_takes_the_fast_way(tmp_path, monkeypatch):
     path = tmp_path / "long.csv"
     one = record(samples=20_000, travel_deg=3.3)
     one.write_csv(path)
-    monkeypatch.setattr("hdbridge.csvfile._slow", None)
+    monkeypatch.setattr("hdbridge.files.csvfile._slow", None)
     assert Record.read_csv(path) == one

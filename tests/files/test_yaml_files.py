@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hdbridge.errors import InputError
-from hdbridge.yamlfile import (
+from hdbridge.files.yamlfile import (
     MAXIMUM_BYTES,
     FileError,
     Hex,
@@ -223,7 +223,7 @@ def test_writing_into_a_missing_folder_is_an_input_error(tmp_path):
 
 WRITER = """
 import sys
-from hdbridge.atomic import write_atomically
+from hdbridge.files.atomic import write_atomically
 print("ready", flush=True)
 number = 0
 while True:

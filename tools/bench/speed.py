@@ -13,8 +13,8 @@ from itertools import pairwise
 
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Bench, compensation_for
-from hdbridge.bundled import bundled_profile
 from hdbridge.drive.drive import Drive
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from hdbridge.errors import InputError
-from hdbridge.expectation import one_line
+from hdbridge.files.expectation import one_line
 
 MAXIMUM_DEPTH = 32
 MAXIMUM_DIGITS = 400

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.atomic import write_atomically
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
-from hdbridge.expectation import nearest, one_line
+from hdbridge.files.atomic import write_atomically
+from hdbridge.files.expectation import nearest, one_line
 
 Column = NDArray[Any]
 """A column: float64, or text where it holds something else than numbers."""

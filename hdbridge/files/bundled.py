@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Literal
 
 from hdbridge.errors import InputError
-from hdbridge.expectation import nearest
+from hdbridge.files.expectation import nearest
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -> Path:

@@ -19,9 +19,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from hdbridge.atomic import write_atomically
-from hdbridge.expectation import expected_words, field_at, field_names, nearest
-from hdbridge.yamlnodes import FLOAT, INTEGER, OCTAL, FileError, Node, compose
+from hdbridge.files.atomic import write_atomically
+from hdbridge.files.expectation import expected_words, field_at, field_names, nearest
+from hdbridge.files.yamlnodes import FLOAT, INTEGER, OCTAL, FileError, Node, compose
 
 __all__ = [
     "Document", "FileError", "Hex", "document_from_text", "dump_yaml", "load_yaml", "nearest", "read_yaml",
