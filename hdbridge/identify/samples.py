@@ -23,7 +23,7 @@ SETTLE_S = 0.1
 """After a fast move the load is left this much time to come to rest."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis stands."""
-GENTLE_DEG_S2 = 5.0
+GENTLE_DEG_S2 = 40.0
 """Load acceleration that a motion of which nothing is known may have."""
 ON_THE_WAY = (Kind.MOVE, Kind.STEP)
 SLOW = (Kind.SWEEP, Kind.SINE, Kind.REVERSAL)
