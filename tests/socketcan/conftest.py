@@ -171,8 +171,8 @@ class Master:
 
 
 @contextmanager
-def master_on(channel: str) -> Iterator[Master]:
-    axis = AxisConfig.load(unhurried_profile())
+def master_on(channel: str, profile: Path | None = None) -> Iterator[Master]:
+    axis = AxisConfig.load(profile or unhurried_profile())
     settings = axis.bus.model_copy(update={"interface": "socketcan", "channel": channel})
     with open_bus(settings) as bus:
         drive = Drive(bus, axis, MonotonicClock())

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from conftest import master_on
 
-with master_on(sys.argv[1]) as master:
+with master_on(sys.argv[1], Path(sys.argv[2])) as master:
     master.boot()
     master.run(50)
     print("moving", flush=True)

@@ -103,10 +103,10 @@ def test_a_deleted_interface_latches(master, may_configure, interface: str) -> N
 
 
 def test_a_killed_master_leaves_an_axis_that_stands_and_is_disabled(
-    simulated, another_master, interface: str
+    simulated, another_master, interface: str, profile: Path
 ) -> None:
     script = Path(__file__).with_name("master_to_kill.py")
-    victim = subprocess.Popen([sys.executable, str(script), interface], stdout=subprocess.PIPE)
+    victim = subprocess.Popen([sys.executable, str(script), interface, str(profile)], stdout=subprocess.PIPE)
     try:
         assert victim.stdout is not None
         assert victim.stdout.readline() == b"moving\n"
