@@ -311,6 +311,9 @@ class _Judge:
             speed_deg_s=speed[workshop.index],
             kind=workshop.evidence.kinds,
             kind_number=points.kind[workshop.index].astype(np.float64),
+            motion=workshop.motion,
+            rows=workshop.index,
+            start=fitted.theory.start,
         )
 
 

@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hdbridge.effects import Effect, FloatArray
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.model import TransmissionModel
 
 SCHEMA = "hdbridge.diagnosis/1"
@@ -131,6 +134,12 @@ class Traces:
     kind: tuple[str, ...]
     """Names of the kinds of motion."""
     kind_number: FloatArray
+    motion: Motion
+    """What drove the whole record; an elastic state passes through all of it."""
+    rows: NDArray[np.intp]
+    """Which points of ``motion`` these arrays are of."""
+    start: Start
+    """Elastic state at the first point of ``motion``, as fitted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
