@@ -9,20 +9,24 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
+from hdbridge.axischannels import LoadTorque, MeasuredChannel, Temperature
+from hdbridge.axisencoders import INT32_MAX, Encoder, LoadEncoder, MotorEncoder, NodeId, Source
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wrong
 from hdbridge.units import ARCSEC_PER_DEG
 
-NodeId = Annotated[int, Field(ge=1, le=127)]
+__all__ = [
+    "AxisConfig", "BusConfig", "CompensationConfig", "DriveConfig", "Encoder", "Gear", "Identity", "Limits",
+    "LoadEncoder", "LoadTorque", "MotorEncoder", "Source", "Teeth", "Temperature",
+]  # fmt: skip
+
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
-Direction = Literal[1, -1]
-INT32_MAX = 2**31 - 1
 
 
 class _Part(BaseModel):
@@ -122,72 +126,6 @@ class DriveConfig(_Part):
         return period
 
 
-class Encoder(_Part):
-    """An encoder: counts per turn and direction."""
-
-    counts_per_turn: int = Field(
-        ge=1, le=INT32_MAX, description="counts per turn of its own shaft, after multiplication"
-    )
-    direction: Direction = Field(
-        1, description="-1 where it counts down as the axis (as the axis file means it) turns forward"
-    )
-
-    def counts(self, deg: float) -> float:
-        """The reading, in (fractional) counts, at an angle of its shaft in degrees."""
-        return self.direction * deg * self.counts_per_turn / 360.0
-
-    def degrees(self, counts: float) -> float:
-        """The angle of its shaft in degrees at a reading."""
-        return self.direction * counts * 360.0 / self.counts_per_turn
-
-    @property
-    def resolution_arcsec(self) -> float:
-        """One count in arcseconds of its own shaft."""
-        return 1_296_000.0 / self.counts_per_turn
-
-
-class MotorEncoder(Encoder):
-    """The encoder of the motor, which the drive closes its loop on (6064h, 607Ah)."""
-
-
-class Source(_Part):
-    """The object that carries the load encoder's reading."""
-
-    WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}
-
-    index: int = Field(0x60E4, ge=0x1000, le=0xFFFF, description="index of the object")
-    subindex: int = Field(1, ge=0, le=255, description="sub-index of the object")
-    type: Literal["int32", "uint32", "int16", "uint16"] = Field("int32", description="type of the object")
-    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
-    node: NodeId | None = Field(
-        None, description="node id of the encoder, where it is a node of its own (for example CiA 406, 6004h)"
-    )
-    range_counts: int | None = Field(
-        None,
-        ge=2,
-        le=2**32,
-        description="reading at which it begins anew at zero (a single-turn encoder: its counts per turn); "
-        "without it the whole range of the type",
-    )
-
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        if self.range_counts is not None and self.range_counts > self.WRAPS[self.type]:
-            raise wrong(f"{self.type} holds no more than {self.WRAPS[self.type]} counts", "range_counts")
-        return self
-
-    @property
-    def wraps_at_counts(self) -> int:
-        """The reading is known modulo this many counts."""
-        return self.range_counts or self.WRAPS[self.type]
-
-
-class LoadEncoder(Encoder):
-    """The encoder at the load, which says how true the axis points."""
-
-    source: Source = Field(default_factory=Source, description="where its reading comes from")
-
-
 class Teeth(_Part):
     """Numbers of teeth of the gear, to check its ratio."""
 
@@ -221,7 +159,6 @@ class Gear(_Part):
         ge=1, le=1000, description="N: motor turns per load turn; a reversing gear: a direction of -1"
     )
     teeth: Teeth | None = Field(None, description="numbers of teeth; checked against the ratio")
-    load_torque: Literal["none"] = Field("none", description="where the load torque comes from")
 
     @field_validator("teeth")
     @classmethod
@@ -284,6 +221,12 @@ class AxisConfig(_Part):
     motor_encoder: MotorEncoder = Field(description="the encoder of the motor")
     load_encoder: LoadEncoder = Field(description="the encoder at the load")
     gear: Gear = Field(description="the gear between them")
+    load_torque: LoadTorque | None = Field(
+        None, description="the torque on the load, where the drive can tell it"
+    )
+    temperature: Temperature | None = Field(
+        None, description="the temperature of the gear, where the drive can tell it"
+    )
     limits: Limits = Field(description="what the axis may do")
     compensation: CompensationConfig = Field(
         default_factory=CompensationConfig, description="how far and how fast the compensation may act"
@@ -327,6 +270,7 @@ class AxisConfig(_Part):
                 f"node {node} is {owner}; expected another, or no key where the drive sends the reading",
                 "load_encoder", "source", "node",
             )  # fmt: skip
+        self._check_channels()
         for end in ("position_min_deg", "position_max_deg"):
             position_deg: float = getattr(self.limits, end)
             reach_deg = abs(position_deg) + self.compensation.maximum_arcsec / ARCSEC_PER_DEG
@@ -339,6 +283,33 @@ class AxisConfig(_Part):
                     end,
                 )
         return self
+
+    def _check_channels(self) -> None:
+        encoder = self.load_encoder.source
+        taken = {}
+        if encoder.node is None:
+            taken[encoder.index, encoder.subindex] = "load_encoder.source"
+        for key, channel in self.channels.items():
+            source = channel.source
+            other = taken.setdefault((source.index, source.subindex), f"{key}.source")
+            if other != f"{key}.source":
+                raise wrong(
+                    f"{source.index:04X}h:{source.subindex:02X} is {other} already; expected another object",
+                    key, "source", "index",
+                )  # fmt: skip
+            least_ms = 2 * channel.every_cycles * self.drive.cycle_ms
+            if channel.hold_ms < least_ms:
+                raise wrong(
+                    f"{channel.hold_ms:g} ms is too short for a reading every {least_ms / 2:g} ms "
+                    f"(every_cycles {channel.every_cycles}); expected at least {least_ms:g}",
+                    key, "hold_ms",
+                )  # fmt: skip
+
+    @property
+    def channels(self) -> dict[str, MeasuredChannel]:
+        """The measured channels that the axis has, by their key."""
+        given = {"load_torque": self.load_torque, "temperature": self.temperature}
+        return {key: channel for key, channel in given.items() if channel is not None}
 
     def on_bus(self, **changes: str | int | None) -> Self:
         """The same axis on another bus (keys of `BusConfig`); options stay only with their interface."""

@@ -15,22 +15,23 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.compensation import Compensation, CompensationLimits
+from hdbridge.compensation import LOSABLE, Compensation, CompensationLimits
 from hdbridge.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.effects import Channel, Observer, compensable, unmet
-from hdbridge.errors import HdbridgeError, InputError, SafetyStop, TransitionError
+from hdbridge.effects import Channel, Moment, Observer, compensable, unmet
+from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop, TransitionError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.record import Record
 
 Outcome = TypeVar("Outcome")
-KNOWN_ON_LINE = frozenset(Channel) - {Channel.LOAD_TORQUE, Channel.TEMPERATURE}
-"""What `Bench` can tell the effects in each cycle."""
+KEYS = {Channel.LOAD_TORQUE: "load_torque", Channel.TEMPERATURE: "temperature"}
+"""The channels that an axis need not have, and their keys in the axis file."""
+_AT_REST = Moment()
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 2.0
 _STANDING = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
@@ -54,6 +55,11 @@ class Run(Generic[Outcome]):
     legs: tuple[Leg, ...]
 
 
+def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
+    """What `Bench` can tell the effects in each cycle."""
+    return frozenset(each for each in Channel if KEYS.get(each, "") in {"", *axis.channels})
+
+
 def axis_view(axis: AxisConfig) -> AxisView:
     """What a procedure may know of its axis."""
     limits = axis.limits
@@ -74,15 +80,49 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
 
     InputError where an effect needs what the control loop does not know.
     """
-    for name, channels in unmet(compensable(model.effects), KNOWN_ON_LINE).items():
-        lacking = ", ".join(sorted(each.value for each in channels))
+    for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
+        lacking = sorted(channels, key=lambda each: each.value)
+        keys = " and ".join(f"'{KEYS[each]}'" for each in lacking)
         raise InputError(
-            f"the effect '{name}' needs {lacking}, which the control loop does not have; "
-            "leave it out of the model that compensates"
+            f"the effect '{name}' needs {', '.join(each.value for each in lacking)}, which this axis does "
+            f"not have: add {keys} to {axis.path}, or leave the effect out of the model that compensates"
         )
     caps = axis.compensation
     limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
     return Compensation(model, limits, axis.drive.cycle_s)
+
+
+def _with_channels(sample: Sample, feedback: Feedback) -> Sample:
+    load_torque_nm, temperature_c = feedback.load_torque_nm, feedback.temperature_c
+    return sample._replace(
+        load_torque_nm=math.nan if load_torque_nm is None else load_torque_nm,
+        temperature_c=math.nan if temperature_c is None else temperature_c,
+    )
+
+
+class _Sensed:
+    """What is known of the channels that can be lost, cycle by cycle; the last value is held."""
+
+    __slots__ = ("known", "load_torque_nm", "temperature_c")
+
+    def __init__(self) -> None:
+        self.known = LOSABLE
+        self.load_torque_nm = _AT_REST.load_torque_nm
+        self.temperature_c = _AT_REST.temperature_c
+
+    def take(self, feedback: Feedback) -> bool:
+        """One cycle's; whether other channels are known than before."""
+        known = set()
+        if feedback.load_torque_nm is not None:
+            self.load_torque_nm = feedback.load_torque_nm
+            known.add(Channel.LOAD_TORQUE)
+        if feedback.temperature_c is not None:
+            self.temperature_c = feedback.temperature_c
+            known.add(Channel.TEMPERATURE)
+        changed = known != self.known
+        if changed:
+            self.known = frozenset(known)
+        return changed
 
 
 class Bench:
@@ -116,8 +156,9 @@ class Bench:
         self._image = drive.image
         self._compensation = compensation or compensation_for(axis, TransmissionModel(axis.gear.ratio))
         self._interrupted = interrupted
-        self._torque_nm = axis.drive.rated_torque_nm / 1000.0
+        self._torque_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
         self._observer = Observer()
+        self._sensed = _Sensed()
         self._place = 0.0
         self._measured: list[list[Sample]] = []
         self._legs: list[Leg] = []
@@ -150,12 +191,18 @@ class Bench:
         return Run(outcome, self.record(), tuple(self._legs))
 
     def record(self) -> Record:
-        """What the present procedure has measured so far."""
+        """What the present procedure has measured so far.
+
+        A channel that was lost on the way is left out: what was held would pass for measured.
+        """
         # Made into arrays only here: between two legs there is no time for it on a real bus.
         rows = [sample for samples in self._measured for sample in samples]
         table = np.array(rows, dtype=np.float64).reshape(-1, len(Sample._fields))
         columns = dict(zip(Sample._fields, table.T, strict=True))
         columns.pop("load_target_deg")
+        for channel, key in KEYS.items():
+            if key not in self._image.axis.channels or np.isnan(columns[channel.value]).any():
+                columns.pop(channel.value)
         return Record(columns)
 
     @property
@@ -177,11 +224,39 @@ class Bench:
                 f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
                 f"'{power.state.value}'; look at its enable input, its supply and its fault history"
             )
+        feedback = self._await_channels(feedback)
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
         self._observer = Observer()
-        self._compensation.reset(motor_deg)
+        self._sensed = _Sensed()
+        self._sensed.take(feedback)
+        self._compensation.know(self._sensed.known)
+        self._compensation.reset(
+            motor_deg,
+            Moment(
+                time_s=feedback.time_s,
+                load_torque_nm=self._sensed.load_torque_nm,
+                motor_torque_nm=feedback.torque_permille * self._torque_nm,
+                temperature_c=self._sensed.temperature_c,
+                load_deg=self._place,
+            ),
+        )
         self._compensation.engage()
+
+    def _await_channels(self, feedback: Feedback) -> Feedback:
+        """Stand until every channel of the axis file has told something."""
+        channels = self._image.channels
+        while any(each.value is None and not each.lost for each in channels):
+            feedback = self.cycle.tick()
+        silent = [each.key for each in channels if each.lost]
+        if silent:
+            self._image.power.go(State.SWITCH_ON_DISABLED)
+            self._rest()
+            raise DriveError(
+                f"{self._image.axis.where(silent[0])}: no reading came that can be believed "
+                f"({self.supervision.events[-1].detail}); check the sensor, or leave the key out"
+            )
+        return feedback
 
     def _walk(
         self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
@@ -213,34 +288,42 @@ class Bench:
         motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._torque_nm
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
         observe, ratio = self._observer.moment, self.view.ratio
+        compensation, sensed = self._compensation, self._sensed
+        needs, has_channels = bool(compensation.needs), bool(image.channels)
         target_deg = self._place
         # Counted in cycles that were run, not in clock time: a period that was skipped must not make the
         # target jump ahead.
         elapsed_s = 0.0
 
         def answer(feedback: Feedback) -> int:
-            moment = observe(
-                ratio * target_deg,
-                feedback.time_s,
-                motor_torque_nm=feedback.torque_permille * torque_nm,
-                load_deg=target_deg,
-            )
+            if not needs:
+                moment = _AT_REST
+            else:
+                if has_channels and sensed.take(feedback):
+                    compensation.know(sensed.known)
+                moment = observe(
+                    ratio * target_deg,
+                    feedback.time_s,
+                    load_torque_nm=sensed.load_torque_nm,
+                    motor_torque_nm=feedback.torque_permille * torque_nm,
+                    temperature_c=sensed.temperature_c,
+                    load_deg=target_deg,
+                )
             return counts_for(command(target_deg, moment) if feedback.fresh else hold(target_deg, moment))
 
         try:
             while True:
                 target_deg = at(elapsed_s)
                 feedback = tick(answer)
-                samples.append(
-                    Sample(
-                        feedback.time_s,
-                        target_deg,
-                        motor_deg(feedback.demand_counts),
-                        motor_deg(feedback.motor_counts),
-                        load_deg(feedback.load_counts),
-                        feedback.torque_permille * torque_nm,
-                    )
+                sample = Sample(
+                    feedback.time_s,
+                    target_deg,
+                    motor_deg(feedback.demand_counts),
+                    motor_deg(feedback.motor_counts),
+                    load_deg(feedback.load_counts),
+                    feedback.torque_permille * torque_nm,
                 )
+                samples.append(_with_channels(sample, feedback) if has_channels else sample)
                 self._place = target_deg
                 if interrupted():
                     raise KeyboardInterrupt

@@ -11,6 +11,9 @@ coming from its present state and w the ramp's weight. Three choices matter:
 * The model's state moves on only when a command is issued (`Compensation.command`), with the angle issued,
   whatever caps and ramps have made of it.
 
+An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` says which are there; the part
+of the correction that needs one that is not is faded out, as `disengage` does with the whole, and in again.
+
 Pure: no clock, no bus.
 """
 
@@ -19,14 +22,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from hdbridge.effects import Moment, Start, Tracker, compensable, fall_bound
+from hdbridge.effects import Channel, Moment, Start, Tracker, compensable, fall_bound
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
+from hdbridge.model import ModelTracker, TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
 _NOWHERE = Moment()
+LOSABLE = frozenset({Channel.LOAD_TORQUE, Channel.TEMPERATURE})
+"""The channels that come from sensors of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +46,27 @@ class CompensationLimits:
     """Time over which the correction is faded in or out."""
 
 
+class _Faded(Tracker):
+    """An effect's tracker with a weight on its error; it goes on following at any weight."""
+
+    __slots__ = ("_tracker", "needs", "weight")
+
+    def __init__(self, tracker: Tracker, needs: frozenset[Channel]) -> None:
+        self._tracker = tracker
+        self.needs = needs
+        self.weight = 1.0
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self.weight * self._tracker.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self.weight * self._tracker.advance(motor_deg, moment)
+
+
 class Inverse:
     """The model's inverse, coming from the state that `advance` has left."""
 
-    __slots__ = ("_error", "_fall", "_motor_deg", "_slope", "_timeless", "_tracker")
+    __slots__ = ("_error", "_fall", "_motor_deg", "_slope", "_timeless", "_tracker", "faded", "needs")
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
         """Leaves out what cannot or must not be compensated, such as the load encoder's own errors.
@@ -52,7 +74,14 @@ class Inverse:
         Refuses (InputError) a model whose repeating part is too steep to have one inverse.
         """
         model = replace(model, effects=compensable(model.effects))
-        self._tracker: Tracker = model.tracker(start)
+        trackers = [each.tracker(start) for each in model.effects]
+        self.faded: list[_Faded] = []
+        """Those that need a channel that can be lost."""
+        for place, each in enumerate(model.effects):
+            if sensed := each.needs() & LOSABLE:
+                trackers[place] = faded = _Faded(trackers[place], sensed)
+                self.faded.append(faded)
+        self._tracker: Tracker = trackers[0] if len(trackers) == 1 else ModelTracker(trackers)
         self._slope = ARCSEC_PER_DEG / model.ratio
         self._fall = fall_bound(model.effects)
         if self._fall > _STEEPEST_FALL * self._slope:
@@ -64,7 +93,9 @@ class Inverse:
         self._motor_deg = 0.0
         self._error = 0.0
         # Without channels the error at rest is what it was when the command was issued: not asked twice.
-        self._timeless = not any(each.needs() for each in model.effects)
+        self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
+        """The channels that the effects need."""
+        self._timeless = not self.needs
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """The command is issued: move the state on; returns the model's error there, arcsec."""
@@ -134,8 +165,8 @@ class Compensation:
     """
 
     __slots__ = (
-        "_correction", "_inverse", "_maximum", "_ratio", "_slew_step", "_target", "_weight", "_weight_step",
-        "limited",
+        "_correction", "_fading", "_inverse", "_known", "_maximum", "_ratio", "_slew_step", "_target",
+        "_weight", "_weight_step", "limited", "needs",
     )  # fmt: skip
 
     def __init__(
@@ -154,6 +185,10 @@ class Compensation:
         self._weight = 0.0
         self._target = 0.0
         self._correction = 0.0
+        self._known = LOSABLE
+        self._fading = False
+        self.needs = self._inverse.needs
+        """The channels that it needs a `Moment` with; without any it may be left out."""
         self.limited = 0
         """Cycles in which a cap or the slew limit was at work."""
 
@@ -167,6 +202,11 @@ class Compensation:
         """The ramp's weight: 0 off, 1 fully on."""
         return self._weight
 
+    def know(self, channels: frozenset[Channel]) -> None:
+        """From the next command on these of `LOSABLE` are known; what needs another is faded out."""
+        self._known = channels
+        self._fading = bool(self._inverse.faded)
+
     def engage(self) -> None:
         """Fade the correction in from the next command on."""
         self._target = 1.0
@@ -178,6 +218,8 @@ class Compensation:
     def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
         """The motor stands at ``motor_deg`` and nothing is being corrected: begin from there."""
         self._weight = self._correction = 0.0
+        for each in self._inverse.faded:
+            each.weight = float(each.needs <= self._known)
         self._inverse.advance(motor_deg, moment)
 
     def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
@@ -187,6 +229,8 @@ class Compensation:
             step = self._weight_step
             weight += min(max(self._target - weight, -step), step)
             self._weight = weight
+        if self._fading:
+            self._fade()
         motor = self._inverse.solve(load_deg, moment, weight)
         wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
         slew = self._slew_step
@@ -198,6 +242,15 @@ class Compensation:
         self._correction = allowed
         self._inverse.advance(motor, moment)
         return motor
+
+    def _fade(self) -> None:
+        """One cycle nearer to what is known of the channels."""
+        settled = True
+        for each in self._inverse.faded:
+            target = float(each.needs <= self._known)
+            each.weight += min(max(target - each.weight, -self._weight_step), self._weight_step)
+            settled = settled and each.weight == target
+        self._fading = not settled
 
     def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Motor target in degrees with the correction frozen: for a cycle whose feedback is missing."""

@@ -4,7 +4,8 @@
 
 * *drain*: what waited since the last cycle is not of this one. Heartbeats and emergencies are noted, TPDOs
   are stale and thrown away.
-* *receive*: until every TPDO is there, or the window closes. The newest of each identifier wins.
+* *receive*: until every TPDO is there, or the window closes. The newest of each identifier wins. Those of the
+  optional channels are waited for when they come with every SYNC and are not lost, else taken when they come.
 * *check*: by the fault table of `hdbridge.drive.supervision`.
 * *RPDO*: with this cycle's feedback already in it.
 * *heartbeat*: the master's own comes from this loop and nowhere else, so that a loop that hangs is noticed
@@ -18,7 +19,7 @@ This is the one place where speed comes before looks: no logging, no SDO, no all
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from hdbridge.clock import Clock
@@ -63,6 +64,10 @@ class Feedback(NamedTuple):
     torque_permille: int
     fresh: bool
     """False when a TPDO was missing or not believed: the values are the last good ones."""
+    load_torque_nm: float | None = None
+    """Last reading that was believed; None where the axis has none, or none is known (any more)."""
+    temperature_c: float | None = None
+    """Of the gear; None as with the load torque."""
 
 
 Target = int | None
@@ -79,10 +84,10 @@ class Cycle:
     """
 
     __slots__ = (
-        "_all", "_bits", "_commanded", "_count", "_deadline", "_discarded", "_faults", "_good_cycle",
-        "_heard_s", "_heartbeat_s", "_image", "_last", "_late_s", "_link", "_nodes", "_own", "_plausibility",
-        "_rested", "_stop_cycles", "_window_s", "clock", "histogram", "monitor", "overruns", "period_s",
-        "skipped", "stopping", "supervision",
+        "_all", "_bits", "_channel_ids", "_channels", "_commanded", "_count", "_deadline", "_discarded",
+        "_faults", "_given_up", "_good_cycle", "_heard_s", "_heartbeat_s", "_image", "_last", "_late_s",
+        "_link", "_nodes", "_own", "_plausibility", "_rested", "_stop_cycles", "_window_s", "clock",
+        "histogram", "monitor", "overruns", "period_s", "skipped", "stopping", "supervision",
     )  # fmt: skip
 
     def __init__(
@@ -121,8 +126,8 @@ class Cycle:
             COB_NMT: "an NMT command",
             COB_SDO_REQUEST + image.node_id: "an SDO request",
         }
-        self._bits = {can_id: 1 << place for place, can_id in enumerate(image.tpdo_ids)}
-        self._all = (1 << len(self._bits)) - 1
+        self._channels = bool(image.channels)
+        self._channel_ids = frozenset(layout.can_id for layout in image.channel_tpdos)
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
         self._stop_cycles = max(int(stop_timeout_s / period_s), STILL_CYCLES + 1)
@@ -143,6 +148,15 @@ class Cycle:
         self._last: Feedback | None = None
         self._good_cycle = self._count
         self._commanded = False
+        self._image.forget_channels()
+        self._await(self._image.awaited_channels())
+
+    def _await(self, channel_ids: Sequence[int]) -> None:
+        """Wait in each cycle for the TPDOs that it needs and for these of the optional channels."""
+        awaited = (*self._image.tpdo_ids, *channel_ids)
+        self._given_up = len(channel_ids) < len(self._channel_ids)
+        self._bits = {can_id: 1 << place for place, can_id in enumerate(awaited)}
+        self._all = (1 << len(awaited)) - 1
 
     def tick(self, command: Command = None) -> Feedback:
         """Run one period and give what it measured.
@@ -185,6 +199,8 @@ class Cycle:
             else:
                 complete = self._receive(clock.now() + self._window_s) and complete
 
+            if self._channels:
+                self._step_channels()
             enabled = image.power.state is State.OPERATION_ENABLED
             if complete and enabled and last is not None:
                 complete = self._believable(last)
@@ -192,6 +208,7 @@ class Cycle:
                 feedback = self._last = Feedback(
                     count, count * self.period_s, image.statusword or 0, image.motor_counts,
                     image.load_counts, image.demand_counts, image.torque_permille, True,
+                    image.load_torque_nm, image.temperature_c,
                 )  # fmt: skip
                 self._good_cycle = count
             else:
@@ -291,13 +308,30 @@ class Cycle:
             faults.append((Fault.DISCARDED_FRAME, "remote, extended, FD or error frame"))
         if got == everything:
             return True
-        missing = ", ".join(f"{can_id:03X}h" for can_id, bit in bits.items() if not got & bit)
-        faults.append((Fault.LOST_TPDO, missing))
-        return False
+        missing = [
+            can_id for can_id, bit in bits.items() if not got & bit and can_id not in self._channel_ids
+        ]
+        if missing:
+            faults.append((Fault.LOST_TPDO, ", ".join(f"{can_id:03X}h" for can_id in missing)))
+        return not missing
+
+    def _step_channels(self) -> None:
+        """Hold what did not come, give up what stays away, and wait again for what is back."""
+        image = self._image
+        faults = image.step_channels()
+        if faults or self._given_up:
+            self._faults += faults
+            self._await(image.awaited_channels())
 
     def _other(self, frame: Frame) -> None:
-        """A frame that is no TPDO of ours: what it means."""
+        """A frame that is not waited for: what it means."""
         can_id, data, time_s = frame
+        if can_id in self._channel_ids:
+            try:
+                self._image.accept(can_id, data)
+            except PdoLengthError:
+                self._faults.append((Fault.DISCARDED_FRAME, f"{can_id:03X}h with {len(data)} bytes"))
+            return
         if self.monitor.dispatch(frame):
             node_id = can_id & _NODE_MASK
             if node_id not in self._nodes or not data:

@@ -6,18 +6,24 @@ unpacks with it.
     TPDO1 180h+id  statusword, position, torque        8 bytes
     TPDO2 280h+id  load encoder, position demand       8 bytes (4 when the load encoder is a node of its own)
     TPDO1 180h+id2 load encoder of another node        as long as its object
+    TPDO3 380h+id  load torque, temperature            as long as its objects; where the axis has them
+    TPDO4 480h+id  temperature                         where it comes less often than the load torque
     RPDO1 200h+id  controlword, target position        6 bytes
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hdbridge.drive import objects
+from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.pdo import PdoCodec, PdoEntry
 from hdbridge.drive.states import PowerWalk
+from hdbridge.drive.supervision import Fault
 from hdbridge.drive.unwrap import Unwrap, wrap_int32
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
@@ -37,10 +43,12 @@ class Layout(NamedTuple):
     number: int
     can_id: int
     codec: PdoCodec
+    every: int = 1
+    """It goes with every so many SYNCs."""
 
 
 def tpdo_layouts(axis: AxisConfig) -> tuple[Layout, ...]:
-    """The PDOs that the master receives."""
+    """The PDOs that each cycle needs."""
     drive_id = axis.drive.node_id
     source = axis.load_encoder.source
     load = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
@@ -54,6 +62,22 @@ def tpdo_layouts(axis: AxisConfig) -> tuple[Layout, ...]:
         first,
         Layout(drive_id, 2, second_id, PdoCodec((demand,))),
         Layout(source.node, 1, objects.COB_TPDO1 + source.node, PdoCodec((load,))),
+    )
+
+
+def channel_layouts(axis: AxisConfig) -> tuple[Layout, ...]:
+    """The PDOs of the optional channels: one for all that come equally often."""
+    together: dict[int, list[PdoEntry]] = {}
+    for channel in axis.channels.values():
+        source = channel.source
+        entry = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
+        together.setdefault(channel.every_cycles, []).append(entry)
+    drive_id = axis.drive.node_id
+    return tuple(
+        Layout(drive_id, number, base + drive_id, PdoCodec(entries), every)
+        for (every, entries), (number, base) in zip(
+            together.items(), ((3, objects.COB_TPDO3), (4, objects.COB_TPDO4)), strict=False
+        )
     )
 
 
@@ -89,6 +113,7 @@ class ProcessImage:
         self.axis = axis
         self.node_id: int = axis.drive.node_id
         self.tpdos = tpdo_layouts(axis)
+        self.channel_tpdos = channel_layouts(axis)
         rpdo = rpdo_layout(axis)
         self.rpdo_id, self.rpdo = rpdo.can_id, rpdo.codec
         self.sync_id: int = objects.COB_SYNC
@@ -103,15 +128,31 @@ class ProcessImage:
         self.halt = False
         """Sets the halt bit of the controlword."""
 
-        self._slots: dict[int, tuple[int, PdoCodec]] = {
-            layout.can_id: (place, layout.codec) for place, layout in enumerate(self.tpdos)
-        }
-        self.tpdo_ids: tuple[int, ...] = tuple(self._slots)
-        """Identifiers of the frames that belong to one cycle."""
         source = axis.load_encoder.source
-        self._load = self._place((source.index, source.subindex))
-        self._demand = self._place((0x6062, 0))
-        self._values: list[tuple[int, ...]] = [(0,) * len(slot[1].entries) for slot in self._slots.values()]
+        self._load_key = (source.index, source.subindex)
+        self._handlers: dict[int, Callable[[bytes], None]] = {
+            layout.can_id: self._handler(place, layout.codec) for place, layout in enumerate(self.tpdos)
+        }
+        self.tpdo_ids: tuple[int, ...] = tuple(self._handlers)
+        """Identifiers of the frames that each cycle needs."""
+        self.channels = tuple(
+            ChannelFollower(key, channel, axis.drive.cycle_ms) for key, channel in axis.channels.items()
+        )
+        """What the axis has beside its encoders; empty for most."""
+        followers = {
+            (channel.source.index, channel.source.subindex): follower
+            for channel, follower in zip(axis.channels.values(), self.channels, strict=True)
+        }
+        self._carried = {
+            layout.can_id: [followers[entry.index, entry.sub] for entry in layout.codec.entries]
+            for layout in self.channel_tpdos
+        }
+        for layout in self.channel_tpdos:
+            self._handlers[layout.can_id] = partial(self._accept_channels, layout)
+        self.load_torque_nm: float | None = None
+        """Last load torque that was believed; None where the axis has none, or none is known (any more)."""
+        self.temperature_c: float | None = None
+        """Last temperature of the gear that was believed; None as with the load torque."""
         self._unwrap_motor = Unwrap()
         self._unwrap_demand = Unwrap()
         self._unwrap_load = Unwrap(source.wraps_at_counts)
@@ -124,34 +165,76 @@ class ProcessImage:
         self.target_counts = 0
         """Last target that was packed."""
 
-    def _place(self, key: tuple[int, int]) -> tuple[int, int]:
-        for place, (_, codec) in enumerate(self._slots.values()):
-            if key in codec.positions:
-                return place, codec.positions[key]
-        raise InputError(f"object {key[0]:04X}h:{key[1]:02X} is in no PDO")
+    def _handler(self, place: int, codec: PdoCodec) -> Callable[[bytes], None]:
+        """What to do with the data of a TPDO that each cycle needs."""
+        if place == 0:
+            return partial(self._accept_state, codec.unpack)
+        load = codec.positions.get(self._load_key)
+        demand = codec.positions.get((objects.POSITION_DEMAND.index, objects.POSITION_DEMAND.sub))
+        return partial(self._accept_positions, codec.unpack, load, demand)
 
     def accept(self, can_id: int, data: bytes) -> bool:
         """Take a TPDO; whether it was one of the image's. `PdoLengthError` when its length is wrong.
 
         Of several frames of one identifier the newest wins. A frame that is rejected leaves all as it was.
         """
-        slot = self._slots.get(can_id)
-        if slot is None:
+        handler = self._handlers.get(can_id)
+        if handler is None:
             return False
-        place, codec = slot
-        values = codec.unpack(data)
-        self._values[place] = values
-        if place == 0:
-            statusword, motor, torque = values
-            self.statusword = statusword
-            self.power.observe(statusword)
-            self.motor_counts = self._unwrap_motor.update(motor)
-            self.torque_permille = torque
-        if place == self._load[0]:
-            self.load_counts = self._unwrap_load.update(values[self._load[1]])
-        if place == self._demand[0]:
-            self.demand_counts = self._unwrap_demand.update(values[self._demand[1]])
+        handler(data)
         return True
+
+    def _accept_state(self, unpack: Callable[[bytes], tuple[int, ...]], data: bytes) -> None:
+        self.statusword, motor, self.torque_permille = unpack(data)
+        self.power.observe(self.statusword)
+        self.motor_counts = self._unwrap_motor.update(motor)
+
+    def _accept_positions(
+        self,
+        unpack: Callable[[bytes], tuple[int, ...]],
+        load: int | None,
+        demand: int | None,
+        data: bytes,
+    ) -> None:
+        values = unpack(data)
+        if load is not None:
+            self.load_counts = self._unwrap_load.update(values[load])
+        if demand is not None:
+            self.demand_counts = self._unwrap_demand.update(values[demand])
+
+    def _accept_channels(self, layout: Layout, data: bytes) -> None:
+        for follower, counts in zip(self._carried[layout.can_id], layout.codec.unpack(data), strict=True):
+            follower.accept(counts)
+
+    def awaited_channels(self) -> list[int]:
+        """Identifiers of the optional channels' TPDOs that come with every SYNC, as long as they do."""
+        return [
+            layout.can_id
+            for layout in self.channel_tpdos
+            if layout.every == 1 and not all(each.lost for each in self._carried[layout.can_id])
+        ]
+
+    def step_channels(self) -> list[tuple[Fault, str]]:
+        """One cycle is over for the channels: their values as of now, and what is wrong with them."""
+        faults = []
+        for follower in self.channels:
+            fault = follower.step()
+            if fault is not None:
+                faults.append(fault)
+            self._publish(follower)
+        return faults
+
+    def forget_channels(self) -> None:
+        """Nothing is known of the channels: the cycle begins, or has rested."""
+        for follower in self.channels:
+            follower.reset()
+            self._publish(follower)
+
+    def _publish(self, follower: ChannelFollower) -> None:
+        if follower.key == "load_torque":
+            self.load_torque_nm = follower.value
+        else:
+            self.temperature_c = follower.value
 
     def check_target(self, counts: int) -> None:
         """`InputError` unless ``counts`` is an integer within the position limits."""

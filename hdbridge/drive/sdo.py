@@ -54,7 +54,7 @@ _ADVICE: Final = {
     0x0601_0000: "the drive does not support this access",
     0x0601_0002: "the object is read-only on this drive",
     0x0602_0000: "the drive does not have the object: check that drive.eds is the EDS of this drive",
-    0x0604_0041: "the drive cannot map it to a PDO: choose another object in load_encoder.source",
+    0x0604_0041: "the drive cannot map it to a PDO: choose another object",
     0x0604_0042: "the mapped objects do not fit the PDO",
     0x0609_0011: "the drive does not have this sub-index: check that drive.eds is the EDS of this drive",
     0x0609_0030: "the drive refuses the value: change it in the axis file",

@@ -50,6 +50,8 @@ class Fault(Enum):
     BAD_TARGET = "the target is not a number within the limits"
     BUS_DOWN = "the CAN interface went away"
     TRANSMIT_FULL = "the transmit queue is full"
+    CHANNEL_HELD = "a load torque or temperature did not come, or is not believed"
+    CHANNEL_LOST = "a load torque or temperature stays away"
 
 
 class Row(NamedTuple):
@@ -84,6 +86,8 @@ TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.BAD_TARGET, _STOP, 1, _STOP, "correct what computes the target"),
     Row(Fault.BUS_DOWN, _LATCH, 1, _LATCH, "bring the interface up, open it anew and boot the drive again"),
     Row(Fault.TRANSMIT_FULL, _STOP, 1, _STOP, "check that another node acknowledges and the bus load"),
+    Row(Fault.CHANNEL_HELD, _GO, 1, _GO, "check the sensor, its range in the axis file and the bus load"),
+    Row(Fault.CHANNEL_LOST, _GO, 1, _GO, "check the sensor and its cable"),
 )
 ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
 

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
-from hdbridge.drive.image import Layout, position_limits_counts, rpdo_layout, tpdo_layouts
+from hdbridge.drive.channels import channel_complaints
+from hdbridge.drive.image import (
+    Layout,
+    channel_layouts,
+    position_limits_counts,
+    rpdo_layout,
+    tpdo_layouts,
+)
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
 from hdbridge.errors import InputError
 
@@ -66,8 +73,10 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
 
     With the drive's object dictionary ``od``, objects that a drive need not have are left out where it has
     none, and its other PDOs are disabled. Raises `InputError` where a value of the axis file cannot be
-    expressed in its object.
+    expressed in its object, or the dictionary has not what the axis file says.
     """
+    if od is not None and (complaints := channel_complaints(axis, od)):
+        raise InputError(complaints[0])
     own = [*_heartbeats(axis), *_pdos(axis, od), *_cycle(axis), *_options(axis), *_limits(axis)]
     drive_id = axis.drive.node_id
     return [
@@ -133,10 +142,9 @@ def _heartbeats(axis: AxisConfig) -> Iterator[_Row]:
 
 def _pdos(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[_Row]:
     used = set()
-    for layout in tpdo_layouts(axis):
+    for layout in (*tpdo_layouts(axis), *channel_layouts(axis)):
         used.add((layout.node_id, objects.TPDO_COMMUNICATION + layout.number - 1))
-        carries = "load_encoder.source" if _carries_load_encoder(axis, layout) else ""
-        yield from _pdo(layout, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING, carries)
+        yield from _pdo(layout, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING, _carried(axis, layout))
     layout = rpdo_layout(axis)
     used.add((layout.node_id, objects.RPDO_COMMUNICATION))
     timeout_ms = max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
@@ -149,7 +157,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[_Row]:
         "drive.cycle_ms",
         IntegerType.UINT16,
     )
-    *others, last = _pdo(layout, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING, "")
+    *others, last = _pdo(layout, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING, ["", ""])
     yield from others
     yield timer, True
     yield last
@@ -159,44 +167,51 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[_Row]:
                 yield _invalidate(axis.drive.node_id, index, f"{kind}{index - base + 1} is not used"), False
 
 
-def _carries_load_encoder(axis: AxisConfig, layout: Layout) -> bool:
-    source = axis.load_encoder.source
-    return (source.index, source.subindex) in layout.codec.positions
+def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
+    """The key of the axis file that chose each entry of a PDO; empty where none did."""
+    encoder = axis.load_encoder.source
+    keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
+    for key, channel in axis.channels.items():
+        keys[channel.source.index, channel.source.subindex] = f"{key}.source"
+    return [keys.get((entry.index, entry.sub), "") for entry in layout.codec.entries]
 
 
-def _invalidate(node_id: int, index: int, why: str) -> PlannedWrite:
+def _invalidate(node_id: int, index: int, why: str, field: str = "") -> PlannedWrite:
     return PlannedWrite(
         node_id,
         index,
         1,
         PDO_INVALID,
         why,
+        field,
         type=IntegerType.UINT32,
         compared=PDO_INVALID,
         kept=PDO_INVALID - 1,
     )
 
 
-def _pdo(layout: Layout, communication: int, mapping: int, field: str) -> Iterator[_Row]:
-    """The order that CiA 301 prescribes: invalid, empty, entries, count, valid."""
-    node_id, number, can_id, codec = layout
+def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[_Row]:
+    """The order that CiA 301 prescribes: invalid, empty, entries, count, valid.
+
+    ``fields`` are the keys of the axis file that chose the entries, empty where none did.
+    """
+    node_id, number, can_id, codec, every = layout
+    field = next(filter(None, fields), "")
     communication += number - 1
     mapping += number - 1
     name = f"{'TPDO' if communication >= objects.TPDO_COMMUNICATION else 'RPDO'}{number}"
     byte, word = IntegerType.UINT8, IntegerType.UINT32
     count = len(codec.entries)
-    yield _invalidate(node_id, communication, f"{name} is off while it is changed"), False
+    yield _invalidate(node_id, communication, f"{name} is off while it is changed", field), False
     yield PlannedWrite(node_id, mapping, 0, 0, f"{name} maps nothing while it is changed", type=byte), False
-    for place, entry in enumerate(codec.entries, start=1):
+    for place, (entry, chosen) in enumerate(zip(codec.entries, fields, strict=True), start=1):
         yield (
-            PlannedWrite(node_id, mapping, place, entry.mapping, f"{name} carries {entry}", field, word),
+            PlannedWrite(node_id, mapping, place, entry.mapping, f"{name} carries {entry}", chosen, word),
             False,
         )
     yield PlannedWrite(node_id, mapping, 0, count, f"{name} maps {count} objects", field, byte), False
-    yield (
-        PlannedWrite(node_id, communication, 2, SYNCHRONOUS, f"{name} goes with every SYNC", type=byte),
-        False,
-    )
+    when = "every SYNC" if every == SYNCHRONOUS else f"every SYNC in {every}"
+    yield PlannedWrite(node_id, communication, 2, every, f"{name} goes with {when}", field, byte), False
     yield (
         PlannedWrite(
             node_id,

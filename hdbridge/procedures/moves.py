@@ -45,6 +45,10 @@ class Sample(NamedTuple):
     motor_position_deg: float
     load_position_deg: float
     motor_torque_nm: float
+    load_torque_nm: float = math.nan
+    """NaN where it is not known."""
+    temperature_c: float = math.nan
+    """NaN where it is not known."""
 
 
 class Path(NamedTuple):

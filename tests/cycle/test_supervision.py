@@ -30,6 +30,8 @@ EXPECTED = {
     Fault.BAD_TARGET: (STOP, STOP, STOP),
     Fault.BUS_DOWN: (LATCH, LATCH, LATCH),
     Fault.TRANSMIT_FULL: (STOP, STOP, STOP),
+    Fault.CHANNEL_HELD: (GO, GO, GO),
+    Fault.CHANNEL_LOST: (GO, GO, GO),
 }
 cycles = st.lists(st.sets(st.sampled_from(Fault), max_size=3), max_size=40)
 harmless = st.sampled_from([fault for fault, reactions in EXPECTED.items() if reactions == (GO, GO, GO)])

@@ -152,7 +152,7 @@ def test_a_refused_write_names_the_field(drive: Drive, tiny: Any, key: tuple[int
 
 def test_a_load_encoder_that_cannot_be_mapped(drive: Drive, tiny: Any) -> None:
     tiny.scripts[0x1A01, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
-    with pytest.raises(SdoError, match=r"cannot be mapped.*another object in load_encoder\.source"):
+    with pytest.raises(SdoError, match=r"cannot map it.*another object.*load_encoder\.source"):
         drive.boot()
 
 

@@ -1,0 +1,107 @@
+"""What a drive can tell the control loop beside its encoders: the axis file's optional channels.
+
+Each is an object of the drive that comes by PDO, with its unit, the range in which a reading is believed, and
+how long the last one is held. `hdbridge.drive.channels` follows them on line.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hdbridge.files.yamlfile import wrong
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Scale(NamedTuple):
+    """A quantity is ``at_zero + per_count * counts``; it is believed from ``least`` to ``greatest``."""
+
+    per_count: float
+    at_zero: float
+    least: float
+    greatest: float
+    unit: str
+
+
+class ChannelSource(_Part):
+    """The object of the drive that carries a channel."""
+
+    index: int = Field(ge=0x1000, le=0xFFFF, description="index of the object")
+    subindex: int = Field(0, ge=0, le=255, description="sub-index of the object")
+    type: Literal["int32", "uint32", "int16", "uint16", "int8", "uint8"] = Field(
+        description="type of the object"
+    )
+    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
+
+
+class LoadTorque(_Part):
+    """The torque on the load: from a sensor at its flange, or what the drive knows of it."""
+
+    source: ChannelSource = Field(description="the object that tells it")
+    newton_metres_per_count: float = Field(gt=0, le=1e6, description="torque at the load per count")
+    direction: Literal[1, -1] = Field(
+        1, description="-1 where it counts down when the torque pushes the load forward"
+    )
+    maximum_nm: float = Field(
+        1000.0, gt=0, le=1e6, description="torque, either way, beyond which a reading is not believed"
+    )
+    every_cycles: int = Field(1, ge=1, le=240, description="it comes with every n-th SYNC")
+    hold_ms: float = Field(
+        100.0,
+        gt=0,
+        le=600_000,
+        description="how long the last reading is held when none comes; then it is lost",
+    )
+
+    @property
+    def scale(self) -> Scale:
+        """Newton metres at the load, positive forward."""
+        limit = self.maximum_nm
+        return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit, "Nm")
+
+
+class Temperature(_Part):
+    """The temperature of the gear."""
+
+    source: ChannelSource = Field(description="the object that tells it")
+    celsius_per_count: float = Field(gt=0, le=1000, description="degrees Celsius per count")
+    celsius_at_zero: float = Field(
+        0.0, ge=-1000, le=1000, description="temperature at a reading of zero (-273.15 where it is in kelvin)"
+    )
+    minimum_celsius: float = Field(
+        -40.0, ge=-273.15, le=1000, description="temperature below which a reading is not believed"
+    )
+    maximum_celsius: float = Field(
+        150.0, ge=-273.15, le=1000, description="temperature above which a reading is not believed"
+    )
+    every_cycles: int = Field(25, ge=1, le=240, description="it comes with every n-th SYNC")
+    hold_ms: float = Field(
+        5000.0,
+        gt=0,
+        le=600_000,
+        description="how long the last reading is held when none comes; then it is lost",
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.minimum_celsius >= self.maximum_celsius:
+            raise wrong(
+                f"found {self.maximum_celsius:g}; expected more than minimum_celsius, "
+                f"{self.minimum_celsius:g}",
+                "maximum_celsius",
+            )
+        return self
+
+    @property
+    def scale(self) -> Scale:
+        """Degrees Celsius."""
+        return Scale(
+            self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius, "C"
+        )
+
+
+MeasuredChannel = LoadTorque | Temperature

@@ -1,0 +1,83 @@
+"""The axis file's encoders: what they count, and where the load encoder's reading comes from."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hdbridge.files.yamlfile import wrong
+
+NodeId = Annotated[int, Field(ge=1, le=127)]
+Direction = Literal[1, -1]
+INT32_MAX = 2**31 - 1
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Encoder(_Part):
+    """An encoder: counts per turn and direction."""
+
+    counts_per_turn: int = Field(
+        ge=1, le=INT32_MAX, description="counts per turn of its own shaft, after multiplication"
+    )
+    direction: Direction = Field(
+        1, description="-1 where it counts down as the axis (as the axis file means it) turns forward"
+    )
+
+    def counts(self, deg: float) -> float:
+        """The reading, in (fractional) counts, at an angle of its shaft in degrees."""
+        return self.direction * deg * self.counts_per_turn / 360.0
+
+    def degrees(self, counts: float) -> float:
+        """The angle of its shaft in degrees at a reading."""
+        return self.direction * counts * 360.0 / self.counts_per_turn
+
+    @property
+    def resolution_arcsec(self) -> float:
+        """One count in arcseconds of its own shaft."""
+        return 1_296_000.0 / self.counts_per_turn
+
+
+class MotorEncoder(Encoder):
+    """The encoder of the motor, which the drive closes its loop on (6064h, 607Ah)."""
+
+
+class Source(_Part):
+    """The object that carries the load encoder's reading."""
+
+    WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}
+
+    index: int = Field(0x60E4, ge=0x1000, le=0xFFFF, description="index of the object")
+    subindex: int = Field(1, ge=0, le=255, description="sub-index of the object")
+    type: Literal["int32", "uint32", "int16", "uint16"] = Field("int32", description="type of the object")
+    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
+    node: NodeId | None = Field(
+        None, description="node id of the encoder, where it is a node of its own (for example CiA 406, 6004h)"
+    )
+    range_counts: int | None = Field(
+        None,
+        ge=2,
+        le=2**32,
+        description="reading at which it begins anew at zero (a single-turn encoder: its counts per turn); "
+        "without it the whole range of the type",
+    )
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if self.range_counts is not None and self.range_counts > self.WRAPS[self.type]:
+            raise wrong(f"{self.type} holds no more than {self.WRAPS[self.type]} counts", "range_counts")
+        return self
+
+    @property
+    def wraps_at_counts(self) -> int:
+        """The reading is known modulo this many counts."""
+        return self.range_counts or self.WRAPS[self.type]
+
+
+class LoadEncoder(Encoder):
+    """The encoder at the load, which says how true the axis points."""
+
+    source: Source = Field(default_factory=Source, description="where its reading comes from")

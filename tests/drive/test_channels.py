@@ -1,0 +1,163 @@
+"""Load torque and temperature: mapped, read back, scaled, checked, held and given up."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axischannels import LoadTorque, Temperature
+from hdbridge.drive import Drive, ProcessImage, load_eds, plan
+from hdbridge.drive.channels import ChannelFollower
+from hdbridge.drive.supervision import Fault
+from hdbridge.errors import InputError, SdoError
+from hdbridge.files.bundled import bundled_folder
+
+TORQUE = {"source": {"index": 0x2101, "type": "int32"}, "newton_metres_per_count": 0.001, "maximum_nm": 50}
+TEMPERATURE = {"source": {"index": 0x2100, "type": "int16"}, "celsius_per_count": 0.1}
+Build = Callable[..., AxisConfig]
+
+
+def follower(**changes: Any) -> ChannelFollower:
+    return ChannelFollower("load_torque", LoadTorque.model_validate(TORQUE | changes), cycle_ms=4)
+
+
+def test_both_come_as_values_with_their_units(build_axis: Build) -> None:
+    image = ProcessImage(build_axis(load_torque=TORQUE | {"direction": -1}, temperature=TEMPERATURE))
+    assert (image.load_torque_nm, image.temperature_c) == (None, None)
+    assert image.accept(0x381, struct.pack("<i", 1500))
+    assert image.accept(0x481, struct.pack("<h", -35))
+    assert not image.step_channels()
+    assert image.load_torque_nm == pytest.approx(-1.5)
+    assert image.temperature_c == pytest.approx(-3.5)
+
+
+def test_what_comes_equally_often_shares_a_pdo(build_axis: Build) -> None:
+    image = ProcessImage(build_axis(load_torque=TORQUE, temperature=TEMPERATURE | {"every_cycles": 1}))
+    assert image.accept(0x381, struct.pack("<ih", 1500, 215))
+    image.step_channels()
+    assert image.load_torque_nm == pytest.approx(1.5)
+    assert image.temperature_c == pytest.approx(21.5)
+
+
+def test_a_temperature_may_be_in_kelvin() -> None:
+    channel = Temperature.model_validate(
+        TEMPERATURE | {"celsius_per_count": 0.01, "celsius_at_zero": -273.15}
+    )
+    each = ChannelFollower("temperature", channel, cycle_ms=4)
+    each.accept(29_315)
+    assert each.value == pytest.approx(20.0)
+
+
+def test_the_plan_maps_them_and_says_which_key_decides(build_axis: Build) -> None:
+    axis = build_axis(load_torque=TORQUE, temperature=TEMPERATURE)
+    rows = {(row.index, row.sub): row for row in plan(axis)}
+    assert (rows[0x1A02, 1].value, rows[0x1A02, 1].field) == (0x2101_0020, "load_torque.source")
+    assert (rows[0x1A03, 1].value, rows[0x1A03, 1].field) == (0x2100_0010, "temperature.source")
+    assert (rows[0x1802, 2].value, rows[0x1803, 2].value) == (1, 25)
+    assert (rows[0x1802, 1].value, rows[0x1803, 1].value) == (0x381, 0x481)
+
+
+def test_without_them_nothing_is_mapped(build_axis: Build) -> None:
+    od = load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
+    rows = {(row.index, row.sub): row for row in plan(build_axis(), od)}
+    assert rows[0x1802, 1].value == 0x8000_0000
+    assert (0x1A02, 1) not in rows
+
+
+@pytest.mark.parametrize(
+    ("source", "complaint"),
+    [
+        ({"index": 0x2155, "type": "int32"}, r"load_torque\.source\.index: .* has no object 2155h:00"),
+        ({"index": 0x2101, "subindex": 1, "type": "int32"}, r"load_torque\.source\.index: .* has no object"),
+        ({"index": 0x60E4, "subindex": 9, "type": "int32"}, r"load_torque\.source\.index: .* has no object"),
+        ({"index": 0x2101, "type": "int16"}, r"load_torque\.source\.type: .* says that 2101h:00 is int32"),
+        ({"index": 0x6065, "type": "uint32"}, r"load_torque\.source\.index: .* 6065h:00 cannot be mapped"),
+    ],
+)
+def test_what_the_eds_says_otherwise_is_refused(
+    build_axis: Build, source: dict[str, Any], complaint: str
+) -> None:
+    od = load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
+    with pytest.raises(InputError, match=complaint):
+        plan(build_axis(load_torque=TORQUE | {"source": source}), od)
+
+
+def test_a_drive_that_does_not_take_the_mapping_is_refused(
+    bus: Any, clock: Any, tiny: Any, build_axis: Build
+) -> None:
+    tiny.scripts[0x1A02, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
+    with pytest.raises(SdoError, match=r"cannot map it.*load_torque\.source decides it"):
+        Drive(bus, build_axis(load_torque=TORQUE), clock, load_eds_with_2101()).boot()
+    tiny.scripts.clear()
+    tiny.stuck.add((0x1A02, 1))
+    with pytest.raises(Exception, match=r"1A02h:01 .*reads back 0; .*load_torque\.source decides it"):
+        Drive(bus, build_axis(load_torque=TORQUE), clock, load_eds_with_2101()).boot()
+
+
+def load_eds_with_2101() -> Any:
+    return load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
+
+
+def test_a_reading_that_cannot_be_is_not_believed() -> None:
+    each = follower()
+    each.accept(10_000)
+    assert each.step() is None
+    each.accept(50_001)
+    assert each.step() == (Fault.CHANNEL_HELD, "load_torque: 50.001 Nm is not within -50 to 50 Nm")
+    assert each.value == pytest.approx(10.0)
+    each.accept(-50_000)
+    assert each.step() is None
+    assert each.value == pytest.approx(-50.0)
+
+
+@pytest.mark.parametrize("counts", [-(2**15), 2**15 - 1])
+def test_the_ends_of_the_type_are_no_reading(counts: int) -> None:
+    each = follower(source={"index": 0x2101, "type": "int16"})
+    each.accept(counts)
+    assert each.value is None
+    each.accept(counts - 1 if counts > 0 else counts + 1)
+    assert each.value is not None
+
+
+def test_what_stays_away_is_held_and_then_lost_and_may_come_back() -> None:
+    each = follower(hold_ms=20)
+    each.accept(1000)
+    assert each.step() is None
+    for _ in range(5):
+        assert each.step() == (Fault.CHANNEL_HELD, "load_torque: none came")
+        assert each.value == pytest.approx(1.0)
+    assert each.step() == (Fault.CHANNEL_LOST, "load_torque: none came")
+    assert each.value is None
+    assert each.lost
+    assert each.step() is None  # said once
+    each.accept(2000)
+    assert (each.step(), each.value, each.lost) == (None, 2.0, False)
+
+
+def test_before_the_first_reading_there_is_nothing_to_hold() -> None:
+    each = follower(hold_ms=20)
+    said = [each.step() for _ in range(10)]
+    assert [fault for fault in said if fault] == [(Fault.CHANNEL_LOST, "load_torque: none came")]
+
+
+@given(every=st.integers(2, 30), missed=st.integers(0, 5), late=st.lists(st.integers(0, 1), max_size=20))
+def test_one_that_comes_every_so_many_cycles_is_missed_once_each_time(
+    every: int, missed: int, late: list[int]
+) -> None:
+    each = follower(every_cycles=every, hold_ms=4 * every * 10)
+    arrivals = {i * every + shift for i, shift in enumerate([*late, 0])}
+    first = max(arrivals) + 1
+    held = 0
+    for cycle in range(first + (missed + 1) * every):
+        if cycle in arrivals:
+            each.accept(1000)
+        held += each.step() is not None
+        if cycle < first:
+            assert not held
+    assert held == missed
