@@ -23,6 +23,7 @@ import math
 from dataclasses import dataclass, replace
 
 from hdbridge.effects import Channel, Moment, Start, Tracker, compensable, fall_bound
+from hdbridge.effects.base import Memoryless
 from hdbridge.errors import InputError
 from hdbridge.model import ModelTracker, TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
@@ -66,7 +67,10 @@ class _Faded(Tracker):
 class Inverse:
     """The model's inverse, coming from the state that `advance` has left."""
 
-    __slots__ = ("_error", "_fall", "_motor_deg", "_slope", "_timeless", "_tracker", "faded", "needs")
+    __slots__ = (
+        "_before_deg", "_error", "_fall", "_motor_deg", "_peeked", "_rise", "_slope", "_standing",
+        "_stateful", "_timeless", "_tracker", "faded", "needs",
+    )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
         """Leaves out what cannot or must not be compensated, such as the load encoder's own errors.
@@ -75,6 +79,7 @@ class Inverse:
         """
         model = replace(model, effects=compensable(model.effects))
         trackers = [each.tracker(start) for each in model.effects]
+        stateful = [not isinstance(each, Memoryless) for each in trackers]
         self.faded: list[_Faded] = []
         """Those that need a channel that can be lost."""
         for place, each in enumerate(model.effects):
@@ -82,6 +87,7 @@ class Inverse:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
                 self.faded.append(faded)
         self._tracker: Tracker = trackers[0] if len(trackers) == 1 else ModelTracker(trackers)
+        self._stateful = [each for each, keeps in zip(trackers, stateful, strict=True) if keeps]
         self._slope = ARCSEC_PER_DEG / model.ratio
         self._fall = fall_bound(model.effects)
         if self._fall > _STEEPEST_FALL * self._slope:
@@ -90,8 +96,12 @@ class Inverse:
                 f"more than {_STEEPEST_FALL:g} of the gear's own {self._slope:.3g}: "
                 "it has no usable inverse; check the amplitudes and orders"
             )
-        self._motor_deg = 0.0
-        self._error = 0.0
+        self._motor_deg = self._before_deg = 0.0
+        self._error = self._rise = 0.0
+        self._peeked: tuple[float, float, Moment] | None = None
+        """Angle, error and moment of the solution that `solve` gave last."""
+        self._standing = False
+        """To advance to the same angle once more changes nothing."""
         # Without channels the error at rest is what it was when the command was issued: not asked twice.
         self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
         """The channels that the effects need."""
@@ -99,9 +109,25 @@ class Inverse:
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """The command is issued: move the state on; returns the model's error there, arcsec."""
+        if self._standing and motor_deg == self._motor_deg:
+            return self._error
+        peeked = self._peeked
+        if peeked is not None and peeked[0] == motor_deg and peeked[2] is moment:
+            # The error is known; what has no state need not hear of it.
+            error = peeked[1]
+            for each in self._stateful:
+                each.advance(motor_deg, moment)
+        else:
+            error = self._tracker.advance(motor_deg, moment)
+        self._peeked = None
+        step = motor_deg - self._motor_deg
+        if step:
+            self._rise = (error - self._error) / step
+            self._before_deg = self._motor_deg
         self._motor_deg = motor_deg
-        self._error = self._tracker.advance(motor_deg, moment)
-        return self._error
+        self._error = error
+        self._standing = self._timeless
+        return error
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
         """Motor angle in degrees that puts the load at ``load_deg``; the state does not change.
@@ -110,21 +136,28 @@ class Inverse:
         last bit of the motor angle where the law is so steep that this comes first.
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
+        self._peeked = None
         goal = ARCSEC_PER_DEG * load_deg
         here = self._error if self._timeless else peek(last, moment)
         gap = goal - slope * last - weight * here
         if abs(gap) <= _TOLERANCE_ARCSEC:
             return last
-        # In plain travel the gear's own slope nearly is the whole slope: a few secants and it is there.
-        x0, f0 = last, -gap
-        x1 = last + gap / slope
+        # In plain travel the last step tells the slope, and three points the next ones.
+        before, x0, f0, s0 = self._before_deg, last, -gap, slope + weight * self._rise
+        x1 = last + gap / (s0 if 0.5 * slope < s0 < 2.0 * slope else slope)
         for _ in range(4):
-            f1 = slope * x1 + weight * peek(x1, moment) - goal
-            if abs(f1) <= _TOLERANCE_ARCSEC:
+            error = peek(x1, moment)
+            f1 = slope * x1 + weight * error - goal
+            if -_TOLERANCE_ARCSEC <= f1 <= _TOLERANCE_ARCSEC:
+                self._peeked = (x1, error, moment)
                 return x1
             if f1 == f0:
                 break
-            x0, x1, f0 = x1, x1 - f1 * (x1 - x0) / (f1 - f0), f1
+            s1 = (f1 - f0) / (x1 - x0)
+            bend = (x1 - x0) * (s1 - s0) / (x1 - before) if x1 != before else 0.0
+            # After a reversal the points before it tell nothing, and the chord has to do.
+            s = s1 + bend if -0.5 < bend / s1 < 1.0 else s1
+            before, x0, x1, f0, s0 = x0, x1, x1 - f1 / s, f1, s1
         # The error falls at most by `fall` per degree, so the root is no farther than this.
         far = last + gap / (slope - weight * self._fall) * (1.0 + 1e-9)
         return self._bracketed(goal, moment, weight, last, -gap, far)
@@ -233,13 +266,13 @@ class Compensation:
             self._fade()
         motor = self._inverse.solve(load_deg, moment, weight)
         wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
-        slew = self._slew_step
-        allowed = min(max(wanted, self._correction - slew), self._correction + slew)
-        allowed = min(max(allowed, -self._maximum), self._maximum)
-        if allowed != wanted:
+        slew, last, most = self._slew_step, self._correction, self._maximum
+        if not (last - slew <= wanted <= last + slew and -most <= wanted <= most):
             self.limited += 1
-            motor = self._ratio * (load_deg - allowed / ARCSEC_PER_DEG)
-        self._correction = allowed
+            wanted = min(max(wanted, last - slew), last + slew)
+            wanted = min(max(wanted, -most), most)
+            motor = self._ratio * (load_deg - wanted / ARCSEC_PER_DEG)
+        self._correction = wanted
         self._inverse.advance(motor, moment)
         return motor
 

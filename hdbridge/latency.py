@@ -60,8 +60,9 @@ class Histogram:
         if us >= _EXACT:
             self._counts[min(_bin_of(us), _BINS - 1)] += 1
         else:
-            self._counts[max(us, 0)] += 1
-        self.maximum_us = max(self.maximum_us, us)
+            self._counts[us if us > 0 else 0] += 1
+        if us > self.maximum_us:  # noqa: PLR1730 - max() costs three times as much, in every cycle
+            self.maximum_us = us
         self.total += 1
 
     def percentile_us(self, percent: float) -> int:

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import can
 from can.interfaces.socketcan import SocketcanBus
+from can.typechecking import Channel
 
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull
 from hdbridge.errors import BusError
@@ -40,19 +41,24 @@ def fast_link(link: Link) -> Link:
     return fast
 
 
-class _DataFrame(can.Message):
-    """A message whose deep copy is cheap: it holds nothing but its data that could be shared."""
+class DataFrame(can.Message):
+    """A message that is cheap to make and to copy: a data frame with an 11-bit identifier, nothing else."""
 
     __slots__ = ()
 
+    def __init__(self, can_id: int, data: bytes | bytearray, channel: Channel | None) -> None:
+        # What the base class makes of the same, without asking for what cannot be.
+        self.arbitration_id = can_id
+        self.data = bytearray(data)
+        self.dlc = len(data)
+        self.channel = channel
+        self.timestamp = 0.0
+        self.is_rx = True
+        self.is_extended_id = self.is_remote_frame = self.is_error_frame = False
+        self.is_fd = self.bitrate_switch = self.error_state_indicator = False
+
     def __deepcopy__(self, memo: object) -> can.Message:
-        return can.Message(
-            timestamp=self.timestamp,
-            arbitration_id=self.arbitration_id,
-            is_extended_id=False,
-            channel=self.channel,
-            data=bytes(self.data),
-        )
+        return DataFrame(self.arbitration_id, self.data, self.channel)
 
 
 class _MessageLink(Link):
@@ -64,7 +70,7 @@ class _MessageLink(Link):
         if self._down is not None:
             raise BusError(self._down)
         try:
-            self._send(_DataFrame(arbitration_id=can_id, is_extended_id=False, data=data, channel=self._mark))
+            self._send(DataFrame(can_id, data, self._mark))
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 

@@ -62,7 +62,7 @@ class PdoCodec:
     ``entries`` are the mapped objects in order; 1 to 8 bytes together, no object twice, else `InputError`.
     """
 
-    __slots__ = ("_limits", "_odd", "_struct", "_unpack", "entries", "length", "positions")
+    __slots__ = ("_odd", "_struct", "_unpack", "entries", "length", "positions")
 
     def __init__(self, entries: Iterable[PdoEntry]) -> None:
         self.entries: tuple[PdoEntry, ...] = tuple(entries)
@@ -74,7 +74,6 @@ class PdoCodec:
             (entry.index, entry.sub): place for place, entry in enumerate(self.entries)
         }
         """Place of an object's value in the tuple, by (index, sub-index)."""
-        self._limits = tuple((entry.type.minimum, entry.type.maximum) for entry in self.entries)
         # struct has no 24-bit integer: such entries travel as three bytes and are converted apart.
         self._odd = tuple(place for place, entry in enumerate(self.entries) if entry.type.bits == 24)
         names = ", ".join(map(str, self.entries))
@@ -102,25 +101,32 @@ class PdoCodec:
 
     def pack(self, values: Sequence[int]) -> bytes:
         """The frame's data; `InputError` when a value is not an integer within the range of its type."""
-        if len(values) != len(self._limits):
-            raise InputError(
-                f"a PDO of {len(self._limits)} objects needs as many values, but got {len(values)}"
-            )
-        for value, (least, greatest) in zip(values, self._limits, strict=True):
-            # A float is refused even when it is whole: rounding is a decision, and NaN is a float too.
-            if not isinstance(value, int) or not least <= value <= greatest:
-                self._refuse(values)
         if not self._odd:
-            return self._struct.pack(*values)
+            try:
+                # struct itself refuses what is no integer (NaN is a float) and what is out of range.
+                return self._struct.pack(*values)
+            except struct.error as error:
+                raise self._refusal(values) from error
         encoded: list[int | bytes] = list(values)
         for place in self._odd:
-            encoded[place] = self.entries[place].type.encode(values[place])
-        return self._struct.pack(*encoded)
+            kind = self.entries[place].type
+            if not isinstance(values[place], int) or not kind.minimum <= values[place] <= kind.maximum:
+                raise self._refusal(values)
+            encoded[place] = kind.encode(values[place])
+        try:
+            return self._struct.pack(*encoded)
+        except struct.error as error:
+            raise self._refusal(values) from error
 
-    def _refuse(self, values: Sequence[int]) -> None:
+    def _refusal(self, values: Sequence[int]) -> InputError:
+        if len(values) != len(self.entries):
+            return InputError(
+                f"a PDO of {len(self.entries)} objects needs as many values, but got {len(values)}"
+            )
         for entry, value in zip(self.entries, values, strict=True):
             if not isinstance(value, int) or not entry.type.minimum <= value <= entry.type.maximum:
-                raise InputError(
-                    f"object {entry}: {value!r} is not an integer in "
-                    f"[{entry.type.minimum}, {entry.type.maximum}]; nothing was sent"
-                )
+                break
+        return InputError(
+            f"object {entry}: {value!r} is not an integer in "
+            f"[{entry.type.minimum}, {entry.type.maximum}]; nothing was sent"
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import time
 from collections import deque
+from copy import deepcopy
 
 import can
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from hdbridge.axis import BusConfig
 from hdbridge.clock import MonotonicClock
 from hdbridge.drive import Link, TransmitBufferFull, open_bus
+from hdbridge.drive.fastlink import DataFrame
 from hdbridge.errors import BusError
 
 
@@ -200,3 +202,12 @@ def test_what_the_interface_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         "bitrate": 500_000,
         "can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}],
     }
+
+
+def test_the_messages_of_the_cycle_are_those_of_python_can() -> None:
+    plain = can.Message(arbitration_id=0x201, is_extended_id=False, data=b"\x0f\x00\x01", channel="x")
+    for message in (made := DataFrame(0x201, b"\x0f\x00\x01", "x"), copy := deepcopy(made)):
+        for name in can.Message.__slots__:
+            if name != "__weakref__":
+                assert getattr(message, name) == getattr(plain, name), name
+    assert copy.data is not made.data

@@ -1,0 +1,61 @@
+"""Frames that are no PDO of the cycle: what they say of the nodes, and of somebody else on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.drive.objects import COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, NmtState
+from hdbridge.drive.supervision import Fault
+
+if TYPE_CHECKING:
+    from hdbridge.drive.image import ProcessImage
+    from hdbridge.drive.link import Frame
+    from hdbridge.drive.monitor import NetworkMonitor
+
+_NODE_MASK: Final = 0x7F
+
+
+class Traffic:
+    """Judges the frames that the control cycle does not wait for."""
+
+    __slots__ = ("_monitor", "_node_id", "_nodes", "_own", "_sync_id", "heard_s")
+
+    def __init__(self, image: ProcessImage, monitor: NetworkMonitor, now_s: float) -> None:
+        self._monitor = monitor
+        self._node_id = image.node_id
+        self._nodes = {can_id & _NODE_MASK for can_id in image.tpdo_ids}
+        for node_id in self._nodes:
+            monitor.watch(node_id)
+        self._sync_id = image.sync_id
+        self._own = {
+            image.rpdo_id: "the RPDO",
+            image.heartbeat_id: "the master's heartbeat",
+            COB_NMT: "an NMT command",
+            COB_SDO_REQUEST + image.node_id: "an SDO request",
+        }
+        self.heard_s = now_s
+        """When the drive's last heartbeat came."""
+
+    def faults(self, frame: Frame) -> Iterator[tuple[Fault, str]]:
+        """What is wrong about a frame, with its detail for a person."""
+        can_id, data, time_s = frame
+        if self._monitor.dispatch(frame):
+            node_id = can_id & _NODE_MASK
+            if node_id not in self._nodes or not data:
+                return
+            if can_id < COB_HEARTBEAT:
+                if any(data[:2]):
+                    yield Fault.EMERGENCY, str(self._monitor.nodes[node_id].last_error)
+                return
+            if node_id == self._node_id:
+                self.heard_s = time_s
+            state = data[0] & _NODE_MASK
+            if state == NmtState.BOOT_UP:
+                yield Fault.BOOT_UP, f"node {node_id}"
+            elif state != NmtState.OPERATIONAL:
+                yield Fault.NMT_CHANGE, f"node {node_id}, NMT state {state:02X}h"
+        elif can_id == self._sync_id:
+            yield Fault.FOREIGN_SYNC, ""
+        elif can_id in self._own:
+            yield Fault.OWN_ID_ELSEWHERE, f"{can_id:03X}h, {self._own[can_id]}"
