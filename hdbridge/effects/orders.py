@@ -159,5 +159,9 @@ class OrderTracker(Memoryless):
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
         """Error in arcsec at this motor angle."""
-        angle = self._scale * motor_deg
-        return horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real
+        # `horner`, written out: it is asked several times in each control cycle.
+        turn = cmath.exp(1j * (self._scale * motor_deg))
+        total = 0j
+        for amplitude in self._phasors:
+            total = total * turn + amplitude
+        return total.real
