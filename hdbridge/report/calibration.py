@@ -12,33 +12,24 @@ import numpy as np
 from hdbridge import __version__
 from hdbridge.calibration import Calibration
 from hdbridge.calibration.result import unit_of
-from hdbridge.calibration.validation import Validation
 from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
 from hdbridge.modeldiff import diff
 from hdbridge.report.page import Block, Chart, Facts, Grid, Mark, Page, Section, Series, Table, histogram
+from hdbridge.report.validation import stepping_sections
+from hdbridge.report.words import SIGMA, figure, sentence, with_interval
 from hdbridge.units import DEG_PER_TURN
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
-SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
-X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "error, arcsec"
 TURN_LABEL: Final = "motor angle within its turn, deg"
 LOAD_LABEL: Final = "load angle, deg"
 R_LABEL: Final = "residual, arcsec"
-WAYS: Final = ("there (CW)", "back (CCW)")
 PAUSE_STEPS: Final = 20.0
 """A gap in time of so many usual steps parts two runs."""
 HIGHEST_ORDER: Final = 16.0
 """Of the spectrum that is drawn."""
-ISO_FIGURES: Final = (
-    ("accuracy", "accuracy A"),
-    ("repeatability", "repeatability R"),
-    ("reversal", "reversal B"),
-    ("systematic", "systematic E"),
-    ("range", "range M"),
-)
 
 
 def calibration_page(result: Calibration) -> Page:
@@ -46,10 +37,7 @@ def calibration_page(result: Calibration) -> Page:
     traces = result.fit.traces
     sections = []
     if result.validation is not None:
-        sections.append(
-            Section("Stepping test", _stepping_text(result.validation), [*_stepping(result.validation)])
-        )
-        sections += _iso_section(result.validation)
+        sections += stepping_sections(result.validation)
     sections += [
         Section("Parameters", _parameters_text(result), [*_parameters(result)]),
         Section(
@@ -75,7 +63,7 @@ def calibration_page(result: Calibration) -> Page:
             "which shows the side lobes of its neighbours too.",
             [_spectrum(result)],
         ),
-        Section("What the model leaves", _sentence(result.fit.held_out.text), [*_residual(result)]),
+        Section("What the model leaves", sentence(result.fit.held_out.text), [*_residual(result)]),
     ]
     if len(result.drift) > 1:
         sections.append(Section("Reference pose", _drift_text(result), [_drift(result)]))
@@ -92,14 +80,10 @@ def calibration_page(result: Calibration) -> Page:
 
 
 def _verdict(result: Calibration) -> str:
-    text = _sentence(result.offer.reason if result.offer is not None else result.fit.held_out.text)
+    text = sentence(result.offer.reason if result.offer is not None else result.fit.held_out.text)
     if notes := len(result.fit.warnings):
         text += f" Read the {'note' if notes == 1 else f'{notes} notes'} under 'What the model leaves'."
     return text
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
 def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
@@ -257,18 +241,18 @@ def _parameters(result: Calibration) -> Iterator[Block]:
     for each in result.fit.intervals:
         row: list[str | float] = [_parameter_words(each.effect, each.parameter)]
         if each.identifiable:
-            row += _with_interval(each.value, each.half_width)
+            row += with_interval(each.value, each.half_width)
         else:
-            row += [f"({_number(each.value)})", "not known"]
+            row += [f"({figure(each.value)})", "not known"]
         row.append(unit_of(each.parameter))
         if before:
             was = before.get((each.effect, each.parameter))
-            row += ["new", ""] if was is None else [_number(was), _change(each.value - was, each.parameter)]
+            row += ["new", ""] if was is None else [figure(was), _change(each.value - was, each.parameter)]
         rows.append(row)
     yield Table(header, rows)
     if result.fit.nuisances:
         fitted: list[list[str | float]] = [
-            [each.text, *_with_interval(each.value, each.half_width), each.unit]
+            [each.text, *with_interval(each.value, each.half_width), each.unit]
             for each in result.fit.nuisances
         ]
         yield Table(
@@ -290,63 +274,6 @@ def _change(change: float, parameter: str) -> str:
     if parameter.endswith("phase_deg"):
         change = math.remainder(change, DEG_PER_TURN)
     return f"{change:+.3g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _stepping_text(checked: Validation) -> str:
-    share = checked.after.pooled.three_sigma_arcsec / checked.floor.three_sigma_arcsec
-    return (
-        f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
-        f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
-        "that."
-    )
-
-
-def _stepping(checked: Validation) -> Iterator[Block]:
-    rows: list[list[str | float]] = []
-    charts, remains = [], {}
-    reach = 1.08 * max(
-        (
-            abs(error)
-            for each in (checked.before, checked.after)
-            for way in each.errors_arcsec
-            for error in way
-        ),
-        default=1.0,
-    )
-    for when, each in (("before", checked.before), ("after", checked.after)):
-        row: list[str | float] = [f"{when}: {each.model}"]
-        for part in (each.cw, each.ccw, each.pooled):
-            row += [part.three_sigma_arcsec, part.mean_arcsec]
-        rows.append(row)
-        series = [
-            Series(name, targets, errors, Mark.POINTS)
-            for name, targets, errors in zip(WAYS, each.targets_deg, each.errors_arcsec, strict=True)
-        ]
-        caption = f"{when.capitalize()}: {each.model}"
-        charts.append(Chart(caption, X_LABEL, Y_LABEL, series, height_px=240, y_range=(-reach, reach)))
-        remains = {one.label: one.y for one in series}
-    after = Chart("After, enlarged", X_LABEL, Y_LABEL, charts[-1].series, height_px=240)
-    yield Table(
-        ["with", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean", f"pooled {SIGMA}", "mean"], rows, "arcsec"
-    )
-    yield Grid([*charts, after, histogram("After: how often which error", Y_LABEL, remains, height_px=240)])
-
-
-def _iso_section(checked: Validation) -> list[Section]:
-    given = [
-        (when, each)
-        for when, each in (("before", checked.accuracy_before), ("after", checked.accuracy_after))
-        if each is not None
-    ]
-    if not given:
-        return []
-    rows = [[when, *(getattr(each, name) for name, _ in ISO_FIGURES)] for when, each in given]
-    tested = given[-1][1]
-    text = (
-        f"The figures of ISO 230-2 for a rotary axis, arcsec: {tested.targets} targets, each approached "
-        f"{tested.runs} times from either side."
-    )
-    return [Section("Accuracy and repeatability", text, [Table(["", *(w for _, w in ISO_FIGURES)], rows)])]
 
 
 def _drift_text(result: Calibration) -> str:
@@ -381,18 +308,6 @@ def _text(value: object) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_text, value))
     return str(value)
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """The half width with two digits, the value with as many decimals."""
-    if not (math.isfinite(half_width) and half_width > 0.0):
-        return _number(value), _number(half_width)
-    decimals = max(1 - math.floor(math.log10(half_width)), 0)
-    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}"), f"{half_width:.{decimals}f}"
 
 
 def _of_kind(traces: Traces, kind: str) -> BoolArray:

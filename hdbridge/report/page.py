@@ -37,6 +37,8 @@ class Mark(Enum):
     """Joined in the order given: also loops, whose x goes back and forth."""
     DASHED = "dashed"
     POINTS = "points"
+    FAINT = "faint"
+    """Small grey points, behind everything else: the raw data under what is made of them."""
     BARS = "bars"
     """From zero (or, on a logarithmic axis, from its lower end) to y."""
 
@@ -51,6 +53,10 @@ class Series:
     mark: Mark = Mark.LINE
     bar_width: float | None = None
     """Of `Mark.BARS`, in units of x; else what looks right."""
+    spread: FloatArray | Sequence[float] | None = None
+    """Of `Mark.POINTS`: half the length of a vertical bar through each point, in units of y."""
+    colour: int | None = None
+    """Place in the palette, where series belong together; else each has its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +81,8 @@ class Chart:
     levels: Sequence[Level] = ()
     y_log: bool = False
     """Logarithmic; values that are not positive are gaps."""
+    x_log: bool = False
+    """The same of x."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,19 +220,27 @@ def _chart_data(chart: Chart) -> dict[str, Any]:
         x, y = np.asarray(each.x, dtype=np.float64), np.asarray(each.y, dtype=np.float64)
         if x.shape != y.shape or x.ndim != 1:
             raise ValueError(f"series '{each.label}': x and y must be of one length")
+        spread = None if each.spread is None else np.asarray(each.spread, dtype=np.float64)
+        if spread is not None and (spread.shape != x.shape or len(x) > POINTS_MAXIMUM):
+            raise ValueError(f"series '{each.label}': one spread per point, {POINTS_MAXIMUM} at most")
         if chart.y_log:
             y = np.where(y > 0.0, y, np.nan)
+        if chart.x_log:
+            y = np.where(x > 0.0, y, np.nan)
         count = len(x)
         if each.mark is not Mark.BARS:
-            x, y = (sampled if each.mark is Mark.POINTS else thinned)(x, y)
+            cloud = each.mark in {Mark.POINTS, Mark.FAINT}
+            x, y = (sampled if cloud else thinned)(x, y)
         most_left_out = max(most_left_out, count / max(len(x), 1))
         series.append(
             {
                 "label": each.label,
                 "mark": each.mark.value,
                 "bar": each.bar_width,
-                "x": _rounded(x),
+                "colour": each.colour,
+                "x": _significant(x) if chart.x_log else _rounded(x),
                 "y": _significant(y) if chart.y_log else _rounded(y),
+                "spread": None if spread is None else _rounded(spread),
             }
         )
     return {
@@ -233,6 +249,7 @@ def _chart_data(chart: Chart) -> dict[str, Any]:
         "height": chart.height_px,
         "y_range": chart.y_range,
         "y_log": chart.y_log,
+        "x_log": chart.x_log,
         "levels": [{"label": each.label, "value": each.value} for each in chart.levels],
         "note": f"every {most_left_out:.0f}th point is drawn, and the peaks" if most_left_out >= 1.5 else "",
         "series": series,

@@ -25,7 +25,23 @@
         ctx.strokeStyle = ctx.fillStyle = colour;
         ctx.lineWidth = 1.5 * dpr;
         ctx.lineJoin = "round";
-        if (mark === "points") {
+        if (series.spread) {
+          ctx.globalAlpha = 0.55;
+          ctx.lineWidth = dpr;
+          ctx.beginPath();
+          for (let i = 0; i < xs.length; i++) {
+            if (ys[i] === null) continue;
+            ctx.moveTo(x(xs[i]), y(ys[i] - series.spread[i]));
+            ctx.lineTo(x(xs[i]), y(ys[i] + series.spread[i]));
+          }
+          ctx.stroke();
+          ctx.lineWidth = 1.5 * dpr;
+        }
+        if (mark === "faint") {
+          ctx.globalAlpha = xs.length > 1500 ? 0.3 : 0.45;
+          const size = (xs.length > 1500 ? 1.4 : 2) * dpr;
+          for (let i = 0; i < xs.length; i++) if (ys[i] !== null) ctx.fillRect(x(xs[i]) - size / 2, y(ys[i]) - size / 2, size, size);
+        } else if (mark === "points") {
           const radius = (xs.length > 1500 ? 1.1 : xs.length > 500 ? 1.5 : xs.length > 40 ? 2 : 3.2) * dpr;
           ctx.globalAlpha = xs.length > 500 ? 0.75 : 0.9;
           for (let i = 0; i < xs.length; i++) {
@@ -97,20 +113,29 @@
     let low = Infinity, high = -Infinity, bars = false;
     const see = value => { if (value !== null) { low = Math.min(low, value); high = Math.max(high, value); } };
     for (const series of chart.series) {
-      for (const value of series[key]) see(value);
+      for (const value of series[key]) if (value > 0 || !(key === "x" && chart.x_log)) see(value);
       if (series.mark !== "bars") continue;
       if (key === "x" && series.bar) for (const value of series.x) { see(value - series.bar / 2); see(value + series.bar / 2); }
       if (key === "y" && !chart.y_log) { see(0); bars = true; }
     }
     if (key === "y") for (const level of chart.levels) see(level.value);
-    if (!(low <= high)) return chart.y_log && key === "y" ? [0.1, 1] : [0, 1];
-    if (key === "y" && chart.y_log) return [low / 1.4, high * 1.4];
+    if (!(low <= high)) return chart[`${key}_log`] ? [0.1, 1] : [0, 1];
+    if (chart[`${key}_log`]) return [low / 1.4, high * 1.4];
     const margin = (key === "y" && chart.levels.length ? 0.12 : 0.05) * (high - low) || 0.1 * Math.abs(high) || 1;
     return [bars && low === 0 ? 0 : low - margin, bars && high === 0 ? 0 : high + margin];
   }
 
+  // Each series' colour: grey, the one asked for, or the next that is free.
+  function coloured(chart) {
+    const colours = palette();
+    let next = 0;
+    return chart.series.map(series => series.mark === "faint" ? css("--faint")
+      : colours[(series.colour === null ? next++ : series.colour) % colours.length]);
+  }
+
   function swatch(mark, colour) {
     const shape = {
+      faint: `<circle cx="11" cy="5" r="1.8" fill="${colour}" fill-opacity=".6"/>`,
       points: `<circle cx="11" cy="5" r="3.4" fill="${colour}"/>`,
       bars: `<rect x="5" y="0" width="12" height="10" fill="${colour}" fill-opacity=".55" stroke="${colour}"/>`,
       dashed: `<path d="M0 5h22" stroke="${colour}" stroke-width="2" stroke-dasharray="5 3"/>`,
@@ -125,7 +150,7 @@
     chart.series.forEach((series, i) => {
       if (!series.label) return;
       const item = document.createElement("span");
-      item.innerHTML = swatch(series.mark, colours[i % colours.length]);
+      item.innerHTML = swatch(series.mark, colours[i]);
       item.append(series.label);
       row.append(item);
     });
@@ -161,7 +186,7 @@
 
   function plot(holder) {
     const chart = CHARTS[holder.dataset.chart];
-    const colours = palette(), ink = css("--faint"), line = css("--line");
+    const colours = coloured(chart), ink = css("--faint"), line = css("--line");
     const font = `12px ${getComputedStyle(document.body).fontFamily}`;
     const axis = label => ({
       label, font, labelFont: font, labelGap: 2, labelSize: 20, stroke: ink,
@@ -184,16 +209,16 @@
       cursor: { drag: { x: true, y: true, uni: 12 }, points: { show: false } },
       legend: { show: false },
       scales: {
-        x: { time: false, range: (u, low, high) => enlarged ? [low, high] : xRange },
+        x: { time: false, distr: chart.x_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : xRange },
         y: { distr: chart.y_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : yRange },
       },
-      axes: [{ ...axis(chart.x_label), values, size: 28 }, { ...axis(chart.y_label), values: chart.y_log ? decades : values, size: 52 }],
+      axes: [{ ...axis(chart.x_label), values: chart.x_log ? decades : values, size: 28 }, { ...axis(chart.y_label), values: chart.y_log ? decades : values, size: 52 }],
       series: [null, ...chart.series.map((series, i) => ({
         label: series.label,
-        stroke: colours[i % colours.length],
-        fill: colours[i % colours.length],
+        stroke: colours[i],
+        fill: colours[i],
         facets: [{ scale: "x", auto: true }, { scale: "y", auto: true }],
-        paths: draw(series, colours[i % colours.length], chart.y_log ? yRange[0] : 0),
+        paths: draw(series, colours[i], chart.y_log ? yRange[0] : 0),
       }))],
       hooks: {
         setSelect: [u => { enlarged = u.select.width > 0 || u.select.height > 0; }],
