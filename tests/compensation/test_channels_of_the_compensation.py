@@ -1,0 +1,117 @@
+"""Effects that need more than the motor angle: inverted on line, and faded out without their channel."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hdbridge.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
+from hdbridge.effects import CATALOGUE, Channel, Compliance, Moment, Observer, Start, compensable, extended
+from hdbridge.model import TransmissionModel
+
+PERIOD = 0.004
+BASE = extended((CATALOGUE["synchronous"].candidate(50.0),), CATALOGUE["hysteresis"].candidate(50.0))
+SOFT = Compliance(
+    c1_arcsec_per_nm=16, c2_arcsec_per_nm=16, c3_arcsec_per_nm=16, torque1_nm=50, torque2_nm=100
+)
+LOADED = TransmissionModel(50.0, extended(BASE, SOFT))
+
+
+def run_with(effect) -> TransmissionModel:
+    return TransmissionModel(50.0, extended(BASE, effect))
+
+
+def moments(loads):
+    """What a control loop would know on the way, with a torque and a temperature that change."""
+    observer = Observer()
+    for index, load in enumerate(loads):
+        time_s = index * PERIOD
+        yield observer.moment(
+            50.0 * load,
+            time_s,
+            load_torque_nm=8.0 * math.sin(3.0 * load),
+            motor_torque_nm=0.2 * math.cos(2.0 * load),
+            temperature_c=25.0 + 2.0 * time_s,
+            load_deg=load,
+        )
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_that_may_be_compensated_is_inverted_with_its_channels(name):
+    effect = CATALOGUE[name].candidate(50.0, BASE)
+    model = run_with(effect)
+    if not compensable((effect,)):
+        assert len(compensable(model.effects)) == 2
+        return
+    inverse = Inverse(model)
+    gear = TransmissionModel(50.0, compensable(model.effects)).tracker()
+    rng = np.random.default_rng(5)
+    steps = rng.choice([0.0, 1e-4, 0.01, 0.05], 600) * rng.choice([-1, 1, 1], 600)
+    loads = np.cumsum(steps).tolist()
+    for load, moment in zip(loads, moments(loads), strict=True):
+        if moment.time_s == 0.0:
+            inverse.advance(50.0 * load, moment)
+            gear.advance(50.0 * load, moment)
+            continue
+        motor = inverse.solve(load, moment)
+        inverse.advance(motor, moment)
+        assert abs(3600 * (motor / 50 - load) + gear.advance(motor, moment)) <= 1e-6
+
+
+def test_what_an_inverse_needs_is_said():
+    assert Inverse(TransmissionModel(50.0, BASE)).needs == frozenset()
+    assert Compensation(LOADED, CompensationLimits(), PERIOD).needs == {Channel.LOAD_TORQUE}
+
+
+def engaged(torque_nm: float) -> tuple[Compensation, Moment]:
+    compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
+    moment = Moment(load_torque_nm=torque_nm)
+    compensation.reset(0.0, moment)
+    compensation.engage()
+    for load in np.arange(0.0, 5.0, 10.0 * PERIOD):
+        compensation.command(float(load), moment)
+    for _ in range(200):
+        compensation.command(5.0, moment)
+    return compensation, moment
+
+
+def test_without_its_channel_an_effect_is_faded_out_and_with_it_in_again():
+    compensation, moment = engaged(5.0)
+    gear = LOADED.tracker(Start.FORWARD)  # five degrees forward are many times the loop's width
+    gear.advance(compensation.command(5.0, moment), moment)
+    with_torque = compensation.correction_arcsec
+    compensation.know(LOSABLE - {Channel.LOAD_TORQUE})
+    steps, last = [], with_torque
+    for _ in range(200):
+        gear.advance(compensation.command(5.0, moment), moment)
+        steps.append(abs(compensation.correction_arcsec - last))
+        last = compensation.correction_arcsec
+    without_torque = compensation.correction_arcsec
+    # 80 arcsec in half a second, and what the loop makes of turning back: never more than 3 per cycle.
+    assert 0 < max(steps) < 3.0
+    assert max(steps[130:]) == 0.0
+    assert abs(with_torque - without_torque) > 30
+    compensation.know(LOSABLE)
+    for _ in range(200):
+        motor = compensation.command(5.0, moment)
+        error = 3600 * (motor / 50 - 5.0) + gear.advance(motor, moment)
+    assert abs(error) < 1e-6
+
+
+def test_to_lose_a_channel_that_nothing_needs_changes_nothing():
+    compensation, moment = engaged(5.0)
+    before = compensation.correction_arcsec
+    compensation.know(LOSABLE - {Channel.TEMPERATURE})
+    for _ in range(200):
+        compensation.command(5.0, moment)
+    assert compensation.correction_arcsec == before
+
+
+def test_a_compensation_that_begins_without_the_channel_begins_without_the_effect():
+    compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
+    compensation.know(frozenset())
+    compensation.reset(0.0)
+    compensation.engage()
+    for _ in range(200):
+        compensation.command(0.0, Moment(load_torque_nm=50.0))
+    assert abs(compensation.correction_arcsec) < 40
