@@ -112,12 +112,15 @@ class ReversalsEntry(_Part):
         60.0, gt=0, le=3600, description="way at the motor before each, more than the hysteresis is wide"
     )
     motor_deg_per_s: float = Field(10.0, gt=0, le=3600, description="speed of the motor")
+    beyond: bool = Field(
+        False, description="all depths in one curve, each beyond where the last turned: shows memory"
+    )
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
         """Slowed to the permitted speed, the reach shortened to the travel."""
         reach = room.half(name, "the reach of the reversals", self.reach_deg / room.ratio) * room.ratio
         depths = tuple(each for each in self.depths_deg if each <= reach)
-        yield Reversals(room.middle_deg, depths, reach, room.speed(name, self.motor_deg_per_s))
+        yield Reversals(room.middle_deg, depths, reach, room.speed(name, self.motor_deg_per_s), self.beyond)
 
 
 class SteppingEntry(_Part):

@@ -19,11 +19,15 @@ class Reversals:
     reach_deg: float = 60.0
     velocity_deg_s: float = 0.2
     """At the load."""
+    beyond: bool = False
 
     def moves(self, axis: AxisView) -> Steps[None]:
         """Starts each curve on the forward branch, at the centre."""
-        for depth_deg in self.depths_deg:
-            depth = depth_deg / axis.ratio
+        depths = [each / axis.ratio for each in self.depths_deg]
+        curves: list[tuple[float, ...]] = [(0.0, -each, -0.5 * each, -each, 0.0) for each in depths]
+        if self.beyond:
+            curves = [(0.0, *(place for each in depths for place in (-each, -0.5 * each)), 0.0)]
+        for curve in curves:
             yield MoveTo(self.centre_deg - self.reach_deg / axis.ratio)
-            for place in (0.0, -depth, -0.5 * depth, -depth, 0.0):
+            for place in curve:
                 yield MoveTo(self.centre_deg + place, self.velocity_deg_s, kind="reversal")

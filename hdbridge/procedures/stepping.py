@@ -58,12 +58,13 @@ class Stepping:
                 target = self.start_deg + index * self.step_deg / axis.ratio
                 yield MoveTo(target, kind="step")
                 samples = yield self.settle
-                stands.append(_standing(target, samples, self.settle))
+                stands.append(standing(target, samples, self.settle))
             passes.append(tuple(stands))
         return SteppingOutcome(cw=passes[0], ccw=passes[1])
 
 
-def _standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
+def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
+    """What was measured at a target: the mean over the settled window."""
     window = settle.window(samples)
     mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
     return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

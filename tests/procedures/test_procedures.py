@@ -12,6 +12,7 @@ from hdbridge.procedures.moves import AxisView, Dwell, MotionLimits, MoveTo, Sam
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.reversals import Reversals
 from hdbridge.procedures.sine import Sines
+from hdbridge.procedures.small_steps import SmallSteps
 from hdbridge.procedures.standstill import Precondition, Standstill
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.procedures.sweep import Sweep
@@ -118,6 +119,8 @@ PROCEDURES = [
     Sweep(-10, 10, 5.0, laps=2),
     Sines(),
     Reversals(),
+    Reversals(beyond=True),
+    SmallSteps(),
     Stepping(count=20),
 ]
 
