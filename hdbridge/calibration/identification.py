@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,20 +76,18 @@ def resting(recording: Recording, window_s: float) -> FloatArray:
 
 
 def provenance(
-    paths: Iterable[Path | str], recordings: Sequence[Recording], result: FitResult
+    paths: Iterable[Path | str],
+    recordings: Sequence[Recording],
+    held_out: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What a model file says of where its numbers come from."""
+    """What a model file says of where its numbers come from; ``held_out`` is its gain on unseen data."""
     dates = sorted({each.date for each in recordings if each.date})
     data: dict[str, Any] = {
         "recordings": [str(each) for each in paths],
         "recorded": dates,
         "samples": sum(len(each.record) for each in recordings),
         "versions": versions_here(),
-        "held_out": {
-            "over": result.held_out.over,
-            "before_arcsec": result.held_out.before_arcsec,
-            "after_arcsec": result.held_out.after_arcsec,
-        },
+        "held_out": dict(held_out),
     }
     return {name: value for name, value in data.items() if value not in ([], {})}
 

@@ -91,7 +91,12 @@ def conclude(
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
-    model = with_provenance(fit.model, provenance(recordings, measured, fit))
+    held_out = {
+        "over": fit.held_out.over,
+        "before_arcsec": fit.held_out.before_arcsec,
+        "after_arcsec": fit.held_out.after_arcsec,
+    }
+    model = with_provenance(fit.model, provenance(recordings, measured, held_out))
     first = measured[0]
     return Calibration(
         recordings=tuple(map(str, recordings)),

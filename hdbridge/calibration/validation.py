@@ -189,11 +189,11 @@ def validate(
         pace.begin(f"stepping {name}")
         compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
         bench = Bench(drive, compensation, interrupted=pace.interrupted)
-        with _kept(bench, folder / f"stepping-{name}.csv.gz"):
+        with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
             results.append(Stepped.of(words, bench.run(stepping).outcome))
         if positioning:
             pace.begin(f"positioning {name}")
-            with _kept(bench, folder / f"positioning-{name}.csv.gz"):
+            with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
                 approaches = bench.run(positioning).outcome
             accuracies.append(
                 axis_accuracy(
@@ -206,7 +206,7 @@ def validate(
 
 
 @contextmanager
-def _kept(bench: Bench, path: Path) -> Iterator[None]:
+def record_kept(bench: Bench, path: Path) -> Iterator[None]:
     """Write what the bench measures within, also when it is stopped."""
     try:
         yield

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +15,7 @@ from hdbridge.calibration.measure import identity_of, outlook
 from hdbridge.calibration.validation import validation_s
 from hdbridge.cli.findings import print_calibration, write_calibration_page
 from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.measuring import kept_in, phases
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -31,7 +30,6 @@ from hdbridge.cli.options import (
     console,
     load_axis,
     notes,
-    progress_bar,
     write_json,
 )
 from hdbridge.drive.drive import Drive
@@ -95,14 +93,14 @@ def command(
         deferred_interrupt() as interrupted,
         connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
         Drive(bus, axis, clock) as drive,
-        _kept_in(folder),
+        kept_in(folder),
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
         if journal is None:
             about = {"simulated": True, "seed": seed} if simulate else {}
             journal = start_journal(folder, axis, chosen, date, identity_of(drive), about)
-        with _progress() as progress:
+        with phases() as progress:
             result = calibrate(
                 drive,
                 journal,
@@ -142,29 +140,3 @@ def _announce(plan: Plan, axis: AxisConfig, journal: Journal | None) -> None:
         f"{validation_s(plan, axis) / 60:.1f} min to test the model",
         soft_wrap=True,
     )
-
-
-@contextmanager
-def _kept_in(folder: Path) -> Iterator[None]:
-    """Say where the record is when the measurement does not come to its end."""
-    try:
-        yield
-    except BaseException:
-        if (folder / "recording.yaml").exists():
-            notes.print(f"what was measured is kept; go on with --resume {folder}", soft_wrap=True)
-        raise
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, float, float], None]]:
-    """A bar for the plan and one for the validation."""
-    with progress_bar() as bar:
-        bars: dict[bool, int] = {}
-
-        def show(name: str, done_s: float, total_s: float) -> None:
-            validating = name.startswith(("stepping ", "positioning "))
-            if validating not in bars:
-                bars[validating] = bar.add_task("", total=total_s)
-            bar.update(bars[validating], completed=done_s, description=f"{name:>18}")  # type: ignore[arg-type]
-
-        yield show

@@ -75,14 +75,15 @@ def run(
         independent_zeros=independent_zeros,
         progress=lambda words: notes.print(f"{words} ..."),
     )
-    _print(result)
+    print_diagnosis(result)
     write_json(json_file, result.as_dict())
     if extend is not None:
         result.model.save(extend)
         notes.print(f"wrote {extend}")
 
 
-def _print(result: Diagnosis) -> None:
+def print_diagnosis(result: Diagnosis) -> None:
+    """Verdict, findings, the next experiments, and what was not named."""
     console.print(result.verdict())
     table = Table("cause", "probability", "or", "size", "held out", "parameters")
     for each in result.findings:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.calibration import Calibration, Validation
+from hdbridge.calibration import Calibration, Stepped, Validation
 from hdbridge.calibration.result import unit_of
 from hdbridge.cli.options import console
 from hdbridge.files.atomic import write_atomically
@@ -59,7 +60,7 @@ def print_calibration(result: Calibration) -> None:
     for warning in fit.warnings:
         console.print(f"note: {escape(warning)}", soft_wrap=True)
     if result.validation:
-        _print_stepping(result)
+        print_stepping(result.validation)
     if result.offer:
         console.print(
             escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True
@@ -77,22 +78,9 @@ def _title(result: Calibration) -> str:
     return escape(f"Model of {axis}, ratio {result.model.ratio:g}")
 
 
-def _print_stepping(result: Calibration) -> None:
-    checked = result.validation
-    assert checked is not None
-    table = Table(title="Stepping test: load error at rest, arcsec", title_justify="left")
-    table.add_column("with")
-    for direction in ("CW", "CCW", "pooled"):
-        table.add_column(f"{direction} 3σ", justify="right")
-        table.add_column("mean", justify="right")
-    for each in (checked.before, checked.after):
-        cells = [
-            f"{value:.2f}"
-            for part in (each.cw, each.ccw, each.pooled)
-            for value in (part.three_sigma_arcsec, part.mean_arcsec)
-        ]
-        table.add_row(each.model, *cells)
-    console.print(table)
+def print_stepping(checked: Validation) -> None:
+    """The stepping test with the model before and with the new one, beside the floor of the axis."""
+    print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     _print_accuracy(checked)
     floor = checked.floor
     console.print(
@@ -100,6 +88,23 @@ def _print_stepping(result: Calibration) -> None:
         f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} of it",
         soft_wrap=True,
     )
+
+
+def print_steps(title: str, tests: Iterable[Stepped]) -> None:
+    """Scatter and mean of stepping tests, a line each."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("with")
+    for direction in ("CW", "CCW", "pooled"):
+        table.add_column(f"{direction} 3σ", justify="right")
+        table.add_column("mean", justify="right")
+    for each in tests:
+        cells = [
+            f"{value:.2f}"
+            for part in (each.cw, each.ccw, each.pooled)
+            for value in (part.three_sigma_arcsec, part.mean_arcsec)
+        ]
+        table.add_row(each.model, *cells)
+    console.print(table)
 
 
 def _print_accuracy(checked: Validation) -> None:
