@@ -17,6 +17,7 @@ from hdbridge.cli import (
     diagnose,
     doctor,
     fit,
+    improve,
     latency,
     model,
     report,
@@ -38,7 +39,21 @@ app = typer.Typer(
         "5 stopped by supervision, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
-for command in (demo, check, scan, doctor, simulate, step, calibrate, fit, diagnose, model, report, latency):
+for command in (
+    demo,
+    check,
+    scan,
+    doctor,
+    simulate,
+    step,
+    calibrate,
+    fit,
+    diagnose,
+    improve,
+    model,
+    report,
+    latency,
+):
     command.register(app)
 
 

@@ -1,0 +1,80 @@
+"""What the axis can do by itself to tell apart what a diagnosis leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from hdbridge.diagnose import Diagnosis
+from hdbridge.diagnose.experiment import machine_for_unexplained, machine_plans
+from hdbridge.diagnose.planned import plan_report
+from hdbridge.improvement.extension import alternatives
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.moves import AxisView
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import rehearse
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An experiment that is worth its time."""
+
+    plan: Plan
+    duration_s: float
+    """At an ideal axis."""
+    tells: tuple[str, ...]
+    """What it is predicted to tell, in words."""
+
+
+def choose(
+    diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, done: Collection[str] = ()
+) -> Choice | None:
+    """The shortest experiment, not ``done`` yet, predicted to separate a surviving pair of causes.
+
+    Where no pair survives but something is unexplained: the experiment that looks closer at where it lives.
+    None where the machine can learn nothing more by itself.
+    """
+    menu = sorted(
+        ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
+        key=lambda each: each[0],
+    )
+    pairs = [(each.cause, alias, each.peak_arcsec) for each in diagnosis.findings for alias in each.aliases]
+    if pairs:
+        for duration_s, plan in menu:
+            report = plan_report(plan, model, view.limits)["identifiability"]
+            told = [f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)]
+            if told:
+                return Choice(plan, duration_s, tuple(told))
+    for finding in diagnosis.findings:
+        if finding.cause == "unexplained":
+            name = machine_for_unexplained(finding.lives_in)
+            for duration_s, plan in menu:
+                if plan.name == name:
+                    return Choice(plan, duration_s, (f"what lives in the {finding.lives_in or 'time'}",))
+    return None
+
+
+def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """For whatever is still open, what a person can do about it."""
+    return tuple(
+        dict.fromkeys(
+            f"{alternatives(each)}: {each.experiment}"
+            for each in diagnosis.findings
+            if each.experiment and (each.aliases or each.cause == "unexplained")
+        )
+    )
+
+
+def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float) -> bool:
+    """Whether the plan by itself would see the cause at its size, and not take it for the other."""
+    seen = report[one]
+    limit = seen["detection_limit_arcsec"]
+    if not seen["detectable"] or limit is None or limit > peak_arcsec:
+        return False
+    return other not in seen["aliases"] and one not in report[other]["aliases"]
+
+
+def _duration_s(plan: Plan, view: AxisView) -> float:
+    middle = 0.5 * (view.limits.position_min_deg + view.limits.position_max_deg)
+    return sum(rehearse(each.procedure, view, middle).duration_s for each in plan.tasks(view).tasks)

@@ -1,0 +1,240 @@
+"""The whole way, from a booted drive to a pending model that points better."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import axis_view
+from hdbridge.calibration.identification import provenance, with_provenance
+from hdbridge.calibration.journal import Journal, tasks_of
+from hdbridge.calibration.measure import identity_of, measure, start_journal
+from hdbridge.calibration.pipeline import ACTIVE_NAME, MODEL_NAME
+from hdbridge.calibration.result import Offer
+from hdbridge.calibration.validation import floor_of
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
+from hdbridge.improvement.extension import alternatives, extension_of, named
+from hdbridge.improvement.further import advice, choose
+from hdbridge.improvement.result import Improvement, Round
+from hdbridge.improvement.trial import Trial, try_out
+from hdbridge.model import TransmissionModel
+from hdbridge.modelstore import propose
+from hdbridge.procedures.plan import Plan
+from hdbridge.recording import ABOUT_NAME, Recording
+
+RESULT_NAME = "improvement.json"
+Progress = Callable[[str, float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What is diagnosed: a plan to be run (its journal), or recordings that are there."""
+
+    plan: Plan
+    """Its stepping test is the trial's, also where recordings are given."""
+    folder: Path
+    """Where everything new goes."""
+    journal: Journal | None = None
+    given: tuple[Path, ...] = ()
+    independent_zeros: bool = False
+    """The encoders' zeros were lost between the given recordings."""
+
+
+def improve(
+    drive: Drive,
+    source: Source,
+    profile: Path,
+    active: TransmissionModel,
+    date: datetime,
+    *,
+    rounds: int = 0,
+    progress: Progress = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Improvement:
+    """Diagnose, extend, step with both models, and propose the better one to the profile.
+
+    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. With
+    ``rounds`` the axis runs so many further experiments at most, while something is left to tell apart.
+    Nothing is proposed where nothing is found, where what is found cannot be compensated, or where the
+    model does not gain on held-out data and in stepping. InputError where model or recordings are not of this
+    axis and drive.
+    """
+    active.check_bound_to(drive.axis, identity_of(drive))
+    bench = _Bench(drive, date, progress, interrupted)
+    earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
+    paths, recording, apart = _begin(source, bench)
+    tell("diagnosing")
+    diagnosis = _diagnosed(recording, active, apart)
+    found: list[Round] = []
+    while len(found) < rounds:
+        folder = source.folder / f"round-{len(found) + 1}"
+        journal, tells = _journal(folder, bench, diagnosis, active, {each.experiment for each in found})
+        if journal is None:
+            break
+        tell(diagnosis.verdict())
+        tell(f"round {len(found) + 1}: {journal.plan.about}, to tell {', '.join(tells) or 'more'}")
+        apart = bench.run(journal) or apart or earlier
+        paths.append(folder)
+        recording = Recording.load(*paths)
+        diagnosis = _diagnosed(recording, active, apart)
+        left = tuple(map(alternatives, diagnosis.findings))
+        found.append(Round(journal.plan.name, journal.plan.about, str(folder), tells, left))
+    result = Improvement(
+        axis=drive.axis.name,
+        recordings=tuple(map(str, paths)),
+        date=recording.date or Recording.load(paths[0]).date,
+        plan=source.plan.name,
+        active=active,
+        diagnosis=diagnosis,
+        extension=extension_of(diagnosis, active),
+        rounds=tuple(found),
+        advice=advice(diagnosis),
+        trial=None,
+        offer=Offer(False, "nothing found: the active model stays"),
+    )
+    if diagnosis.findings:
+        result = _concluded(result, bench, source, profile, recording, tell)
+    return _kept(source.folder, result)
+
+
+@dataclass(frozen=True, slots=True)
+class _Bench:
+    """What every measurement here is run with."""
+
+    drive: Drive
+    date: datetime
+    progress: Progress
+    interrupted: Callable[[], bool]
+
+    def run(self, journal: Journal) -> bool:
+        """Measure what is missing; whether an encoder may have lost its zero between its tasks."""
+        measure(self.drive, journal, progress=self.progress, interrupted=self.interrupted)
+        return len({each.session for each in tasks_of(journal.recording())}) > 1
+
+
+def _begin(source: Source, bench: _Bench) -> tuple[list[Path], Recording, bool]:
+    if source.journal is not None:
+        apart = bench.run(source.journal)
+        return [source.journal.folder], source.journal.recording(), apart
+    recording = Recording.load(*source.given)
+    _check_is_of(recording, bench.drive.axis, source.given[0])
+    return list(source.given), recording, source.independent_zeros
+
+
+def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
+    for what, theirs, ours in (
+        ("axis", recording.axis, axis.name),
+        ("gear ratio", recording.ratio, axis.gear.ratio),
+    ):
+        if theirs is not None and theirs != ours:
+            raise InputError(
+                f"{path}: this recording is of {what} {theirs}, but here is {ours} ({axis.path}); "
+                "improve the axis that it was measured on"
+            )
+
+
+def _diagnosed(recording: Recording, active: TransmissionModel, apart: bool) -> Diagnosis:
+    return diagnose(recording.record, active, recording.segments, independent_zeros=apart)
+
+
+def _journal(
+    folder: Path, bench: _Bench, diagnosis: Diagnosis, active: TransmissionModel, done: set[str]
+) -> tuple[Journal | None, tuple[str, ...]]:
+    """The next experiment's: one that was begun before, or the one that is worth most now."""
+    axis = bench.drive.axis
+    if (folder / ABOUT_NAME).exists():
+        journal = Journal.open(folder)
+        journal.check_is_of(axis, identity_of(bench.drive))
+        return journal, ()
+    choice = choose(diagnosis, active, axis_view(axis), done)
+    if choice is None:
+        return None, ()
+    return start_journal(folder, axis, choice.plan, bench.date, identity_of(bench.drive)), choice.tells
+
+
+def _concluded(
+    result: Improvement,
+    bench: _Bench,
+    source: Source,
+    profile: Path,
+    recording: Recording,
+    tell: Callable[[str], None],
+) -> Improvement:
+    """With the trial, where one is worth its time, and the offer."""
+    extension, drive = result.extension, bench.drive
+    if not extension.carried:
+        return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
+    if not extension.improves:
+        return replace(
+            result, offer=Offer(False, f"not offered: no gain on held-out data, {extension.held_out()}")
+        )
+    model = with_provenance(extension.model, _provenance(result, recording))
+    tell("stepping with the active and with the extended model, in turns")
+    floor = floor_of(drive.axis, recording)
+    try:
+        trial = try_out(
+            drive,
+            source.plan,
+            result.active,
+            model,
+            floor,
+            source.folder,
+            progress=bench.progress,
+            interrupted=bench.interrupted,
+        )
+    except InputError as problem:
+        return replace(result, offer=Offer(False, f"not offered: {problem}"))
+    result = replace(result, trial=trial)
+    told = _told(trial)
+    if not trial.improves:
+        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
+    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
+    pending = propose(profile, model, reason, bench.date, identity_of(drive))
+    return replace(result, offer=Offer(True, reason, pending))
+
+
+def _told(trial: Trial) -> str:
+    big = [each.pooled.three_sigma_arcsec for each in (trial.stepping.before, trial.stepping.after)]
+    small = [each.pooled.three_sigma_arcsec for each in trial.small]
+    return (
+        f"stepping 3 sigma {big[0]:.2f} to {big[1]:.2f} arcsec, small steps {small[0]:.2f} to {small[1]:.2f}"
+    )
+
+
+def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
+    first = result.extension.carried[0]
+    held_out = {
+        "over": f"stretches of time left out of the fit, without and with {first.cause}",
+        "before_arcsec": first.before_arcsec,
+        "after_arcsec": first.after_arcsec,
+    }
+    found = [
+        {
+            "cause": each.cause,
+            "probability": round(each.probability, 3),
+            "aliases": list(each.aliases),
+            "held_out_before_arcsec": each.before_arcsec,
+            "held_out_after_arcsec": each.after_arcsec,
+        }
+        for each in result.diagnosis.findings
+    ]
+    return {**provenance(result.recordings, [recording], held_out), "found": found}
+
+
+def _kept(folder: Path, result: Improvement) -> Improvement:
+    """Result and models beside the recording; nothing where nothing new was measured."""
+    if folder.is_dir():
+        if result.diagnosis.findings:
+            result.extension.model.save(folder / MODEL_NAME)
+        result.active.save(folder / ACTIVE_NAME)
+        write_atomically(folder / RESULT_NAME, json.dumps(result.as_dict(), indent=1, allow_nan=False) + "\n")
+    return result

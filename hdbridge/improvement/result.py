@@ -1,0 +1,76 @@
+"""What an improvement says, as plain values; `Improvement.as_dict` is the document for machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from hdbridge.calibration.result import Offer
+from hdbridge.diagnose import Diagnosis
+from hdbridge.improvement.extension import Extension
+from hdbridge.improvement.trial import Trial
+from hdbridge.model import TransmissionModel
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A further experiment that the axis has run."""
+
+    experiment: str
+    about: str
+    recording: str
+    tells: tuple[str, ...]
+    """What it was predicted to tell; empty where it was there already."""
+    found: tuple[str, ...]
+    """The findings after it, each with what it could also be."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {
+            "experiment": self.experiment,
+            "about": self.about,
+            "recording": self.recording,
+            "tells": list(self.tells),
+            "found": list(self.found),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Improvement:
+    """Diagnosed, extended, tried out; and whether the model is offered for commit."""
+
+    axis: str
+    recordings: tuple[str, ...]
+    date: str | None
+    """When the first was recorded, ISO 8601."""
+    plan: str
+    active: TransmissionModel
+    diagnosis: Diagnosis
+    extension: Extension
+    rounds: tuple[Round, ...]
+    advice: tuple[str, ...]
+    """What a person can do about what is still open."""
+    trial: Trial | None
+    offer: Offer
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract of ``--json``: schema ``hdbridge.improvement/1``."""
+        trial = (
+            self.trial.as_dict() if self.trial else {"stepping": None, "small_steps": None, "improves": None}
+        )
+        return {
+            "schema": "hdbridge.improvement/1",
+            "axis": self.axis,
+            "recordings": list(self.recordings),
+            "date": self.date,
+            "plan": self.plan,
+            "offered": self.offer.made,
+            "reason": self.offer.reason,
+            "pending": str(self.offer.pending) if self.offer.pending else None,
+            "compensated": [each.cause for each in self.extension.carried],
+            "not_compensated": list(self.extension.left),
+            "rounds": [each.as_dict() for each in self.rounds],
+            "advice": list(self.advice),
+            **trial,
+            "diagnosis": self.diagnosis.as_dict(),
+        }

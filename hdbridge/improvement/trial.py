@@ -1,0 +1,147 @@
+"""Does the axis point better with the extended model? Stepping with both, in turns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import Bench, axis_view, compensation_for
+from hdbridge.calibration.measure import Pace
+from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Hysteresis, HysteresisMemory
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.moves import AxisView
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.procedures.small_steps import SmallSteps
+from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+
+PIECES = 4
+"""Parts of the travel; in each both models step, so that a drift is the same for both."""
+SMALL_STEPS = 40
+DEFAULT_WIDTH_DEG = 20.0
+"""Reach of the small steps where the model has no hysteresis; motor degrees."""
+_WORDS = ("the active model", "the extended model")
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What stepping gave with the active and with the extended model, at the load encoder."""
+
+    stepping: Validation
+    """Steps longer than the hysteresis is wide, over the plan's travel."""
+    small: tuple[Stepped, Stepped]
+    """Steps shorter than it is wide, about one pose: before and after."""
+
+    @property
+    def improves(self) -> bool:
+        """Whether the axis points better in one of the two tests and in neither worse, beyond chance."""
+        gains = [
+            _gain(self.stepping.before, self.stepping.after),
+            _gain(*self.small),
+        ]
+        return any(each > CHANCE for each in gains) and all(each > -CHANCE for each in gains)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data; ``stepping`` is that of a calibration."""
+        before, after = self.small
+        return {
+            "stepping": self.stepping.as_dict(),
+            "small_steps": {"before": before.as_dict(), "after": after.as_dict()},
+            "improves": self.improves,
+        }
+
+
+def try_out(
+    drive: Drive,
+    plan: Plan,
+    active: TransmissionModel,
+    model: TransmissionModel,
+    floor: Floor,
+    folder: Path,
+    *,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Trial:
+    """Step a booted drive's axis with both models, part of the travel by part, in turns.
+
+    Each run's samples go to ``folder``, also when it is stopped. InputError, before anything moves, where the
+    axis lacks a channel that the model's compensation needs.
+    """
+    axis = drive.axis
+    compensations = [compensation_for(axis, each) for each in (active, model)]
+    procedures = _procedures(plan, axis_view(axis), active)
+    pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, progress, interrupted)
+    outcomes: tuple[list[SteppingOutcome], list[SteppingOutcome]] = ([], [])
+    for number, (name, procedure) in enumerate(procedures):
+        for which in (0, 1) if number % 2 == 0 else (1, 0):
+            title = f"{name}-{'before' if which == 0 else 'after'}"
+            pace.begin(title.replace("-", " "))
+            bench = Bench(drive, compensations[which], interrupted=pace.interrupted)
+            with record_kept(bench, folder / f"{title}.csv.gz"):
+                outcomes[which].append(bench.run(procedure).outcome)
+    pieces = [Stepped.of(words, _together(each[:-1])) for words, each in zip(_WORDS, outcomes, strict=True)]
+    small = [Stepped.of(words, each[-1]) for words, each in zip(_WORDS, outcomes, strict=True)]
+    return Trial(Validation(pieces[0], pieces[1], floor), (small[0], small[1]))
+
+
+def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
+    """How long it takes at an ideal axis."""
+    view = axis_view(axis)
+    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
+    procedures = _procedures(plan, view, active)
+    return 2.0 * sum(rehearse(each, view, middle).duration_s for _, each in procedures)
+
+
+def _procedures(
+    plan: Plan, view: AxisView, active: TransmissionModel
+) -> list[tuple[str, Stepping | SmallSteps]]:
+    """The plan's stepping test in parts, and the small steps last."""
+    whole = plan.stepping(view)
+    count = max(whole.count // PIECES, 2)
+    pieces = [
+        replace(
+            whole,
+            count=min(count, whole.count - first)
+            if first + 2 * count <= whole.count
+            else whole.count - first,
+            start_deg=whole.start_deg + first * whole.step_deg / view.ratio,
+        )
+        for first in range(0, whole.count - count + 1, count)
+    ]
+    widths = [each.width_deg for each in active.effects if isinstance(each, Hysteresis | HysteresisMemory)]
+    limits = view.limits
+    small = SmallSteps(
+        0.5 * (limits.position_min_deg + limits.position_max_deg),
+        0.9 * min(*(widths or [DEFAULT_WIDTH_DEG]), plan.precondition_deg),
+        min(SMALL_STEPS, 2 * whole.count),
+        whole.precondition_deg,
+    )
+    return [*((f"stepping-{n}", each) for n, each in enumerate(pieces, 1)), ("small-steps", small)]
+
+
+def _together(outcomes: Sequence[SteppingOutcome]) -> SteppingOutcome:
+    return SteppingOutcome(
+        cw=tuple(each for one in outcomes for each in one.cw),
+        ccw=tuple(each for one in outcomes for each in one.ccw),
+    )
+
+
+def _gain(before: Stepped, after: Stepped) -> float:
+    """By how many of its standard errors the mean square about the mean has fallen; both stood at the same
+    places.
+    """
+    squares = []
+    for stepped in (before, after):
+        errors = np.concatenate([np.asarray(each) for each in stepped.errors_arcsec])
+        squares.append((errors - errors.mean()) ** 2)
+    fall = squares[0] - squares[1]
+    error = float(np.std(fall)) / math.sqrt(len(fall))
+    return float(np.mean(fall)) / error if error > 0.0 else 0.0
