@@ -46,9 +46,10 @@ def compare_schemes(
     ``progress`` receives the share of the present scheme that is done; ``finished`` each run as it ends, so
     that nothing measured is lost when a later one fails.
     """
+    # All of them first: what cannot be compensated is refused before anything moves.
+    compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
-    for scheme in schemes:
-        compensation = compensation_for(drive.axis, scheme.of(model))
+    for scheme, compensation in compensations.items():
         bench = Bench(drive, compensation, interrupted=interrupted)
         runs[scheme] = bench.run(stepping, partial(progress, scheme))
         finished(scheme, runs[scheme])

@@ -5,8 +5,9 @@ from __future__ import annotations
 import typer
 
 from hdbridge.axis import AxisConfig
+from hdbridge.bench import compensation_for
 from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, write_json
-from hdbridge.compensation import Inverse
+from hdbridge.drive import load_eds, plan
 from hdbridge.model import TransmissionModel
 from hdbridge.stepping import quantisation_floor_arcsec
 
@@ -20,6 +21,7 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
     """Read an axis file, its EDS and its model; say what they mean, or what is wrong and where."""
     files = Profile.find(profile)
     axis = AxisConfig.load(files.axis)
+    plan(axis, load_eds(axis.eds_path, axis.drive.node_id))
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
     facts = {
         "axis": axis.name,
@@ -30,11 +32,13 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
         "quantisation floor": f"{floor:.3g} arcsec (3 sigma)",
         "travel": f"{axis.limits.position_min_deg:g} to {axis.limits.position_max_deg:g} deg",
     }
+    if axis.channels:
+        facts["beside encoders"] = ", ".join(axis.channels).replace("_", " ")
     path = model or (files.model if files.model.exists() else None)
     if path is not None:
         loaded = TransmissionModel.load(path)
         loaded.check_ratio(axis)
-        Inverse(loaded)
+        compensation_for(axis, loaded)
         facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
     for name, value in facts.items():
         console.print(f"{name:>20}  {value}")
