@@ -20,7 +20,7 @@ from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import FLOORS_ARCSEC, PENALTY, REPEATED, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, rest
-from hdbridge.effects import Channel, ChannelSkew, FloatArray, InertialWindup, Start, unmet
+from hdbridge.effects import Channel, ChannelSkew, Effect, FloatArray, InertialWindup, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
@@ -37,6 +37,7 @@ SHADOW = 2.0
 PLAIN_ARCSEC = 1.0
 """More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
 particular."""
+LOW_SHARE = 0.8
 SAME_FAMILY = 3
 """So many picks of one family, nearly equal, are one unknown and not many causes."""
 
@@ -200,13 +201,15 @@ class _Judge:
         aliases: list[str] = []
         margin = own
         count = fitted.count()
+        # Where more is left than noise, neither is the whole truth, and a margin counts for less.
+        excess = max(fitted.chi_square / max(len(fitted.residual) - count, 1), 1.0)
         for name, trial in self.search.rivals(without, effect.name):
             worse = trial.chi_square - fitted.chi_square + PENALTY * (trial.count() - count)
-            if worse < 20.0 + 0.01 * own:
+            if worse < 20.0 * excess + 0.01 * own:
                 aliases.append(name)
             else:
                 margin = min(margin, worse)
-        if effect.name == "motor_order" and {each.order for each in effect.orders} <= {1, 2}:  # type: ignore[attr-defined]
+        if effect.name == "motor_order" and _low(effect):
             aliases += [each for each in ALWAYS["motor_order"] if each not in aliases]
         has_torque = Channel.LOAD_TORQUE in self.workshop.motion.available()
         orders = {each.order for each in getattr(effect, "orders", ())}
@@ -315,6 +318,12 @@ class _Judge:
             rows=workshop.index,
             start=fitted.theory.start,
         )
+
+
+def _low(effect: Effect) -> bool:
+    """Whether orders 1 and 2 are most of it, which the motor's encoder may make itself."""
+    squares = {each.order: each.amplitude_arcsec**2 for each in effect.orders}  # type: ignore[attr-defined]
+    return bool(squares.get(1, 0.0) + squares.get(2, 0.0) > LOW_SHARE * sum(squares.values()))
 
 
 def _many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:

@@ -12,7 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hdbridge.diagnose.evidence import Evidence, IntArray, Series
-from hdbridge.effects import Effect, FloatArray, Motion, Start, refreshed
+from hdbridge.effects import Effect, FloatArray, Motion, Start, VelocityWindup, refreshed
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import OrderSeries
 from hdbridge.effects.play import stop
 
@@ -21,6 +23,9 @@ CONVERGED = 0.5
 """A step that gains less than this in chi square is the last."""
 FIXED_SHAPES = frozenset({"time_s", "frequency_hz", "torque1_nm", "torque2_nm"})
 """Shapes that a local step cannot improve: found by search over all their values."""
+ONE_SIDED = (Hysteresis, HysteresisMemory, VelocityWindup)
+"""Effects of which no coefficient is negative. One that is not there would come out on either side of zero
+by chance, and half of the time the effect would be refused for it: it is held at zero instead."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 _EPS = 1e-9
@@ -158,17 +163,21 @@ class Workshop:
         blocks = [self.zero_columns(), self.nuisance]
         parameters = [Parameter(-1, f"zero{i}") for i in range(self.evidence.zeros)]
         parameters += [Parameter(-1, f"nuisance{i}") for i in range(self.nuisance.shape[1])]
-        values = []
         for place, effect in enumerate(theory.effects):
             columns = self.columns(effect, theory.start)
             blocks.append(columns)
-            values.append(effect.coefficients())
             parameters += [Parameter(place, str(i)) for i in range(columns.shape[1])]
         linear = self.weighted(np.hstack(blocks))
         observed = (self.observed - self.level) * self.weight
         # Linear in the coefficients: solve for them outright; what is carried elsewhere follows in
         # `refreshed`.
+        bounded = [
+            each.effect >= 0 and isinstance(theory.effects[each.effect], ONE_SIDED) for each in parameters
+        ]
         solution = _solve(linear, observed)
+        while np.any(below := np.array(bounded) & (solution < 0.0)):
+            linear[:, below] = 0.0
+            solution = _solve(linear, observed)
         effects: list[Effect] = []
         at = self.evidence.zeros + self.nuisance.shape[1]
         for effect in theory.effects:

@@ -38,6 +38,7 @@ HIDDEN = [
     ("flexspline_order", {"orders": [(2, 4.0, 30.0)]}, {}),
     ("direction_phase", {"shift": 3.0}, {}),
     ("channel_skew", {"ms": 0.2}, {}),
+    ("velocity_windup", {"coulomb": 0.0, "viscous": 0.02, "shear": 400.0}, {}),
     ("count_loss", {"size": 4.0, "at": 0.4}, {}),
     ("vibration", {"size": 3.0, "hz": 3.3}, {}),
     ("local_defect", {"size": 5.0, "at": 200.0, "width": 2.0}, {}),
