@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
+from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import JsonOption, console, notes, write_json
+from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, write_json
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.planned import plan_report
+from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.recording import Recording
+from hdbridge.report.diagnosis import diagnosis_page
+from hdbridge.report.page import render
 
 
 def register(app: typer.Typer) -> None:
@@ -31,6 +38,7 @@ def run(
         Path | None, typer.Option("--model", metavar="MODEL.yaml", help="The model that is put to the test.")
     ] = None,
     json_file: JsonOption = None,
+    html_file: HtmlOption = None,
     extend: Annotated[
         Path | None, typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model.")
     ] = None,
@@ -76,7 +84,16 @@ def run(
         progress=lambda words: notes.print(f"{words} ..."),
     )
     print_diagnosis(result)
-    write_json(json_file, result.as_dict())
+    shares = seen_over(result)
+    _print_figures(result)
+    _print_shares(shares)
+    write_json(json_file, result.as_dict() | {"seen_over": shares})
+    if html_file is not None:
+        page = diagnosis_page(
+            result, title=_title(recording, records), provenance=_provenance(recording, records, model)
+        )
+        write_atomically(html_file, render(page))
+        notes.print(f"wrote {html_file}", soft_wrap=True)
     if extend is not None:
         result.model.save(extend)
         notes.print(f"wrote {extend}")
@@ -102,6 +119,46 @@ def print_diagnosis(result: Diagnosis) -> None:
                 console.print(f"next, for {each.cause}: {each.experiment}")
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
         notes.print(remark)
+
+
+def _print_figures(result: Diagnosis) -> None:
+    table = Table(title="simulation against measurement, arcsec", title_justify="left")
+    table.add_column("")
+    for name in ("as given, rms", "3σ", "extended, rms", "3σ"):
+        table.add_column(name, justify="right")
+    rows = {"overall": (result.baseline, result.extended), **result.by_kind}
+    for name, pair in rows.items():
+        figures = [value for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)]
+        table.add_row(escape(name), *(f"{value:.2f}" for value in figures))
+    console.print(table)
+
+
+def _print_shares(shares: dict[str, dict[str, float]]) -> None:
+    ranked = sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
+    table = Table(title="share of the difference that goes with", title_justify="left")
+    table.add_column("")
+    for name in ("as given", "extended"):
+        table.add_column(name, justify="right")
+    for name, each in ranked:
+        table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
+    console.print(table)
+
+
+def _title(recording: Recording, records: Sequence[Path]) -> str:
+    if recording.axis:
+        return f"Diagnosis of axis '{recording.axis}'"
+    names = [each.name for each in records]
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"Diagnosis of {', '.join(names[:3])}{more}"
+
+
+def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> list[tuple[str, str]]:
+    rows = [("record", str(each)) for each in records]
+    rows += [("model", str(model))]
+    rows += [
+        (name, value) for name, value in (("axis", recording.axis), ("recorded", recording.date)) if value
+    ]
+    return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]
 
 
 def _words(finding: Finding) -> str:

@@ -82,6 +82,8 @@ class Portrait:
     """What the finding does; None where it has no law."""
     rows: BoolArray
     """The points that show it."""
+    forward: BoolArray
+    """Direction, held at rest."""
     strength: Strength | None = None
 
 
@@ -97,7 +99,8 @@ def portrait(finding: Finding, traces: Traces, ratio: float) -> Portrait:
     if finding.cause == "creep" and np.count_nonzero(resting) >= LEAST_RESTING:
         rows = resting
     residual = left if own is None else left + own
-    return Portrait(home, residual, own, rows, _strength(finding, traces, home, residual, own))
+    forward = traces.direction > 0.0
+    return Portrait(home, residual, own, rows, forward, _strength(finding, traces, home, residual, own))
 
 
 def contribution(finding: Finding, traces: Traces) -> FloatArray | None:

@@ -194,7 +194,9 @@
     });
     const xRange = range(chart, "x"), yRange = chart.y_range || range(chart, "y");
     const values = (u, splits) => splits.map(value => value === null ? "" : text(value));
-    const decades = (u, splits) => values(u, splits.map(value => value > 0 && Math.abs(Math.log10(value) % 1) < 1e-6 ? value : null));
+    const whole = splits => splits.map(value => value > 0 && Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-6 ? value : null);
+    const decades = (u, splits) => values(u, whole(splits));
+    const logarithmic = { values: decades, grid: { stroke: line, width: 1, filter: (u, splits) => whole(splits) } };
     const tip = document.createElement("div"), dot = document.createElement("div");
     tip.className = "tip";
     dot.className = "dot";
@@ -212,7 +214,7 @@
         x: { time: false, distr: chart.x_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : xRange },
         y: { distr: chart.y_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : yRange },
       },
-      axes: [{ ...axis(chart.x_label), values: chart.x_log ? decades : values, size: 28 }, { ...axis(chart.y_label), values: chart.y_log ? decades : values, size: 52 }],
+      axes: [{ ...axis(chart.x_label), values, ...(chart.x_log ? logarithmic : {}), size: 28 }, { ...axis(chart.y_label), values, ...(chart.y_log ? logarithmic : {}), size: 52 }],
       series: [null, ...chart.series.map((series, i) => ({
         label: series.label,
         stroke: colours[i],

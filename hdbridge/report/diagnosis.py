@@ -1,0 +1,306 @@
+"""The page of a diagnosis: the verdict, what to do, each finding with its picture, all that was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from hdbridge import __version__
+from hdbridge.calibration.validation import Validation
+from hdbridge.diagnose import Diagnosis, Finding
+from hdbridge.diagnose.portrait import portrait
+from hdbridge.diagnose.seeing import Seen, see
+from hdbridge.effects import CATALOGUE
+from hdbridge.report.page import Block, Facts, Grid, Page, Section, Table
+from hdbridge.report.residuals import beside_charts, portrait_chart, residual_charts
+from hdbridge.report.validation import stepping_sections
+from hdbridge.report.words import SIGMA, figure, sentence, with_interval
+
+SURE: Final = 0.9
+LIKELY: Final = 0.6
+UNEXPLAINED: Final = "unexplained"
+PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
+
+
+def diagnosis_page(
+    diagnosis: Diagnosis,
+    *,
+    title: str,
+    provenance: Mapping[str, str] | Sequence[tuple[str, str]] = (),
+    stepping: Validation | None = None,
+) -> Page:
+    """The page of a diagnosis.
+
+    ``provenance`` says in names and values where records and model come from. ``stepping`` is the stepping
+    test under the old and the extended model, where there was one: it goes before everything else.
+    """
+    seen = see(diagnosis)
+    given = provenance.items() if isinstance(provenance, Mapping) else provenance
+    sections = [_to_do(diagnosis)]
+    if stepping is not None:
+        sections += stepping_sections(stepping)
+    if diagnosis.findings:
+        sections.append(_found(diagnosis))
+    sections += [_finding(number, each, diagnosis) for number, each in enumerate(diagnosis.findings, 1)]
+    sections += [
+        _figures(diagnosis),
+        Section(
+            "Simulation beside measurement",
+            "The transmission error on the same trajectory: load encoder less motor angle over the ratio, "
+            "the zero taken off. Drag to enlarge a chart, double-click to go back.",
+            [Grid([*beside_charts(diagnosis.traces)], columns=1)],
+        ),
+        _over(seen),
+        _could(diagnosis),
+    ]
+    if facts := [*_remarks(diagnosis), *given]:
+        sections.append(Section("Where it comes from", "", [Facts(facts)]))
+    return Page(
+        title=title,
+        verdict=_verdict(diagnosis, stepping),
+        sections=sections,
+        footer=f"hdbridge {__version__}. Errors are arcseconds at the load; rms is the root mean square, "
+        f"{SIGMA} three standard deviations; intervals are of 95 %.",
+    )
+
+
+def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
+    given, own, after = (
+        _two(each.rms_arcsec) for each in (diagnosis.baseline, diagnosis.refitted, diagnosis.extended)
+    )
+    noise = f"the noise of a reading is {_two(diagnosis.noise_floor_arcsec)}"
+    if not diagnosis.findings:
+        text = (
+            f"Nothing found: simulation and measurement are {given} arcsec (rms) apart, which noise and an "
+            f"everyday calibration account for; {noise}."
+        )
+    else:
+        causes = _listed([_claim(each) for each in diagnosis.findings])
+        text = f"The simulation is off by {given} arcsec (rms): {causes}."
+        if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
+            text += f" No cause of the catalogue fits it; {noise}."
+        else:
+            text += f" With that in the model {after} remain, without it {own} at best; {noise}."
+    if stepping is not None:
+        before, now = stepping.before.pooled.three_sigma_arcsec, stepping.after.pooled.three_sigma_arcsec
+        text += f" On the axis, stepping went from {SIGMA} = {before:.2f} to {now:.2f} arcsec."
+    return text
+
+
+def _claim(finding: Finding) -> str:
+    """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
+    size = f"up to {_two(finding.peak_arcsec)} arcsec"
+    if finding.cause == UNEXPLAINED:
+        return f"something unexplained that lives in the {finding.lives_in or 'time'}, {size}"
+    name = _title(finding.cause)
+    if finding.aliases:
+        name = _listed([name, *map(_title, finding.aliases)], "or")
+    doubt = "" if finding.probability >= SURE else "probably "
+    return f"{doubt if finding.probability > LIKELY else 'perhaps '}{name}, {size}"
+
+
+def _to_do(diagnosis: Diagnosis) -> Section:
+    if not diagnosis.findings:
+        return Section(
+            "What to do",
+            "Nothing. What this record would have shown, and what it would not, stands under 'What this "
+            "record could show'.",
+        )
+    rows: list[tuple[str, str]] = []
+    for each in diagnosis.findings:
+        if each.cause in CATALOGUE:
+            rows.append((_title(each.cause), sentence(CATALOGUE[each.cause].about.remedy)))
+        else:
+            rows.append(
+                (
+                    _title(each.cause),
+                    "Do not correct what has no name; look closer first, and keep the record.",
+                )
+            )
+        if each.experiment:
+            rows.append(("measure next", sentence(each.experiment)))
+    return Section("What to do", "", [Facts(rows)])
+
+
+def _found(diagnosis: Diagnosis) -> Section:
+    rows: list[list[str | float]] = []
+    for number, each in enumerate(diagnosis.findings, 1):
+        gained = 1.0 - (each.after_arcsec / each.before_arcsec) ** 2 if each.before_arcsec > 0.0 else 0.0
+        rows.append(
+            [
+                f"{number}. {_title(each.cause)}",
+                f"{each.probability:.2f}",
+                each.peak_arcsec,
+                each.before_arcsec,
+                each.after_arcsec,
+                f"{100.0 * gained:.0f} %",
+            ]
+        )
+    header = ["cause", "probability", "size", "held out, without", "with", "gain"]
+    return Section(
+        "What was found",
+        "Size: half the span of what it does in this record. Held out: residual (rms) on stretches of time "
+        "that the fit has not seen, everything else refitted; gain: the share of the mean square that goes.",
+        [Table(header, rows, "arcsec at the load")],
+    )
+
+
+def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
+    title = _title(finding.cause)
+    drawn = portrait(finding, diagnosis.traces, diagnosis.model.ratio)
+    blocks: list[Block] = [portrait_chart(drawn, "Residual without it")]
+    if finding.parameters:
+        blocks.append(_parameters(finding))
+    blocks.append(Facts([*_about(finding)]))
+    if drawn.strength is not None:
+        text = (
+            f"How much the {drawn.strength.of} of the model has to grow, by least squares in each bin; "
+            "bars are one standard deviation."
+        )
+    elif drawn.own_arcsec is None:
+        text = "What no cause accounts for. Dots are means, bars the spread of the readings in them."
+    else:
+        text = (
+            "Everything else that was found is in the simulation, so this is the finding alone, with the "
+            "noise. Dots are means, bars the spread of the readings in them, lines what the finding does."
+        )
+    return Section(f"{number}. {sentence(title).rstrip('.')}", text, blocks)
+
+
+def _parameters(finding: Finding) -> Table:
+    rows: list[list[str | float]] = []
+    for name, each in finding.parameters.items():
+        words = name.removesuffix(f"_{_suffix(each.unit)}").replace("_", " ")
+        unit = "" if each.unit == "1" else each.unit
+        if each.high > each.low:
+            value, half = with_interval(each.value, 0.5 * (each.high - each.low))
+            low, high = (with_interval(one, 0.5 * (each.high - each.low))[0] for one in (each.low, each.high))
+            rows.append([words, value, half, low, high, unit])
+        else:
+            rows.append([words, figure(each.value), "by search", "", "", unit])
+    return Table(["parameter", "value", PLUS_MINUS, "from", "to", "unit"], rows)
+
+
+def _about(finding: Finding) -> Iterator[tuple[str, str]]:
+    about = CATALOGUE[finding.cause].about if finding.cause in CATALOGUE else None
+    yield "probability", _sure(finding)
+    yield (
+        "what else it could be",
+        _listed([*map(_title, finding.aliases)], "or")
+        if finding.aliases
+        else "of the catalogue nothing that these data cannot tell from it"
+        if about
+        else "the catalogue has nothing that fits",
+    )
+    if finding.lives_in:
+        yield "lives in", finding.lives_in
+    if about:
+        yield "how it shows", sentence(about.signature)
+        yield "what it does", sentence(about.consequence)
+        able = CATALOGUE[finding.cause].compensable
+        yield "compensation", f"{'possible' if able.possible else 'no'}: {able.why}"
+        yield "equation", about.equation
+        yield "name in files", finding.cause
+    if finding.note:
+        yield "note", sentence(finding.note)
+
+
+def _sure(finding: Finding) -> str:
+    if finding.cause == UNEXPLAINED:
+        return f"{finding.probability:.2f} that there is something which the catalogue does not have"
+    others = ", or one that it cannot be told from," if finding.aliases else ""
+    return f"{finding.probability:.2f} that this cause{others} is there"
+
+
+def _figures(diagnosis: Diagnosis) -> Section:
+    stages: list[list[str | float]] = [
+        [words, each.rms_arcsec, each.three_sigma_arcsec]
+        for words, each in (
+            ("the model as given", diagnosis.baseline),
+            ("its own parameters refitted", diagnosis.refitted),
+            ("extended", diagnosis.extended),
+        )
+    ]
+    stages.append(["noise of a reading", diagnosis.noise_floor_arcsec, 3.0 * diagnosis.noise_floor_arcsec])
+    kinds: list[list[str | float]] = [
+        [name, one.rms_arcsec, one.three_sigma_arcsec, other.rms_arcsec, other.three_sigma_arcsec]
+        for name, (one, other) in diagnosis.by_kind.items()
+    ]
+    return Section(
+        "Figures",
+        "How far simulation and measurement are apart: overall, by kind of motion and by direction.",
+        [
+            Table(["overall", "rms", SIGMA], stages, "arcsec"),
+            Table(["motion", "as given, rms", SIGMA, "extended, rms", SIGMA], kinds, "arcsec"),
+        ],
+    )
+
+
+def _over(seen: Seen) -> Section:
+    shares = sorted(seen.shares().items(), key=lambda each: -each[1][0])
+    rows: list[list[str | float]] = [
+        [name, f"{100.0 * before:.1f} %", f"{100.0 * after:.1f} %"] for name, (before, after) in shares
+    ]
+    return Section(
+        "What is left, over everything",
+        "Measurement less simulation; lines are means over bins, grey dots readings less the model as given, "
+        "all charts to one scale, the most telling first.\n\nThe table says which share of the mean square "
+        "such means foretell on stretches of time that they were not taken from.",
+        [
+            Grid([*residual_charts(seen)]),
+            Table(["over the", "as given", "extended"], rows),
+        ],
+    )
+
+
+def _could(diagnosis: Diagnosis) -> Section:
+    rows: list[list[str | float]] = []
+    ranked = sorted(
+        diagnosis.identifiability.items(),
+        key=lambda each: (not each[1].detectable, each[1].detection_limit_arcsec or 0.0),
+    )
+    for name, each in ranked:
+        limit = each.detection_limit_arcsec
+        rows.append(
+            [
+                _title(name),
+                f"{limit:.2f}" if limit is not None and each.detectable else "not seen",
+                each.reason or ", ".join(map(_title, each.aliases)) or "",
+            ]
+        )
+    return Section(
+        "What this record could show",
+        "From which peak on each cause would be named, and what it would be taken for; or why it cannot be "
+        "seen.",
+        [Table(["cause", "from, arcsec", "not told from, or why not"], rows)],
+    )
+
+
+def _remarks(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
+    yield from (("the record lacks", each) for each in diagnosis.remarks)
+    yield from (("considered, not named", each.replace("_", " ")) for each in diagnosis.considered)
+    yield "samples looked at", f"{len(diagnosis.traces.time_s):,}"
+
+
+def _title(cause: str) -> str:
+    """The cause by its name, and by what it is where the name does not say it."""
+    name = cause.replace("_", " ")
+    if cause not in CATALOGUE:
+        return name
+    title = CATALOGUE[cause].about.title
+    return title if name in title else f"{name} ({title})"
+
+
+def _listed(words: Sequence[str], last: str = "and") -> str:
+    if len(words) < 2 or any("," in each for each in words):
+        return "; ".join(words)
+    return f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def _suffix(unit: str) -> str:
+    return unit.replace("/", "_per_").replace(" ", "_").replace("^", "").lower()
+
+
+def _two(value: float) -> str:
+    """Two or three digits, without an exponent."""
+    return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

@@ -1,0 +1,159 @@
+"""Charts of residuals: the portrait of a finding, and what is seen over every coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from hdbridge.diagnose import Traces
+from hdbridge.diagnose.portrait import Portrait, Strength
+from hdbridge.diagnose.seeing import BoolArray, Coordinate, Seen, Spacing, binned
+from hdbridge.effects import FloatArray
+from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
+
+R_LABEL: Final = "residual, arcsec"
+E_LABEL: Final = "error, arcsec"
+CLOUD: Final = 2500
+"""Raw points of a portrait."""
+SMALL_CLOUD: Final = 1200
+"""... of a small chart."""
+LINE_POINTS: Final = 2000
+FINER: Final = 3
+"""Bins of a finding's own curve to one of the means."""
+CLOSER_POINTS: Final = 400
+PAUSE_STEPS: Final = 20.0
+"""A gap in time of so many usual steps parts two runs."""
+BLUE: Final = 0
+ORANGE: Final = 1
+GREEN: Final = 2
+FORWARD, BACKWARD = "forward", "backward"
+
+
+def portrait_chart(portrait: Portrait, title: str) -> Chart:
+    """Raw points, means with their spread, and over them what the finding itself does."""
+    if portrait.strength is not None:
+        return _strength_chart(portrait.strength, portrait.coordinate, title)
+    home, residual, own = portrait.coordinate, portrait.residual_arcsec, portrait.own_arcsec
+    rows = portrait.rows
+    x, y = sampled(home.values[rows], residual[rows], CLOUD)
+    series = [Series("readings", x, y, Mark.FAINT)]
+    ways = _ways(portrait.forward) if home.both_ways else [("", BLUE, rows)]
+    for way, colour, chosen in ways:
+        means = binned(home, residual, rows & chosen)
+        name = f"mean, {way}" if way else "mean"
+        series.append(Series(name, means.place, means.mean, Mark.POINTS, spread=means.spread, colour=colour))
+    if own is not None:
+        fine = replace(home, bins=FINER * home.bins)
+        for way, colour, chosen in ways:
+            curve = binned(fine, own, rows & chosen)
+            name = f"the finding, {way}" if way else "the finding"
+            series.append(Series(name, curve.place, curve.mean, colour=colour if way else ORANGE))
+    shown = residual[rows] if own is None else np.concatenate([residual[rows], own[rows]])
+    return Chart(
+        f"{title}, over the {home.name}",
+        home.label,
+        R_LABEL,
+        series,
+        height_px=360,
+        y_range=_reach(shown),
+        x_log=home.spacing is Spacing.LOGARITHMIC,
+    )
+
+
+def _strength_chart(strength: Strength, home: Coordinate, title: str) -> Chart:
+    series = [
+        Series(
+            "measured, each bin by itself",
+            strength.place,
+            strength.measured_percent,
+            Mark.POINTS,
+            spread=strength.spread_percent,
+        ),
+        Series("the finding", strength.place, strength.finding_percent),
+    ]
+    label = f"change of the {strength.of}, %"
+    return Chart(f"{title}, over the {home.name}", home.label, label, series, height_px=360)
+
+
+def residual_charts(seen: Seen) -> Iterator[Chart]:
+    """Over each coordinate the model as it was given and the extended one, all to one scale."""
+    reach = _reach(seen.given_arcsec)
+    shares = seen.shares()
+    whole_turns = (
+        float(np.ptp(seen.coordinates["position"].values)) > 360.0 if "position" in shares else False
+    )
+    for name, _ in sorted(shares.items(), key=lambda each: -each[1][0]):
+        if name == "direction" or (name == "position" and not whole_turns):
+            continue
+        home = seen.coordinates[name]
+        x, y = sampled(home.values, seen.given_arcsec, SMALL_CLOUD)
+        series = [Series("readings, as given", x, y, Mark.FAINT)]
+        for words, colour, values in (
+            ("as given", ORANGE, seen.given_arcsec),
+            ("extended", BLUE, seen.left_arcsec),
+        ):
+            ways = _ways(seen.direction > 0.0) if home.both_ways else [("", colour, None)]
+            for way, _, chosen in ways:
+                means = binned(home, values, chosen)
+                series.append(
+                    Series(
+                        f"{words}, {way}" if way else words,
+                        means.place,
+                        means.mean,
+                        Mark.DASHED if way == BACKWARD else Mark.LINE,
+                        colour=colour,
+                    )
+                )
+        yield Chart(
+            f"Over the {name}",
+            home.label,
+            R_LABEL,
+            series,
+            height_px=230,
+            y_range=reach,
+            x_log=home.spacing is Spacing.LOGARITHMIC,
+        )
+    groups = {way: seen.given_arcsec[rows] for way, _, rows in _ways(seen.direction > 0.0) if np.any(rows)}
+    yield histogram("By direction: how often which, as given", R_LABEL, groups, bins=40, height_px=230)
+
+
+def beside_charts(traces: Traces) -> Iterator[Chart]:
+    """Simulation beside measurement on the same trajectory: the whole, and where they are farthest apart."""
+    whole = np.arange(len(traces.time_s))
+    given = (traces.measured_arcsec - traces.model_arcsec) ** 2
+    left = (traces.measured_arcsec - traces.extended_arcsec) ** 2
+    length = min(CLOSER_POINTS, len(whole))
+    gained = np.concatenate([[0.0], np.cumsum(given - left)])
+    first = int(np.argmax(gained[length:] - gained[:-length]))
+    for caption, rows in (
+        ("The whole record", whole),
+        ("Closer: where the extended model gains most", whole[first : first + length]),
+    ):
+        time = traces.time_s[rows]
+        gap = np.diff(time, prepend=time[0]) > PAUSE_STEPS * float(np.median(np.diff(time)))
+        lines = [
+            Series(name, *thinned(time, np.where(gap, np.nan, values[rows]), LINE_POINTS), colour=colour)
+            for name, colour, values in (
+                ("the model as given", ORANGE, traces.model_arcsec),
+                ("the extended model", BLUE, traces.extended_arcsec),
+            )
+        ]
+        dots = Series(
+            "measured", *sampled(time, traces.measured_arcsec[rows], LINE_POINTS), Mark.POINTS, colour=GREEN
+        )
+        closer = len(time) <= CLOSER_POINTS
+        yield Chart(caption, "time, s", E_LABEL, [*lines, dots] if closer else [dots, *lines], height_px=280)
+
+
+def _ways(forward: BoolArray) -> list[tuple[str, int, BoolArray]]:
+    return [(FORWARD, BLUE, forward), (BACKWARD, ORANGE, ~forward)]
+
+
+def _reach(values: FloatArray) -> tuple[float, float]:
+    """Of an axis: all but the farthest few in a thousand, with a margin."""
+    low, high = np.quantile(values, [0.002, 0.998]).tolist()
+    margin = 0.08 * (high - low) or 1.0
+    return low - margin, high + margin
