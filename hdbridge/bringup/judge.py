@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean, pstdev
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,26 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
             f"{axis.where(SOURCE)}: the load encoder moves by {load_span * load_arcsec:.0f} arcsec while the "
             "power is off; check that the object is a position, and the encoder's shield and mounting"
         )
+    return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
+
+
+def judge_channels(
+    axis: AxisConfig, readings: Mapping[str, float | None], waited_s: float, rest: Verdict
+) -> Verdict:
+    """The verdict on rest, with what load torque and temperature tell; None: nothing that is believed."""
+    text, figures, remedies = rest.measured, dict(rest.figures), list(rest.remedies)
+    for key, value in readings.items():
+        channel = axis.channels[key]
+        name = key.replace("_", " ")
+        if value is not None:
+            text += f"; {name} {value:.4g} {channel.scale.unit}"
+            figures["load_torque_nm" if key == "load_torque" else "temperature_c"] = value
+        elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
+            text += f"; no {name}"
+            remedies.append(
+                f"{axis.where(key)}: nothing comes that can be believed (within {channel.scale.least:g} to "
+                f"{channel.scale.greatest:g} {channel.scale.unit}); check the sensor, the object and its unit"
+            )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from hdbridge.bringup.checks import Verdict, failed, passed
-from hdbridge.bringup.judge import judge_rest
+from hdbridge.bringup.judge import judge_channels, judge_rest
 from hdbridge.bringup.match import compare
 from hdbridge.bringup.patient import Patient
 from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO
@@ -161,6 +161,8 @@ def _listed(patient: Patient) -> Iterator[tuple[int, int]]:
     source = axis.load_encoder.source
     if source.node is None and sdo.has(source.index, source.subindex):
         yield source.index, source.subindex
+    for channel in axis.channels.values():
+        yield channel.source.index, channel.source.subindex
 
 
 def units(patient: Patient) -> Verdict:
@@ -200,7 +202,7 @@ def boot(patient: Patient) -> Verdict:
 
 
 def rest(patient: Patient) -> Verdict:
-    """Both encoders come with every SYNC, and rest while the power is off."""
+    """Both encoders come with every SYNC, and rest while the power is off; other channels tell something."""
     drive = patient.drive
     with patient.interruptible() as interrupted:
         positions = drive.read_positions()
@@ -213,4 +215,5 @@ def rest(patient: Patient) -> Verdict:
         patient.axis, [each.motor_counts for each in fresh], [each.load_counts for each in fresh]
     )
     patient.noise_arcsec = float(verdict.figures["load_noise_arcsec"] or 0.0)
-    return verdict
+    readings = {each.key: each.value for each in drive.image.channels}
+    return judge_channels(patient.axis, readings, REST_S, verdict)

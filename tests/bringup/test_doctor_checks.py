@@ -179,6 +179,38 @@ def test_a_load_encoder_that_jitters_at_rest(case: Callable[..., Any]) -> None:
     assert verdicts["hold"].outcome is NOT_POSSIBLE
 
 
+CHANNELS = {
+    "limits:": "load_torque:\n  source: {index: 0x2101, type: int32}\n  newton_metres_per_count: 0.001\n"
+    "temperature: {source: {index: 0x2100, type: int16}, celsius_per_count: 0.1}\nlimits:"
+}
+
+
+def test_what_load_torque_and_temperature_tell(case: Callable[..., Any]) -> None:
+    verdicts = case(axis=CHANNELS).run(until="rest")
+    assert failures(verdicts) == []
+    assert "; load torque 0 Nm; temperature 22 C" in verdicts["rest"].measured
+    assert verdicts["rest"].figures["temperature_c"] == 22.0
+
+
+def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None:
+    def unplug(node: SimulatedDrive) -> None:
+        node.dictionary[0x2101, 0].bind(lambda: -(2**31))
+
+    verdicts = case(axis=CHANNELS, spoil=unplug).run(until="hold")
+    assert failures(verdicts) == ["rest"]
+    assert "; no load torque; temperature 22 C" in verdicts["rest"].measured
+    assert "axis.yaml:42:1: load_torque: nothing comes that can be believed" in verdicts["rest"].remedies[0]
+    assert verdicts["hold"].outcome is NOT_POSSIBLE
+
+
+def test_a_torque_that_the_drive_does_not_have(case: Callable[..., Any]) -> None:
+    verdicts = case(axis=CHANNELS, spoil=_without((0x2101, 0))).run()
+    assert failures(verdicts)[0] == "eds"
+    verdicts = case(axis=CHANNELS, eds={"[2101]": "[2111]"}).run()
+    assert failures(verdicts) == ["files"]
+    assert "2101h:00" in verdicts["files"].measured + " ".join(verdicts["files"].remedies)
+
+
 def test_the_eds_of_another_drive(case: Callable[..., Any]) -> None:
     verdicts = case(spoil=_without((0x6085, 0), (0x6007, 0))).run()
     assert failures(verdicts) == ["eds"]
