@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.compensation import LOSABLE, Compensation, CompensationLimits
+from hdbridge.compensation import Compensation, CompensationLimits
 from hdbridge.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
@@ -94,10 +94,19 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
 
 def _with_channels(sample: Sample, feedback: Feedback) -> Sample:
     load_torque_nm, temperature_c = feedback.load_torque_nm, feedback.temperature_c
-    return sample._replace(
-        load_torque_nm=math.nan if load_torque_nm is None else load_torque_nm,
-        temperature_c=math.nan if temperature_c is None else temperature_c,
+    return Sample(
+        *sample[:-2],
+        math.nan if load_torque_nm is None else load_torque_nm,
+        math.nan if temperature_c is None else temperature_c,
     )
+
+
+_KNOWN = {
+    (torque, heat): frozenset({Channel.LOAD_TORQUE} if torque else ())
+    | frozenset({Channel.TEMPERATURE} if heat else ())
+    for torque in (True, False)
+    for heat in (True, False)
+}
 
 
 class _Sensed:
@@ -106,22 +115,20 @@ class _Sensed:
     __slots__ = ("known", "load_torque_nm", "temperature_c")
 
     def __init__(self) -> None:
-        self.known = LOSABLE
+        self.known = _KNOWN[True, True]
         self.load_torque_nm = _AT_REST.load_torque_nm
         self.temperature_c = _AT_REST.temperature_c
 
     def take(self, feedback: Feedback) -> bool:
         """One cycle's; whether other channels are known than before."""
-        known = set()
-        if feedback.load_torque_nm is not None:
-            self.load_torque_nm = feedback.load_torque_nm
-            known.add(Channel.LOAD_TORQUE)
-        if feedback.temperature_c is not None:
-            self.temperature_c = feedback.temperature_c
-            known.add(Channel.TEMPERATURE)
-        changed = known != self.known
-        if changed:
-            self.known = frozenset(known)
+        load_torque_nm, temperature_c = feedback.load_torque_nm, feedback.temperature_c
+        if load_torque_nm is not None:
+            self.load_torque_nm = load_torque_nm
+        if temperature_c is not None:
+            self.temperature_c = temperature_c
+        known = _KNOWN[load_torque_nm is not None, temperature_c is not None]
+        changed = known is not self.known
+        self.known = known
         return changed
 
 

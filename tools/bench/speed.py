@@ -1,7 +1,8 @@
 """How much faster than the axis itself the bench on the virtual bus is: `python tools/bench/speed.py`.
 
-One run measures, side by side: the whole bench (master, compensation, bus, simulated drive and plant), and
-the plant alone, moved along the same targets. Ratios are axis time over wall time, and over this process's
+One run measures, side by side: the whole bench (master, compensation, bus, simulated drive and plant), the
+same with load torque and temperature on the bus and compliance in the model, and the plant alone, moved along
+the same targets. Ratios are axis time over wall time, and over this process's
 CPU time, which does not count what other programs take of the machine.
 """
 
@@ -9,11 +10,14 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from itertools import pairwise
 
-from hdbridge.axis import AxisConfig
+from hdbridge.axis import AxisConfig, LoadTorque, Temperature
+from hdbridge.axischannels import ChannelSource
 from hdbridge.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
+from hdbridge.effects import Compliance, extended
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
@@ -37,22 +41,32 @@ def main() -> None:
     axis, model = AxisConfig.load(folder / "axis.yaml"), TransmissionModel.load(folder / "model.yaml")
     truth = Truth.load(folder / "truth.yaml")
     period_s = axis.drive.cycle_s
-    spent: dict[str, list[tuple[float, float]]] = {"whole bench": [], "plant alone": []}
+    told = {
+        "load_torque": LoadTorque(
+            source=ChannelSource(index=0x2101, type="int32"), newton_metres_per_count=0.001
+        ),
+        "temperature": Temperature(source=ChannelSource(index=0x2100, type="int16"), celsius_per_count=0.1),
+    }
+    knowing = axis.model_copy(update=told)
+    longer = replace(model, effects=extended(model.effects, Compliance.candidate(model.ratio)))
+    benches = {"whole bench": (axis, model), "with torque and temperature": (knowing, longer)}
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in (*benches, "plant alone")}
 
     def note(name: str, began: tuple[float, float], axis_s: float) -> None:
         wall, cpu = (after - before for before, after in zip(began, clocks(), strict=True))
         spent[name].append((wall / axis_s, cpu / axis_s))
 
     for block in range(options.blocks):
-        with (
-            simulated_bench(truth, axis.eds_path, axis.drive.node_id, block) as (bus, clock, _),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
-            bench = Bench(drive, compensation_for(axis, model))
-            began, axis_began = clocks(), clock.now()
-            run = bench.run(Stepping(count=options.count))
-            note("whole bench", began, clock.now() - axis_began)
+        for name, (config, compensated) in benches.items():
+            with (
+                simulated_bench(truth, axis.eds_path, axis.drive.node_id, block) as (bus, clock, _),
+                Drive(bus, config, clock) as drive,
+            ):
+                drive.boot()
+                bench = Bench(drive, compensation_for(config, compensated))
+                began, axis_began = clocks(), clock.now()
+                run = bench.run(Stepping(count=options.count))
+                note(name, began, clock.now() - axis_began)
         targets = (run.record.columns["motor_target_deg"] * axis.motor_encoder.counts_per_turn / 360).tolist()
         machine = Machine(truth, block)
         substeps = round(period_s / machine.dt_s)
