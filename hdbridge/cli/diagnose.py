@@ -23,6 +23,9 @@ from hdbridge.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 
+WORTH_TELLING = 0.01
+"""A coordinate that less of the difference goes with is not printed."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -140,7 +143,8 @@ def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     for name in ("as given", "extended"):
         table.add_column(name, justify="right")
     for name, each in ranked:
-        table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
+        if max(each.values()) >= WORTH_TELLING:
+            table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
     console.print(table)
 
 

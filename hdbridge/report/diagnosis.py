@@ -14,10 +14,12 @@ from hdbridge.effects import CATALOGUE
 from hdbridge.report.page import Block, Facts, Grid, Page, Section, Table
 from hdbridge.report.residuals import beside_charts, portrait_chart, residual_charts
 from hdbridge.report.validation import stepping_sections
-from hdbridge.report.words import SIGMA, figure, sentence, with_interval
+from hdbridge.report.words import SIGMA, sentence, with_interval
 
 SURE: Final = 0.9
 LIKELY: Final = 0.6
+TOLD: Final = 3
+"""Findings that the verdict speaks of."""
 UNEXPLAINED: Final = "unexplained"
 PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
 
@@ -36,7 +38,7 @@ def diagnosis_page(
     """
     seen = see(diagnosis)
     given = provenance.items() if isinstance(provenance, Mapping) else provenance
-    sections = [_to_do(diagnosis)]
+    sections = [_to_do(diagnosis, tried=stepping is not None)]
     if stepping is not None:
         sections += stepping_sections(stepping)
     if diagnosis.findings:
@@ -75,7 +77,9 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
             f"everyday calibration account for; {noise}."
         )
     else:
-        causes = _listed([_claim(each) for each in diagnosis.findings])
+        causes = _listed([_claim(each) for each in diagnosis.findings[:TOLD]])
+        if more := len(diagnosis.findings[TOLD:]):
+            causes += f"; and {more} more"
         text = f"The simulation is off by {given} arcsec (rms): {causes}."
         if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
             text += f" No cause of the catalogue fits it; {noise}."
@@ -89,17 +93,17 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 
 def _claim(finding: Finding) -> str:
     """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
-    size = f"up to {_two(finding.peak_arcsec)} arcsec"
     if finding.cause == UNEXPLAINED:
+        size = f"{_two(finding.before_arcsec)} arcsec rms beyond the noise"
         return f"something unexplained that lives in the {finding.lives_in or 'time'}, {size}"
     name = _title(finding.cause)
     if finding.aliases:
         name = _listed([name, *map(_title, finding.aliases)], "or")
-    doubt = "" if finding.probability >= SURE else "probably "
-    return f"{doubt if finding.probability > LIKELY else 'perhaps '}{name}, {size}"
+    doubt = "" if finding.probability >= SURE else "probably " if finding.probability > LIKELY else "perhaps "
+    return f"{doubt}{name}, up to {_two(finding.peak_arcsec)} arcsec"
 
 
-def _to_do(diagnosis: Diagnosis) -> Section:
+def _to_do(diagnosis: Diagnosis, tried: bool) -> Section:
     if not diagnosis.findings:
         return Section(
             "What to do",
@@ -107,18 +111,20 @@ def _to_do(diagnosis: Diagnosis) -> Section:
             "record could show'.",
         )
     rows: list[tuple[str, str]] = []
-    for each in diagnosis.findings:
+    for number, each in enumerate(diagnosis.findings, 1):
+        remedy = "do not correct what has no name; look closer first, and keep the record"
         if each.cause in CATALOGUE:
-            rows.append((_title(each.cause), sentence(CATALOGUE[each.cause].about.remedy)))
-        else:
-            rows.append(
-                (
-                    _title(each.cause),
-                    "Do not correct what has no name; look closer first, and keep the record.",
-                )
-            )
+            remedy = CATALOGUE[each.cause].about.remedy
+        rows.append((f"{number}. {_name(each.cause)}", sentence(remedy)))
         if each.experiment:
             rows.append(("measure next", sentence(each.experiment)))
+    if not tried and any(each.cause != UNEXPLAINED for each in diagnosis.findings):
+        rows.append(
+            (
+                "extended model",
+                "'hdbridge diagnose --extend FILE' writes it; 'hdbridge improve' tries it on the axis.",
+            )
+        )
     return Section("What to do", "", [Facts(rows)])
 
 
@@ -128,9 +134,9 @@ def _found(diagnosis: Diagnosis) -> Section:
         gained = 1.0 - (each.after_arcsec / each.before_arcsec) ** 2 if each.before_arcsec > 0.0 else 0.0
         rows.append(
             [
-                f"{number}. {_title(each.cause)}",
+                f"{number}. {_name(each.cause)}",
                 f"{each.probability:.2f}",
-                each.peak_arcsec,
+                "" if each.cause == UNEXPLAINED else each.peak_arcsec,
                 each.before_arcsec,
                 each.after_arcsec,
                 f"{100.0 * gained:.0f} %",
@@ -140,7 +146,8 @@ def _found(diagnosis: Diagnosis) -> Section:
     return Section(
         "What was found",
         "Size: half the span of what it does in this record. Held out: residual (rms) on stretches of time "
-        "that the fit has not seen, everything else refitted; gain: the share of the mean square that goes.",
+        "that the fit has not seen, everything else refitted (of something unexplained: beyond the noise). "
+        "Gain: the share of the mean square that goes.",
         [Table(header, rows, "arcsec at the load")],
     )
 
@@ -148,7 +155,7 @@ def _found(diagnosis: Diagnosis) -> Section:
 def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     title = _title(finding.cause)
     drawn = portrait(finding, diagnosis.traces, diagnosis.model.ratio)
-    blocks: list[Block] = [portrait_chart(drawn, "Residual without it")]
+    blocks: list[Block] = [portrait_chart(drawn)]
     if finding.parameters:
         blocks.append(_parameters(finding))
     blocks.append(Facts([*_about(finding)]))
@@ -177,7 +184,7 @@ def _parameters(finding: Finding) -> Table:
             low, high = (with_interval(one, 0.5 * (each.high - each.low))[0] for one in (each.low, each.high))
             rows.append([words, value, half, low, high, unit])
         else:
-            rows.append([words, figure(each.value), "by search", "", "", unit])
+            rows.append([words, f"{each.value:.7g}", "by search", "", "", unit])
     return Table(["parameter", "value", PLUS_MINUS, "from", "to", "unit"], rows)
 
 
@@ -198,7 +205,7 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
         yield "how it shows", sentence(about.signature)
         yield "what it does", sentence(about.consequence)
         able = CATALOGUE[finding.cause].compensable
-        yield "compensation", f"{'possible' if able.possible else 'no'}: {able.why}"
+        yield "compensation", f"{'possible' if able.possible else 'no'}: {able.why.removeprefix('no, ')}"
         yield "equation", about.equation
         yield "name in files", finding.cause
     if finding.note:
@@ -265,7 +272,7 @@ def _could(diagnosis: Diagnosis) -> Section:
             [
                 _title(name),
                 f"{limit:.2f}" if limit is not None and each.detectable else "not seen",
-                each.reason or ", ".join(map(_title, each.aliases)) or "",
+                each.reason or ", ".join(map(_name, each.aliases)),
             ]
         )
     return Section(
@@ -282,9 +289,13 @@ def _remarks(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     yield "samples looked at", f"{len(diagnosis.traces.time_s):,}"
 
 
+def _name(cause: str) -> str:
+    return cause.replace("_", " ")
+
+
 def _title(cause: str) -> str:
     """The cause by its name, and by what it is where the name does not say it."""
-    name = cause.replace("_", " ")
+    name = _name(cause)
     if cause not in CATALOGUE:
         return name
     title = CATALOGUE[cause].about.title
@@ -298,7 +309,7 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def _suffix(unit: str) -> str:
-    return unit.replace("/", "_per_").replace(" ", "_").replace("^", "").lower()
+    return unit.replace("%", "percent").replace("/", "_per_").replace(" ", "_").replace("^", "").lower()
 
 
 def _two(value: float) -> str:

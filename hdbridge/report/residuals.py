@@ -24,6 +24,8 @@ LINE_POINTS: Final = 2000
 FINER: Final = 3
 """Bins of a finding's own curve to one of the means."""
 CLOSER_POINTS: Final = 400
+MORE_TURNS_DEG: Final = 540.0
+"""Below this the position says little that the load angle does not."""
 PAUSE_STEPS: Final = 20.0
 """A gap in time of so many usual steps parts two runs."""
 BLUE: Final = 0
@@ -32,14 +34,13 @@ GREEN: Final = 2
 FORWARD, BACKWARD = "forward", "backward"
 
 
-def portrait_chart(portrait: Portrait, title: str) -> Chart:
+def portrait_chart(portrait: Portrait) -> Chart:
     """Raw points, means with their spread, and over them what the finding itself does."""
     if portrait.strength is not None:
-        return _strength_chart(portrait.strength, portrait.coordinate, title)
+        return _strength_chart(portrait.strength, portrait.coordinate)
     home, residual, own = portrait.coordinate, portrait.residual_arcsec, portrait.own_arcsec
     rows = portrait.rows
-    x, y = sampled(home.values[rows], residual[rows], CLOUD)
-    series = [Series("readings", x, y, Mark.FAINT)]
+    series = [_cloud("readings", home.values[rows], residual[rows], CLOUD)]
     ways = _ways(portrait.forward) if home.both_ways else [("", BLUE, rows)]
     for way, colour, chosen in ways:
         means = binned(home, residual, rows & chosen)
@@ -53,7 +54,7 @@ def portrait_chart(portrait: Portrait, title: str) -> Chart:
             series.append(Series(name, curve.place, curve.mean, colour=colour if way else ORANGE))
     shown = residual[rows] if own is None else np.concatenate([residual[rows], own[rows]])
     return Chart(
-        f"{title}, over the {home.name}",
+        f"{'What is left' if own is None else 'Residual without it'}, over the {home.name}",
         home.label,
         R_LABEL,
         series,
@@ -63,7 +64,7 @@ def portrait_chart(portrait: Portrait, title: str) -> Chart:
     )
 
 
-def _strength_chart(strength: Strength, home: Coordinate, title: str) -> Chart:
+def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
     series = [
         Series(
             "measured, each bin by itself",
@@ -74,23 +75,20 @@ def _strength_chart(strength: Strength, home: Coordinate, title: str) -> Chart:
         ),
         Series("the finding", strength.place, strength.finding_percent),
     ]
-    label = f"change of the {strength.of}, %"
-    return Chart(f"{title}, over the {home.name}", home.label, label, series, height_px=360)
+    words = f"hange of the {strength.of}"
+    return Chart(f"C{words}, over the {home.name}", home.label, f"c{words}, %", series, height_px=360)
 
 
 def residual_charts(seen: Seen) -> Iterator[Chart]:
     """Over each coordinate the model as it was given and the extended one, all to one scale."""
     reach = _reach(seen.given_arcsec)
     shares = seen.shares()
-    whole_turns = (
-        float(np.ptp(seen.coordinates["position"].values)) > 360.0 if "position" in shares else False
-    )
     for name, _ in sorted(shares.items(), key=lambda each: -each[1][0]):
-        if name == "direction" or (name == "position" and not whole_turns):
-            continue
         home = seen.coordinates[name]
-        x, y = sampled(home.values, seen.given_arcsec, SMALL_CLOUD)
-        series = [Series("readings, as given", x, y, Mark.FAINT)]
+        few_turns = name == "position" and float(np.ptp(home.values)) < MORE_TURNS_DEG
+        if name == "direction" or few_turns:
+            continue
+        series = [_cloud("readings, as given", home.values, seen.given_arcsec, SMALL_CLOUD)]
         for words, colour, values in (
             ("as given", ORANGE, seen.given_arcsec),
             ("extended", BLUE, seen.left_arcsec),
@@ -146,6 +144,14 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
         )
         closer = len(time) <= CLOSER_POINTS
         yield Chart(caption, "time, s", E_LABEL, [*lines, dots] if closer else [dots, *lines], height_px=280)
+
+
+def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
+    """So many points, drawn by lot (always the same ones): a cloud as dense and as wide as the whole."""
+    if len(x) > most:
+        kept = np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
+        label, x, y = f"{label} ({most:,} of {len(x):,})", x[kept], y[kept]
+    return Series(label, x, y, Mark.FAINT)
 
 
 def _ways(forward: BoolArray) -> list[tuple[str, int, BoolArray]]:
