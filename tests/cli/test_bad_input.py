@@ -34,6 +34,26 @@ def test_a_wrong_axis_file_is_refused(hdbridge, profile, tmp_path, old, new, tex
     assert not (tmp_path / "out.json").exists()
 
 
+COMPLIANCE = """\
+  - effect: compliance
+    parameters: {c1_arcsec_per_nm: 16, c2_arcsec_per_nm: 12, c3_arcsec_per_nm: 9, torque1_nm: 7,
+                 torque2_nm: 25}
+
+"""
+
+
+def test_a_model_that_needs_what_the_axis_cannot_tell_is_refused_for_compensation(hdbridge, profile):
+    folder = profile("# Made from printed tables", COMPLIANCE + "# Made from printed tables", "model.yaml")
+    refused(hdbridge("check", folder), 2, "'compliance' needs load_torque_nm", "add 'load_torque' to")
+    refused(hdbridge("step", folder, "--simulate"), 2, "'compliance' needs load_torque_nm", "axis.yaml")
+
+
+def test_an_object_that_the_eds_does_not_have_is_refused_without_a_drive(hdbridge, profile):
+    torque = "load_torque: {source: {index: 0x2155, type: int32}, newton_metres_per_count: 0.001}"
+    done = hdbridge("check", profile("limits:  ", torque + "\nlimits:  "))
+    refused(done, 2, "axis.yaml:42:24: load_torque.source.index", "has no object 2155h:00")
+
+
 def test_no_such_profile(hdbridge):
     refused(hdbridge("step", "artcile", "--simulate"), 2, "artcile", "did you mean 'article'")
 
