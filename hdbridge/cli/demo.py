@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hdbridge.cli.options import Profile, console, load_axis, write_json
-from hdbridge.cli.step import print_table, run_comparison, write_page
+from hdbridge.cli.step import print_result, run_comparison, write_page
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
 
@@ -45,7 +45,7 @@ def demo(
         seed=seed,
         record=out,
     )
-    print_table(axis, comparison)
+    print_result(axis, comparison)
     write_json(out / "stepping.json", comparison.as_dict())
     write_page(out / "stepping.html", axis, comparison, stepping)
     console.print(f"\nopen {out / 'stepping.html'} for the picture")

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from hdbridge.calibration import Calibration, Stepped, Validation
 from hdbridge.calibration.result import unit_of
-from hdbridge.cli.options import console
+from hdbridge.cli.options import console, print_table
 from hdbridge.files.atomic import write_atomically
 from hdbridge.modeldiff import diff
 from hdbridge.report.calibration import calibration_page
@@ -27,7 +27,7 @@ def print_calibration(result: Calibration) -> None:
     )
     table = Table(title=_title(result), title_justify="left")
     for name in ("effect", "parameter"):
-        table.add_column(name, no_wrap=True, overflow="ignore")
+        table.add_column(name)
     for name in ("value", "± 95 %", "unit", *(("was",) if before else ())):
         table.add_column(name, justify="right" if name != "unit" else "left")
     for each in fit.intervals:
@@ -43,7 +43,7 @@ def print_calibration(result: Calibration) -> None:
             *cells,
             *((f"{was:.3f}" if was is not None else "-",) if before else ()),
         )
-    console.print(table)
+    print_table(table)
     noise = fit.noise
     standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
     console.print(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms")
@@ -104,7 +104,7 @@ def print_steps(title: str, tests: Iterable[Stepped]) -> None:
             for value in (part.three_sigma_arcsec, part.mean_arcsec)
         ]
         table.add_row(each.model, *cells)
-    console.print(table)
+    print_table(table)
 
 
 def _print_accuracy(checked: Validation) -> None:
@@ -118,9 +118,9 @@ def _print_accuracy(checked: Validation) -> None:
         title_justify="left",
     )
     table.add_column("with")
-    for name in ("accuracy A", "repeatability R", "reversal B", "systematic E", "range M"):
+    for name in ("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"):
         table.add_column(name, justify="right")
     for model, each in rows:
         figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
         table.add_row(model, *(f"{value:.2f}" for value in figures))
-    console.print(table)
+    print_table(table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,8 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge import modelstore
-from hdbridge.cli.options import JsonOption, Profile, ProfileArgument, console, write_json
-from hdbridge.modeldiff import diff
+from hdbridge.cli.options import JsonOption, Profile, ProfileArgument, console, print_table, write_json
+from hdbridge.errors import InputError
+from hdbridge.modeldiff import Difference, diff
 from hdbridge.modelstore import ACTIVE, PENDING, Version
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
@@ -51,16 +53,21 @@ def compare(
     profile: ProfileArgument,
     before: Annotated[
         str | None,
-        typer.Argument(metavar="[BEFORE]", help="Number, `active` or `pending`; else the active one."),
+        typer.Argument(metavar="BEFORE", help="Number, `active` or `pending`; else the active one."),
     ] = None,
     after: Annotated[
-        str | None, typer.Argument(metavar="[AFTER]", help="The same; else the pending one.")
+        str | None, typer.Argument(metavar="AFTER", help="The same; else the pending one.")
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Show what changed between two models, parameter by parameter."""
     folder = _folder(profile)
     names = {name for each in modelstore.log(folder) for name in _names(each)}
+    if after is None and before is None and PENDING not in names:
+        raise InputError(
+            f"{folder}: there is no pending model to compare with; calibrate first, or name two of: "
+            f"{', '.join(sorted(names)) or 'none yet'}"
+        )
     if before is None and ACTIVE not in names:
         later = modelstore.find(folder, after or PENDING)
         earlier_name, model = "no model", later.model.only(())
@@ -69,23 +76,7 @@ def compare(
         earlier_name, model = earlier.name, earlier.model
         later = modelstore.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
     rows = diff(model, later.model)
-    table = Table(title=f"{earlier_name} → {later.name}", title_justify="left")
-    for name in ("effect", "parameter"):
-        table.add_column(name, no_wrap=True, overflow="ignore")
-    for name in ("before", "after", "change", "± 95 %"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        known = isinstance(row.before, int | float) and isinstance(row.after, int | float)
-        change = f"{row.after - row.before:+.3f}" if known and row.changed else ""
-        table.add_row(
-            row.effect or "-",
-            escape(row.parameter),
-            _cell(row.before),
-            _cell(row.after),
-            change,
-            _cell(row.half_width),
-        )
-    console.print(table)
+    _print_diff(f"{earlier_name} → {later.name}", rows)
     write_json(
         json_file,
         {
@@ -131,6 +122,32 @@ def _folder(profile: str) -> Path:
 
 def _now() -> datetime:
     return datetime.now().astimezone()
+
+
+def _print_diff(title: str, rows: Sequence[Difference]) -> None:
+    """Effect by effect; without the columns of a model before where there was none."""
+    compared = any(row.before is not None for row in rows if row.effect)
+    table = Table(title=title, title_justify="left")
+    table.add_column("parameter")
+    for name in ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %"):
+        table.add_column(name, justify="right")
+    effect = None
+    for row in rows:
+        if row.effect and row.effect != effect:
+            effect = row.effect
+            table.add_section()
+            table.add_row(f"[bold]{escape(effect)}[/bold]")
+        known = isinstance(row.before, int | float) and isinstance(row.after, int | float)
+        cells = [
+            _cell(row.before),
+            _cell(row.after),
+            f"{row.after - row.before:+.3f}" if known and row.changed else "",
+            _cell(row.half_width),
+        ]
+        table.add_row(
+            f"{'  ' if row.effect else ''}{escape(row.parameter)}", *(cells if compared else cells[1::2])
+        )
+    print_table(table)
 
 
 def _names(version: Version) -> set[str]:

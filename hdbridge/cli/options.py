@@ -12,13 +12,16 @@ from typing import Annotated, Any
 import can
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.measure import Measurement
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.table import Table
+from rich.text import Text
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
+from hdbridge.files.atomic import check_writable, write_atomically
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.realtime import prepare_realtime
 from hdbridge.sim.lockstep import simulated_bench
@@ -28,11 +31,19 @@ console = Console(highlight=False)
 notes = Console(stderr=True, highlight=False)
 """Progress and remarks: standard error, so that they do not get into a pipe."""
 
+
+def _writable(path: Path | None) -> Path | None:
+    """Refuse a result file that cannot be written before anything is measured, not after."""
+    if path is not None:
+        check_writable(path)
+    return path
+
+
 ProfileArgument = Annotated[
     str,
     typer.Argument(
         metavar="PROFILE",
-        help="A folder with axis.yaml (and model.yaml), an axis file, or a bundled profile: `article`.",
+        help="A folder with axis.yaml (and model.yaml), an axis file, or a bundled profile: article, demo.",
     ),
 ]
 ModelOption = Annotated[
@@ -54,10 +65,14 @@ InterfaceOption = Annotated[
 ]
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
 JsonOption = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write the result for machines.", callback=_writable),
 ]
 HtmlOption = Annotated[
-    Path | None, typer.Option("--html", metavar="FILE", help="Write a page that opens without a network.")
+    Path | None,
+    typer.Option(
+        "--html", metavar="FILE", help="Write a page that opens without a network.", callback=_writable
+    ),
 ]
 
 
@@ -96,12 +111,29 @@ def connected(
     if not simulate:
         if truth is not None:
             raise InputError("--truth says what a simulated axis is like: give --simulate with it")
+        if axis.bus.interface == "virtual":
+            notes.print("the bus 'virtual' ends in this process; --simulate puts a simulated drive there")
         with prepare_realtime() as conditions, open_bus(axis.bus) as bus:
-            notes.print(f"{conditions}")
+            notes.print(f"this process: {conditions}")
             yield bus, MonotonicClock()
         return
     with simulated_bench(truth or profile.truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
         yield bus, clock
+
+
+class _TimeColumn(ProgressColumn):
+    """What is left of a task while it runs, what it took when it is done."""
+
+    def render(self, task: Task) -> Text:
+        if task.finished or task.time_remaining is None:
+            took = task.finished_time if task.finished else None
+            return Text("" if took is None else f"{_clock(took)} taken")
+        return Text(f"{_clock(task.time_remaining)} left")
+
+
+def _clock(duration_s: float) -> str:
+    minutes, seconds = divmod(round(duration_s), 60)
+    return f"{minutes:d}:{seconds:02d}"
 
 
 @contextmanager
@@ -111,12 +143,16 @@ def progress_bar() -> Iterator[Progress]:
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        _TimeColumn(),
     )
     with Progress(*columns, console=notes, refresh_per_second=4) as progress:
         yield progress
+
+
+def print_table(table: Table) -> None:
+    """A table at its natural width: a figure cut by a narrow terminal, or a pipe, would be a wrong one."""
+    table.width = Measurement.get(console, console.options.update(width=10_000), table).maximum
+    console.print(table, crop=False)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

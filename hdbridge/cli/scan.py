@@ -41,8 +41,8 @@ def scan(
     profile: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PROFILE]",
-            help="Whose bus, and which drive is expected there; else give --interface and --channel.",
+            metavar="PROFILE",
+            help="Whose bus, and which drive is expected there. Without it: --interface and --channel.",
         ),
     ] = None,
     interface: InterfaceOption = None,

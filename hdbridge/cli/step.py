@@ -26,13 +26,14 @@ from hdbridge.cli.options import (
     console,
     load_axis,
     notes,
+    print_table,
     progress_bar,
     write_json,
 )
 from hdbridge.comparison import Comparison, compare_schemes
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
+from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.report.page import render
@@ -51,12 +52,14 @@ def step(
     scheme: Annotated[
         list[Scheme] | None,
         typer.Option(
-            "--scheme", help="Only this scheme; may stand several times. All that the model has, else."
+            "--scheme", help="Only this scheme; may stand several times. Else all that the model has."
         ),
     ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
-    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, degrees of the motor.")] = 43.56,
-    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start.")] = 0.0,
+    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, in degrees of the motor.")] = 43.56,
+    start_deg: Annotated[
+        float, typer.Option("--start-deg", help="Load angle of the start, in degrees.")
+    ] = 0.0,
     simulate: SimulateOption = False,
     truth: TruthOption = None,
     seed: SeedOption = 0,
@@ -87,7 +90,7 @@ def step(
         seed=seed,
         record=record,
     )
-    print_table(axis, comparison)
+    print_result(axis, comparison)
     write_json(json_file, comparison.as_dict())
     if html_file is not None:
         write_page(html_file, axis, comparison, stepping)
@@ -110,10 +113,11 @@ def run_comparison(
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
         raise InputError("--scheme extended: the model has no effect beyond its two parts; leave it out")
+    if record is not None:
+        make_folder(record)  # before the axis moves, not after
 
     def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
         if record is not None:
-            record.mkdir(parents=True, exist_ok=True)
             run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
 
     with (
@@ -124,19 +128,30 @@ def run_comparison(
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
         with progress_bar() as bar:
-            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0) for each in wanted}
+            bars = {
+                each: bar.add_task(f"{each.value:>12}", total=1.0, start=False, visible=False)
+                for each in wanted
+            }
+
+            def show(scheme: Scheme, share: float) -> None:
+                if not bar.tasks[bars[scheme]].started:
+                    bar.start_task(bars[scheme])
+                    for each in bars.values():  # none is shown of a test that is refused
+                        bar.update(each, visible=True)
+                bar.update(bars[scheme], completed=share)
+
             return compare_schemes(
                 drive,
                 model,
                 wanted,
                 stepping,
-                progress=lambda scheme, share: bar.update(bars[scheme], completed=share),
+                progress=show,
                 interrupted=interrupted,
                 finished=keep,
             )
 
 
-def print_table(axis: AxisConfig, comparison: Comparison) -> None:
+def print_result(axis: AxisConfig, comparison: Comparison) -> None:
     """The result for a person."""
     table = Table(title=f"Load error at rest, arcsec: axis '{axis.name}'", title_justify="left")
     table.add_column("compensation")
@@ -150,7 +165,7 @@ def print_table(axis: AxisConfig, comparison: Comparison) -> None:
             for value in (part.three_sigma_arcsec, part.mean_arcsec)
         ]
         table.add_row(scheme.value, *cells)
-    console.print(table)
+    print_table(table)
     console.print(
         f"quantisation floor (3 sigma of one motor count): {comparison.quantisation_floor_arcsec:.2f}"
     )

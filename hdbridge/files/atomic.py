@@ -36,6 +36,27 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
 
 
+def check_writable(path: Path | str) -> None:
+    """InputError unless a file may be written there: for before a long measurement, instead of after it."""
+    target = Path(path).resolve()
+    if target.is_dir():
+        raise InputError(f"{path}: cannot be written: it is a folder; expected the name of a file")
+    if not target.parent.is_dir():
+        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written: the folder {target.parent} does not permit it")
+
+
+def make_folder(path: Path | str) -> None:
+    """The folder, with its parents where they are missing. InputError where it cannot be made or written."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise InputError(f"{path}: cannot make this folder: {problem.strerror}") from None
+    check_writable(folder / "a file")
+
+
 def _temporary_name(target: Path) -> Path:
     return target.with_name(f".{target.name}.tmp")
 

@@ -111,7 +111,7 @@ class LockstepBus(can.BusABC):
         self._inner = _PolledBus(channel)
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
-        self.channel_info = f"lockstep on virtual channel {channel}"
+        self.channel_info = "the simulated bus"
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send, and let every node take it in and answer."""

@@ -1,0 +1,101 @@
+"""What every command has in common: results that can be written, tables that are whole, a way out."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+
+def command(*arguments, **more):
+    return subprocess.run(
+        [sys.executable, "-m", "hdbridge", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        **more,
+    )
+
+
+@pytest.mark.parametrize("option", ["--json", "--html"])
+@pytest.mark.parametrize(("place", "reason"), [("nowhere/out", "no folder"), ("", "it is a folder")])
+def test_a_result_that_cannot_be_written_is_refused_before_anything_is_measured(
+    hdbridge, tmp_path, option, place, reason
+):
+    done = hdbridge("step", "article", "--simulate", "--count", 2, option, tmp_path / place)
+    assert done.returncode == 2
+    assert reason in done.stderr
+    assert "booted" not in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize("arguments", [("step", "article", "--simulate", "--record"), ("demo", "--out")])
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_measured(hdbridge, tmp_path, arguments):
+    (tmp_path / "file").write_text("")
+    done = hdbridge(*arguments, "file/folder")
+    assert done.returncode == 2
+    assert "file/folder: cannot make this folder" in done.stderr
+    assert "booted" not in done.stderr
+
+
+def test_no_figure_is_cut_in_a_narrow_terminal(tmp_path, profile):
+    shown = command(
+        "model", "diff", profile.folder, "active", "active", env={**os.environ, "COLUMNS": "30"}, cwd=tmp_path
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "…" not in shown.stdout
+    assert "orders[2].amplitude_arcsec" in shown.stdout
+
+
+def test_output_to_a_file_has_neither_colours_nor_control_characters(hdbridge):
+    done = hdbridge("step", "article", "--simulate", "--count", 2, "--scheme", "none")
+    assert done.returncode == 0, done.stderr
+    assert "\x1b" not in done.stdout + done.stderr
+
+
+def test_a_test_that_is_refused_shows_no_progress(hdbridge):
+    done = hdbridge("step", "article", "--simulate", "--start-deg", 5000)
+    assert done.returncode == 2
+    assert "%" not in done.stderr
+
+
+def test_the_version_and_the_short_help(hdbridge):
+    from hdbridge import __version__
+
+    assert hdbridge("--version").stdout == f"hdbridge {__version__}\n"
+    assert hdbridge("step", "-h").stdout == hdbridge("step", "--help").stdout
+
+
+def test_a_reader_that_goes_away_is_no_error(tmp_path):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as broken:
+        done = subprocess.run(
+            [sys.executable, "-m", "hdbridge", "check", "article"],
+            stdout=broken,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+        )
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+
+
+def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path):
+    """An import that never ends stands for a slow one."""
+    (tmp_path / "typer.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+    with subprocess.Popen(
+        [sys.executable, "-m", "hdbridge", "--help"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    ) as process:
+        assert process.stdout.readline() == "loading\n"
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == ""
