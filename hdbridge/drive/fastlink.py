@@ -17,7 +17,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 from can.typechecking import Channel
 
-from hdbridge.drive.link import Frame, Link, TransmitBufferFull
+from hdbridge.drive.link import Frame, Link, TransmitBufferFull, new_tuple
 from hdbridge.errors import BusError
 
 _FRAME: Final = struct.Struct("=IB3x8s")
@@ -122,7 +122,7 @@ class _SocketLink(Link):
             if can_id & _FLAGS:
                 self._drop(_refused(can_id))
                 continue
-            return Frame(can_id, data[:length], self.now())
+            return new_tuple(Frame, (can_id, data[:length], self.now()))
 
     def _wait(self, timeout_s: float) -> None:
         try:

@@ -44,8 +44,8 @@ class Frame(NamedTuple):
     """When it was taken from the interface, on the link's clock."""
 
 
-_new_tuple: Final = tuple.__new__
-"""Makes a Frame in half the time of its own constructor."""
+new_tuple: Final = tuple.__new__
+"""Makes a named tuple of its values in half the time of its own constructor."""
 
 
 @dataclass(slots=True)
@@ -155,7 +155,7 @@ class Link:
             if message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd:
                 self._drop(message)
                 continue
-            return _new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
+            return new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
 
     def drain(self) -> list[Frame]:
         """Everything that has arrived, without waiting; at most 4096 frames, so that it ends on any bus."""
