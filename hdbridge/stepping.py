@@ -75,11 +75,19 @@ class SchemeResult:
         return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``hdbridge step --json``."""
-        return {
+        """The contract of ``hdbridge step --json``; ``steps`` has each step's target and error, in order."""
+        scatter = {
             name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
             for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
         }
+        steps = {
+            name: {
+                "target_deg": [each.target_deg for each in stands],
+                "error_arcsec": [each.error_arcsec for each in stands],
+            }
+            for name, stands in (("cw", self.outcome.cw), ("ccw", self.outcome.ccw))
+        }
+        return {**scatter, "steps": steps}
 
 
 def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:

@@ -3,6 +3,7 @@
 import gzip
 import json
 
+import numpy as np
 import pytest
 
 
@@ -17,6 +18,9 @@ def test_step_prints_a_table_and_writes_the_contract(hdbridge, tmp_path):
     for scheme in ("none", "synchronous", "hysteresis", "both"):
         for part in ("cw", "ccw", "pooled"):
             assert set(result[scheme][part]) == {"three_sigma_arcsec", "mean_arcsec"}
+        errors = result[scheme]["steps"]["cw"]["error_arcsec"]
+        assert len(errors) == 12
+        assert np.mean(errors) == pytest.approx(result[scheme]["cw"]["mean_arcsec"])
     assert result["none"]["cw"]["mean_arcsec"] > 30
     assert result["none"]["ccw"]["mean_arcsec"] < -30
     assert result["both"]["pooled"]["three_sigma_arcsec"] < 4.5
