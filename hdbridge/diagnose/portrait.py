@@ -91,8 +91,6 @@ def portrait(finding: Finding, traces: Traces, ratio: float) -> Portrait:
     """Draw one finding; ``ratio`` is the gear's."""
     own = contribution(finding, traces)
     left = traces.measured_arcsec - traces.extended_arcsec
-    if own is not None:
-        own = own - float(np.mean(own))
     home = _home(finding, traces, ratio)
     rows = np.ones(len(left), dtype=np.bool_)
     resting = traces.speed_deg_s == 0.0

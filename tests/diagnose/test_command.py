@@ -30,14 +30,19 @@ def files(
 
 
 def test_it_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_path: Path) -> None:
-    out, new = tmp_path / "out.json", tmp_path / "new.yaml"
+    out, new, page = (tmp_path / name for name in ("out.json", "new.yaml", "page.html"))
     command = ["diagnose", str(files[0]), "--model", str(files[1]), "--json", str(out), "--extend", str(new)]
+    command += ["--html", str(page)]
     result = RUN.invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0
     data = json.loads(out.read_text())
     assert [each["cause"] for each in data["findings"]] == ["motor_order"]
     assert "motor_order" in [each.name for each in TransmissionModel.load(new).effects]
     assert "motor_order" in result.output
+    shares = {name: each["share_of_baseline"] for name, each in data["seen_over"].items()}
+    assert max(shares, key=lambda name: shares[name]) == "motor angle"
+    assert "motor angle" in result.output
+    assert "Diagnosis of record.csv.gz" in page.read_text()
 
 
 @pytest.mark.parametrize(

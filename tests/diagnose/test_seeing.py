@@ -1,0 +1,91 @@
+"""Seeing: what a residual goes with, and what it does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.diagnose.seeing import Coordinate, Seen, Spacing, binned, since_change_s, since_reversal
+from hdbridge.effects import Motion
+
+COUNT = 8000
+TIME_S = np.arange(COUNT) * 0.1
+LOAD_DEG = np.abs(np.mod(TIME_S, 80.0) - 40.0) * 9.0
+DIRECTION = np.where(np.mod(TIME_S, 80.0) >= 40.0, 1.0, -1.0)
+RNG = np.random.default_rng(3)
+
+
+def seen(given_arcsec):
+    found = (
+        Coordinate("load angle", "deg", LOAD_DEG, both_ways=True),
+        Coordinate("direction", "", DIRECTION, bins=2),
+        Coordinate("speed", "deg/s", RNG.normal(size=COUNT), spacing=Spacing.FILLED, bins=40),
+        Coordinate("time", "s", TIME_S, bins=100),
+    )
+    noise = RNG.normal(size=COUNT)
+    return Seen(given_arcsec, noise, DIRECTION, TIME_S, {each.name: each for each in found})
+
+
+def test_noise_goes_with_nothing():
+    shares = seen(np.zeros(COUNT)).shares()
+    assert max(left for _, left in shares.values()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("error", "home"),
+    [
+        (5.0 * np.cos(np.radians(LOAD_DEG)), "load angle"),
+        (4.0 * DIRECTION, "direction"),
+        (4.0 * (TIME_S > 500.0) - 1.5, "time"),
+    ],
+    ids=["wave", "sides", "step"],
+)
+def test_a_residual_goes_with_the_coordinate_that_it_is_made_of(error, home):
+    before = {name: each[0] for name, each in seen(error + RNG.normal(size=COUNT)).shares().items()}
+    variance = float(np.mean(error**2))
+    assert before[home] == pytest.approx(variance / (variance + 1.0), abs=0.06)
+    others = {"speed", "time" if home != "time" else "load angle"}
+    assert all(before[each] < 0.1 for each in others)
+
+
+def test_what_is_opposite_in_the_two_directions_is_seen_over_the_angle():
+    error = 5.0 * DIRECTION * np.cos(np.radians(LOAD_DEG))
+    both = seen(error)
+    blind = replace(both.coordinates["load angle"], both_ways=False)
+    assert both.shares()["load angle"][0] > 0.9
+    assert replace(both, coordinates={"load angle": blind}).shares()["load angle"][0] < 0.05
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1e4, 1e4), st.floats(-1e3, 1e3)), min_size=3, max_size=200),
+    st.sampled_from(Spacing),
+)
+def test_bins_lose_no_point_and_keep_the_mean(points, spacing):
+    x, y = (np.array(each) for each in zip(*points, strict=True))
+    found = binned(Coordinate("c", "", x, spacing=spacing, bins=1), y)
+    assert np.sum(found.count) == len(x)
+    assert np.average(found.mean, weights=found.count) == pytest.approx(np.mean(y), abs=1e-6)
+    total = np.average(found.spread**2 + found.mean**2, weights=found.count)
+    assert total == pytest.approx(np.mean(y**2), rel=1e-6, abs=1e-6)
+
+
+def test_way_and_time_since_a_reversal_begin_anew_at_each():
+    motor = np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0, 3.0])
+    way, since_s = since_reversal(Motion(motor_deg=motor, time_s=np.arange(7.0)))
+    # A rest belongs to the motion before it: the axis has not turned round yet.
+    assert way.tolist() == [0.0, 1.0, 2.0, 2.0, 1.0, 2.0, 3.0]
+    assert since_s.tolist() == [0.0, 1.0, 2.0, 3.0, 1.0, 2.0, 1.0]
+
+
+def test_an_axis_that_never_turns_counts_from_its_beginning():
+    way, since_s = since_reversal(Motion(motor_deg=np.zeros(4), time_s=np.arange(4.0)))
+    assert not np.any(way)
+    assert since_s.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_time_since_a_stop_or_start():
+    speed = np.array([0.0, 0.0, 5.0, 5.0, 0.0, -5.0])
+    motion = Motion(motor_deg=np.cumsum(speed), time_s=np.arange(6.0), motor_speed_deg_s=speed)
+    assert since_change_s(motion).tolist() == [0.0, 1.0, 0.0, 1.0, 0.0, 0.0]

@@ -1,0 +1,352 @@
+"""The page of a diagnosis says what was found, shows it where it lives, and tells what to do."""
+
+import dataclasses
+import html
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from hdbridge.calibration.validation import Floor, Stepped, Validation
+from hdbridge.diagnose import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
+from hdbridge.effects import (
+    CATALOGUE,
+    CAUSES,
+    CountLoss,
+    Hysteresis,
+    Motion,
+    MotorOrder,
+    Start,
+    Step,
+    Synchronous,
+    Vibration,
+)
+from hdbridge.effects.kinematics import direction_of
+from hdbridge.model import TransmissionModel
+from hdbridge.report.diagnosis import diagnosis_page
+from hdbridge.report.page import render
+from hdbridge.stepping import Scatter
+
+RATIO = 50.0
+MODEL = TransmissionModel(
+    RATIO,
+    (
+        Synchronous(orders=(MotorOrder(order=2, amplitude_arcsec=5.0, phase_deg=0.0),)),
+        Hysteresis(offset_arcsec=30.0, width_deg=20.0, exponent=1.6),
+    ),
+)
+
+
+def motion(count=6000):
+    """A load turn there and back at two speeds, small reversals, and a rest, with a torque."""
+    there = np.linspace(0.0, 18_000.0, count // 4)
+    swing = np.linspace(0.0, 12.0 * np.pi, count // 4)
+    small = (2.0 + 5.0 * np.abs(np.sin(0.31 * swing))) * np.sin(swing)
+    rest = np.zeros(count // 8)
+    slow = np.linspace(0.0, 9_000.0, count - 2 * (count // 4) - count // 4 - count // 8)
+    motor = np.concatenate([there, there[::-1], small, rest, slow])
+    time = np.arange(count) * 0.02
+    load = motor / RATIO
+    speed = np.gradient(motor, time)
+    return Motion(
+        motor_deg=motor,
+        time_s=time,
+        load_torque_nm=5.0 * np.cos(np.radians(7.3 * load)),
+        motor_torque_nm=0.1 * np.sign(speed),
+        temperature_c=20.0 + 8.0 * time / time[-1],
+        motor_speed_deg_s=speed,
+        motor_acceleration_deg_s2=np.gradient(speed, time),
+        load_deg=load,
+    )
+
+
+MOTION = motion()
+
+
+WITHIN = {
+    "count_loss": CountLoss(steps=(Step(time_s=60.0, size_arcsec=4.0),)),
+    "vibration": Vibration(frequency_hz=3.3, amplitude_arcsec=4.0, phase_deg=0.0),
+}
+"""Causes whose candidates do nothing within this record."""
+
+
+def finding(cause="load_order", size=4.0, **more):
+    effect = WITHIN.get(cause) or CATALOGUE[cause].candidate(RATIO, MODEL.effects)
+    values = {
+        "cause": cause,
+        "probability": 0.97,
+        "aliases": (),
+        "parameters": {"order_1_amplitude_arcsec": Parameter(4.0312, "arcsec", 4.0002, 4.0622)},
+        "before_arcsec": 3.0,
+        "after_arcsec": 0.5,
+        "experiment": "two slow load turns both ways",
+        "peak_arcsec": size,
+        "effect": effect,
+    }
+    return Finding(**(values | more))
+
+
+def unexplained(lives_in="load angle and direction"):
+    return Finding(
+        "unexplained", 0.8, (), {}, 1.2, 0.7, "look closer at the load angle", 1.2, lives_in=lives_in
+    )
+
+
+def diagnosis(*findings, driven=MOTION, noise=0.5):
+    rng = np.random.default_rng(7)
+    model = MODEL.predict(driven, Start.FORWARD)
+    own = sum(
+        (each.effect.predict(driven, Start.FORWARD) for each in findings if each.effect is not None),
+        np.zeros(len(driven)),
+    )
+    measured = model + own + noise * rng.normal(size=len(driven))
+    direction = direction_of(driven)
+    return Diagnosis(
+        baseline=Figures(3.1, 9.3),
+        refitted=Figures(2.9, 8.7),
+        extended=Figures(0.61, 1.83),
+        noise_floor_arcsec=noise,
+        findings=findings,
+        identifiability={
+            "load_order": Identifiability(True, 0.7, ("compliance",), 0.9),
+            "vibration": Identifiability(False, None, (), 0.0, "nothing <in> this record"),
+        },
+        by_kind={"standing": (Figures(2.0, 6.0), Figures(0.4, 1.2)), "forward": (Figures(3.0, 9.0),) * 2},
+        remarks=("no command (motor_target_deg)",),
+        model=MODEL,
+        traces=Traces(
+            driven.time_s,
+            driven.motor_deg,
+            measured,
+            model,
+            model + own,
+            direction,
+            driven.motor_speed_deg_s,
+            ("slow",),
+            np.zeros(len(driven)),
+            driven,
+            np.arange(len(driven)),
+            Start.FORWARD,
+        ),
+        considered=("creep: not seen in enough independent stretches",),
+    )
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes; text outside of script and style."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words, self._quiet = [], [], 0
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._quiet += tag in {"script", "style"}
+
+    def handle_endtag(self, tag):
+        self._quiet -= tag in {"script", "style"}
+
+    def handle_data(self, data):
+        if not self._quiet:
+            self.words.append(data)
+
+
+def page(*findings, **more):
+    return render(diagnosis_page(diagnosis(*findings), title="Diagnosis of r.csv", **more))
+
+
+def charts(text):
+    data = json.loads(re.search(r"const CHARTS = (.*);\n", text).group(1))
+    captions = [html.unescape(each) for each in re.findall(r"<figcaption>(.*?)</figcaption>", text)]
+    return dict(zip(captions, data, strict=True))
+
+
+def words(text):
+    return " ".join(" ".join(Reader(text).words).split())
+
+
+def series(chart, begins):
+    (found,) = (each for each in chart["series"] if each["label"].startswith(begins))
+    return np.array(found["x"], dtype=float), np.array(found["y"], dtype=float)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return page(finding(aliases=("compliance",)), provenance={"record": "r.csv"})
+
+
+def test_it_loads_nothing_from_anywhere(plain):
+    for tag, attributes in Reader(plain).tags:
+        assert tag not in {"link", "img", "iframe", "object"}
+        assert not {"src", "href", "srcset"} & set(attributes)
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest", plain)
+
+
+def test_it_says_cause_size_gain_and_what_else_it_could_be(plain):
+    text = words(plain)
+    assert "off by 3.10 arcsec (rms): load order (once or twice per load turn) or compliance" in text
+    assert "up to 4.00 arcsec" in text
+    assert "0.61 remain, without it 2.90 at best; the noise of a reading is 0.50" in text
+    assert "or one that it cannot be told from" in text
+    row = re.search(r"1\. load order</th>(.*?)</tr>", plain).group(1)
+    assert re.findall(r">([^<>]+)</td>", row) == ["0.97", "4.00", "3.00", "0.50", "97 %"]
+
+
+def test_it_says_what_to_do_and_to_measure_next(plain):
+    text = words(plain)
+    assert "measure next Two slow load turns both ways." in text
+    assert "Centre the load encoder" in text
+    assert "hdbridge diagnose --extend" in text
+
+
+def test_parameters_stand_with_their_interval(plain):
+    row = re.search(r"order 1 amplitude</th>(.*?)</tr>", plain).group(1)
+    assert re.findall(r">([^<>]+)</td>", row) == ["4.031", "0.031", "4.000", "4.062", "arcsec"]
+
+
+def test_what_was_looked_at_and_could_have_been_seen_is_told(plain):
+    text = words(plain)
+    assert "no command (motor_target_deg)" in text
+    assert "creep: not seen in enough independent stretches" in text
+    assert "nothing <in> this record" in text
+    assert "record r.csv" in text
+    assert "standing 2.00 6.00 0.40 1.20" in text
+
+
+def test_a_finding_is_drawn_over_its_coordinate_with_its_own_curve(plain):
+    chart = charts(plain)["Residual without it, over the load angle"]
+    angle, curve = series(chart, "the finding, forward")
+    effect = finding().effect
+    expected = effect.predict(Motion(motor_deg=angle * RATIO))
+    assert curve == pytest.approx(expected, abs=0.02)
+    place, mean = series(chart, "mean, forward")
+    assert np.std(mean - np.interp(place, angle, curve)) < 0.25
+    (bars,) = (each["spread"] for each in chart["series"] if each["label"] == "mean, forward")
+    assert np.median(bars) == pytest.approx(0.5, rel=0.2)
+
+
+def test_backlash_is_drawn_over_the_way_since_the_reversal():
+    chart = charts(page(finding("backlash")))[
+        "Residual without it, over the motor angle since the last reversal"
+    ]
+    assert chart["x_log"] is True
+    way, forward = series(chart, "the finding, forward")
+    backward = series(chart, "the finding, backward")[1]
+    far = way > 100.0
+    assert np.mean(backward[-3:]) - np.mean(forward[far]) == pytest.approx(10.0, rel=0.02)
+
+
+def test_a_cause_that_scales_the_ripple_is_drawn_as_a_scale():
+    found = finding("torque_modulation")
+    chart = charts(page(found))["Change of the ripple, over the load torque, either way"]
+    torque, percent = series(chart, "the finding")
+    assert percent == pytest.approx(found.effect.growth_percent_per_nm * torque, abs=0.05)
+    measured = series(chart, "measured")[1]
+    spread = np.array(chart["series"][0]["spread"])
+    assert np.all(np.abs(measured - percent) < 5.0 * spread + 0.2)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_every_cause_of_the_catalogue_has_a_picture(cause):
+    text = page(finding(cause))
+    assert CATALOGUE[cause].about.title in html.unescape(text)
+    chart = next(iter(charts(text).values()))
+    curves = [each["y"] for each in chart["series"] if each["label"].startswith("the finding")]
+    assert max(abs(value) for curve in curves for value in curve) > 0.01
+
+
+def test_a_change_of_orders_is_drawn_from_its_parameters():
+    parameters = {
+        "order_2_amplitude_arcsec": Parameter(3.0, "arcsec", 2.9, 3.1),
+        "order_2_phase_deg": Parameter(90.0, "deg", 88.0, 92.0),
+    }
+    text = page(finding("motor_order", effect=None, parameters=parameters))
+    angle, curve = series(charts(text)["Residual without it, over the motor angle"], "the finding, forward")
+    assert curve == pytest.approx(-3.0 * np.sin(np.radians(2.0 * angle)), abs=0.05)
+
+
+def test_something_unexplained_has_no_name_and_no_curve():
+    text = page(unexplained())
+    said = words(text)
+    assert "something unexplained that lives in the load angle and direction" in said
+    assert "No cause of the catalogue fits it" in said
+    assert "Do not correct what has no name" in said
+    assert "--extend" not in said
+    chart = charts(text)["What is left, over the load angle"]
+    assert [each["label"].split(" (")[0] for each in chart["series"]] == [
+        "readings",
+        "mean, forward",
+        "mean, backward",
+    ]
+
+
+def test_what_lives_in_an_unknown_coordinate_is_drawn_over_time():
+    assert "What is left, over the time" in charts(page(unexplained("the moon's phase")))
+
+
+def test_nothing_found_is_said_and_nothing_is_to_be_done():
+    text = page()
+    said = words(text)
+    assert "Nothing found" in said
+    assert "What to do Nothing." in said
+    assert "What was found" not in said
+    assert "What this record could show" in said
+
+
+def test_a_guess_is_called_one():
+    assert "(rms): perhaps load order" in words(page(finding(probability=0.5)))
+    assert "(rms): probably load order" in words(page(finding(probability=0.8)))
+
+
+def test_the_residual_is_shown_over_every_coordinate_to_one_scale(plain):
+    over = {name: chart for name, chart in charts(plain).items() if name.startswith("Over the ")}
+    assert set(over) >= {
+        f"Over the {name}"
+        for name in (
+            "motor angle", "load angle", "speed", "acceleration", "load torque", "motor torque",
+            "temperature", "time", "time since the last reversal", "motor angle since the last reversal",
+        )
+    }  # fmt: skip
+    assert len({tuple(chart["y_range"]) for chart in over.values()}) == 1
+    order = list(over)
+    assert order.index("Over the load angle") < order.index("Over the motor angle")
+
+
+def test_simulation_stands_beside_measurement(plain):
+    chart = charts(plain)["Closer: where the extended model gains most"]
+    assert {each["label"] for each in chart["series"]} == {
+        "measured",
+        "the model as given",
+        "the extended model",
+    }
+
+
+def test_a_stepping_test_says_what_was_gained_on_the_axis():
+    targets, errors = ((1.0, 2.0), (2.0, 1.0)), ((3.0, 1.0), (-1.0, -3.0))
+    before = Stepped("the active model", *[Scatter(12.0, 1.0)] * 3, errors, targets)
+    after = Stepped("the extended model", *[Scatter(3.2, 0.1)] * 3, errors, targets)
+    said = words(page(finding(), stepping=Validation(before, after, Floor(2.84, 0.0))))
+    assert "On the axis, stepping went from 3σ = 12.00 to 3.20 arcsec." in said
+    assert "before: the active model 12.00" in said
+    assert "--extend" not in said
+
+
+def test_what_comes_from_outside_stays_text():
+    evil = "</script><script>alert(1)</script><b>&"
+    odd = dataclasses.replace(finding(), experiment=evil, note=evil, lives_in=evil)
+    text = render(
+        diagnosis_page(diagnosis(odd, unexplained(evil)), title=evil, provenance=[(evil, evil), (evil, evil)])
+    )
+    tags = [tag for tag, _ in Reader(text).tags]
+    assert tags.count("script") == 2
+    assert "b" not in tags
+    assert evil in "".join(Reader(text).words)
+
+
+def test_a_page_of_the_longest_traces_stays_small():
+    found = [finding(), finding("backlash"), finding("count_loss"), finding("subdivisional_error")]
+    text = render(diagnosis_page(diagnosis(*found, driven=motion(50_000)), title="long"))
+    assert len(text) < 1_500_000
