@@ -13,7 +13,7 @@ from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.parameters import parameters_of
 from hdbridge.diagnose.result import Finding, Parameter
-from hdbridge.diagnose.search import Trail
+from hdbridge.diagnose.search import EXTRAPOLATED, Trail
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
     Effect,
@@ -46,6 +46,8 @@ def findings(workshop: Workshop, model: TransmissionModel, trail: Trail, spread:
     fitted = trail.fitted
     for place, (given, now) in enumerate(zip(model.effects, fitted.theory.effects, strict=False)):
         if isinstance(given, Hysteresis | HysteresisMemory):
+            if workshop.evidence.reversals < 2:
+                continue  # a loop shows only where the axis turns round
             found = _law(workshop, fitted, trail, place, given, now, spread)
         elif isinstance(given, Synchronous):
             found = _orders(workshop, fitted, place, given, now, spread)
@@ -138,6 +140,11 @@ def _orders(
         weight += abs(apart) ** 2
     if not changed:
         return None
+    seen = 0.5 * float(
+        np.ptp(workshop.columns(now, fitted.theory.start) @ (now.coefficients() - given.coefficients()))
+    )
+    if max(each.amplitude_arcsec for each in changed) > EXTRAPOLATED * seen:
+        return None  # on an arc of their turn orders take any size
     low = {each.order for each in changed} <= {1, 2}
     size = sum(each.amplitude_arcsec for each in changed)
     residual = float(np.sqrt(np.mean((fitted.residual / workshop.weight) ** 2)))

@@ -10,16 +10,16 @@ import numpy as np
 from hdbridge.diagnose import changes
 from hdbridge.diagnose.evidence import Leg, gather
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
-from hdbridge.diagnose.extend import extended_model
+from hdbridge.diagnose.extend import extended_model, supported
 from hdbridge.diagnose.gates import Gate, gate
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.probability import probability
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import FLOORS_ARCSEC, PENALTY, REPEATED, Search, Trail
+from hdbridge.diagnose.search import FLOORS_ARCSEC, PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
-from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, rest
+from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, many_of_one, rest
 from hdbridge.effects import Channel, ChannelSkew, Effect, FloatArray, InertialWindup, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
@@ -29,7 +29,6 @@ from hdbridge.record import Record
 INERTIA_SHARE = 0.15
 """A skew whose part in speed is less than this of its part in acceleration is none."""
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
-SERIAL = REPEATED - {"creep"}
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 SHADOW = 2.0
@@ -38,8 +37,7 @@ PLAIN_ARCSEC = 1.0
 """More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
 particular."""
 LOW_SHARE = 0.8
-SAME_FAMILY = 3
-"""So many picks of one family, nearly equal, are one unknown and not many causes."""
+"""Orders 1 and 2 that make up more than this share of the squares may be the motor encoder's own."""
 
 
 def diagnose(
@@ -89,6 +87,8 @@ class _Judge:
         spread = covariance(workshop, fitted)
         findings = [self._finding(fitted, place, spread) for place in range(base, len(fitted.theory.effects))]
         findings += changes.findings(workshop, self.model, trail, spread)
+        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
         findings.sort(key=lambda each: -each.robust)
         if workshop.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
             workshop.nuisance = workshop.nuisance[:, :0]
@@ -98,10 +98,17 @@ class _Judge:
         findings = self._with_unexplained(findings, left)
         chosen = tuple(range(base, len(fitted.theory.effects)))
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
         given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
-        points = workshop.evidence.points
         after = fitted.residual / workshop.weight
+        sound = supported(workshop, fitted, self.model.effects)
+        if sound != fitted.theory.effects:
+            fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
+            after = self._about_zeros(
+                sum(each.predict(workshop.motion, fitted.theory.start) for each in sound)
+            )
+            fitted = replace(fitted, residual=after * workshop.weight)
+        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
+        points = workshop.evidence.points
         return Diagnosis(
             baseline=_figures(given),
             refitted=_figures(refitted.residual / workshop.weight),
@@ -177,8 +184,6 @@ class _Judge:
         aliases, margin = self._aliases(fitted, without, place)
         own = without.chi_square - fitted.chi_square
         sure = probability(judged.robust, judged.needed, gain.recovered, margin, own)
-        if self.workshop.evidence.reversals < 2:
-            sure = min(sure, ONE_WAY)  # speed, torque, place and time go together: useful, but no proof
         return Finding(
             cause=effect.name,
             probability=sure,
@@ -218,7 +223,7 @@ class _Judge:
         return tuple(aliases), margin
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
-        many = _many_of_one(findings)
+        many = many_of_one(findings)
         if many is None and not self._is_unexplained(left):
             return findings
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
@@ -273,18 +278,25 @@ class _Judge:
 
     def _as_given(self) -> FloatArray:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""
-        workshop = self.workshop
         best: FloatArray | None = None
         for start in Start:
-            error = workshop.observed - self.model.predict(workshop.motion, start)[workshop.index]
-            for zero in range(workshop.evidence.zeros):
-                rows = workshop.zero == zero
-                if np.any(rows):
-                    error[rows] -= np.average(error[rows], weights=workshop.weight[rows] ** 2)
+            error = self._about_zeros(self.model.predict(self.workshop.motion, start))
             if best is None or float(error @ error) < float(best @ best):
                 best = error
         assert best is not None
         return best
+
+    def _about_zeros(self, predicted_arcsec: FloatArray | float) -> FloatArray:
+        """What a prediction for every point leaves of the usable ones, about the zeros that suit it best."""
+        workshop = self.workshop
+        error: FloatArray = (
+            workshop.observed - np.broadcast_to(predicted_arcsec, len(workshop.motion))[workshop.index]
+        )
+        for zero in range(workshop.evidence.zeros):
+            rows = workshop.zero == zero
+            if np.any(rows):
+                error[rows] -= np.average(error[rows], weights=workshop.weight[rows] ** 2)
+        return error
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         workshop = self.workshop
@@ -324,24 +336,6 @@ def _low(effect: Effect) -> bool:
     """Whether orders 1 and 2 are most of it, which the motor's encoder may make itself."""
     squares = {each.order: each.amplitude_arcsec**2 for each in effect.orders}  # type: ignore[attr-defined]
     return bool(squares.get(1, 0.0) + squares.get(2, 0.0) > LOW_SHARE * sum(squares.values()))
-
-
-def _many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
-    """Several near-equal picks of one family: sidebands of something that is none of them."""
-    for family in {each.cause for each in findings}:
-        same = [each for each in findings if each.cause == family]
-        sizes = [
-            value.value
-            for each in same
-            for name, value in each.parameters.items()
-            if name.endswith("amplitude_arcsec") or name.endswith("size_arcsec")
-        ] or [each.peak_arcsec for each in same]
-        if family in SERIAL:
-            sizes.sort(key=abs, reverse=True)
-            near = [each for each in sizes if abs(each) > 0.4 * abs(sizes[0])]
-            if len(near) >= SAME_FAMILY + (2 if family == "motor_order" else 0):
-                return same
-    return None
 
 
 def _figures(values: FloatArray, about_zero: bool = False) -> Figures:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.noise import noise_arcsec
+from hdbridge.diagnose.noise import noise_arcsec, third_deviation
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import quantum_deg, steadied
@@ -31,6 +31,8 @@ IntArray = NDArray[np.intp]
 MOST_POINTS = 50_000
 CHATTER_COUNTS = 1.6
 """Turns of the driving angle smaller than this are no turns: a servo that settles, not a move."""
+CHATTER_SIGMAS = 8.0
+"""... and those smaller than so many standard deviations of the noise of the measured angle."""
 LEAST_SAMPLES = 60
 SPEED_WINDOW_S = 0.03
 SETTLE_S = 0.15
@@ -222,7 +224,10 @@ def _series(
         count / ratio * ARCSEC_PER_DEG,
         quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
         period,
-        sum(_turns(piece[0]) for piece in pieces),
+        sum(
+            _turns(piece[0], _chatter_deg(record.motor_position_deg[first:last]))
+            for piece, (first, last) in zip(pieces, pairwise(edges), strict=True)
+        ),
     )
     return series, names, facts
 
@@ -326,8 +331,14 @@ def _kinds(
     return kind, leg, ("standing", "slow", "fast")
 
 
-def _turns(motor_deg: FloatArray) -> int:
-    steps = np.sign(np.diff(motor_deg))
+def _chatter_deg(position_deg: FloatArray) -> float:
+    """What the noise of an interpolated encoder may go back without the axis having turned round."""
+    third = np.diff(position_deg, 3)
+    return CHATTER_SIGMAS * third_deviation(third) if len(third) else 0.0
+
+
+def _turns(motor_deg: FloatArray, chatter_deg: float) -> int:
+    steps = np.sign(np.diff(steadied(motor_deg, motor_deg, chatter_deg)))
     held = steps[steps != 0.0]
     return int(np.count_nonzero(np.diff(held)))
 

@@ -5,11 +5,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from hdbridge.diagnose.parameters import half_widths, parameters_of
-from hdbridge.diagnose.theory import Fitted
-from hdbridge.effects import Effect, FloatArray, conflicts, extended
+from hdbridge.diagnose.search import EXTRAPOLATED
+from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.effects import Effect, FloatArray, Synchronous, conflicts, extended
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import OrderSeries
 from hdbridge.model import TransmissionModel
+
+
+def supported(workshop: Workshop, fitted: Fitted, given: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The theory's effects, but those of the baseline as ``given`` where the record cannot tell them.
+
+    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record.
+    """
+    start = fitted.theory.start
+    one_way = workshop.evidence.reversals < 2
+    result = list(fitted.theory.effects)
+    for place, (old, new) in enumerate(zip(given, fitted.theory.effects, strict=False)):
+        if isinstance(new, Hysteresis | HysteresisMemory) and one_way:
+            result[place] = old
+        elif isinstance(old, Synchronous) and isinstance(new, Synchronous) and old.orders:
+            change = new.coefficients() - old.coefficients()
+            seen = 0.5 * float(np.ptp(workshop.columns(new, start) @ change))
+            largest = float(np.max(np.hypot(change[::2], change[1::2])))
+            if largest > EXTRAPOLATED * seen:
+                result[place] = old
+    return tuple(result)
 
 
 def extended_model(
@@ -20,7 +45,7 @@ def extended_model(
     reason: str,
     base: int,
 ) -> TransmissionModel:
-    """``model`` with the fitted baseline and the findings at ``places`` of the theory."""
+    """``model`` with the fitted baseline (`supported`) and the findings at ``places`` of the theory."""
     effects: tuple[Effect, ...] = tuple(_tidy(each) for each in fitted.theory.effects[:base])
     uncertainty: dict[str, dict[str, Any]] = {}
     chosen = [*range(base), *places]

@@ -32,8 +32,13 @@ def noise_arcsec(
     inner = still[1:-2]
     result = np.empty(len(error_arcsec))
     for rows, part in ((still, third[inner]), (~still, third[~inner])):
-        size = _MAD * float(np.median(np.abs(part))) / _THIRD if len(part) >= 20 else 0.0
-        result[rows] = max(float(np.hypot(size, 0.0)), floor, 0.02)
+        size = third_deviation(part) if len(part) >= 20 else 0.0
+        result[rows] = max(size, floor, 0.02)
     if np.any(still) and np.any(~still):  # in motion nothing is quieter than at rest
         result[~still] = max(float(result[~still][0]), 0.5 * float(result[still][0]))
     return result
+
+
+def third_deviation(third: FloatArray) -> float:
+    """Standard deviation of white noise from its third differences, by their median."""
+    return float(_MAD * np.median(np.abs(third)) / _THIRD)

@@ -131,7 +131,8 @@ def vibrations(workshop: Workshop, residual: FloatArray) -> Iterator[Candidate]:
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
     frequency = np.arange(len(power)) / (size * evidence.period_s)
-    power[frequency < LOWEST_HZ] = 0.0
+    # Less than two periods of it are a bend, not a frequency.
+    power[frequency < max(LOWEST_HZ, 2.0 / (length * evidence.period_s))] = 0.0
     lobe = max(4, size // length * 4)
     for _ in range(PEAKS):
         at = int(np.argmax(power))

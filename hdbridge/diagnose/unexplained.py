@@ -9,7 +9,7 @@ rest. Where the best of them takes a good deal away, there something is that the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ from scipy.ndimage import uniform_filter1d
 
 from hdbridge.diagnose.gates import since_reversal
 from hdbridge.diagnose.holdout import stretches
+from hdbridge.diagnose.result import Finding
+from hdbridge.diagnose.search import REPEATED
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import FloatArray
 from hdbridge.effects.kinematics import direction_of
@@ -26,6 +28,9 @@ from hdbridge.units import DEG_PER_TURN
 LEFT_ARCSEC = 0.5
 """More than this left in means over `BLOCK_S` is too much."""
 BLOCK_S = 0.2
+SERIAL = REPEATED - {"creep"}
+SAME_FAMILY = 3
+"""So many picks of one family, nearly equal, are one unknown and not many causes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +75,24 @@ def rest(workshop: Workshop, fitted: Fitted) -> Rest:
         best[3],
         shares,
     )
+
+
+def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
+    """Several near-equal picks of one family: sidebands of something that is none of them."""
+    for family in {each.cause for each in findings}:
+        same = [each for each in findings if each.cause == family]
+        sizes = [
+            value.value
+            for each in same
+            for name, value in each.parameters.items()
+            if name.endswith("amplitude_arcsec") or name.endswith("size_arcsec")
+        ] or [each.peak_arcsec for each in same]
+        if family in SERIAL:
+            sizes.sort(key=abs, reverse=True)
+            near = [each for each in sizes if abs(each) > 0.4 * abs(sizes[0])]
+            if len(near) >= SAME_FAMILY + (2 if family == "motor_order" else 0):
+                return same
+    return None
 
 
 def beyond_noise(workshop: Workshop, residual: FloatArray) -> float:
