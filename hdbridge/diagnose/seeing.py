@@ -24,6 +24,12 @@ BoolArray = NDArray[np.bool_]
 
 LEAST_IN_BIN: Final = 3
 """Points; the mean of fewer is not shown."""
+POINTS_PER_BIN: Final = 8
+LEAST_BINS: Final = 2
+SAME: Final = 1e-6
+"""A quantity that varies by less than this share of itself is one value, rounded."""
+NOTHING: Final = 1e-9
+"""... and so is one that varies by no more than this in its unit."""
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
 SMALLEST_WAY_DEG: Final = 0.01
@@ -53,6 +59,7 @@ class Coordinate:
     """Whether forward and backward are looked at apart."""
     spacing: Spacing = Spacing.EVEN
     bins: int = 72
+    """At most; fewer where there are not `POINTS_PER_BIN` points for each."""
 
     @property
     def label(self) -> str:
@@ -62,11 +69,12 @@ class Coordinate:
     def edges(self) -> FloatArray:
         """Of the bins, shape (b + 1,), rising; two equal ones where there is but one value."""
         low, high = float(np.min(self.values)), float(np.max(self.values))
+        bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
         if self.spacing is Spacing.FILLED:
-            return np.asarray(np.unique(np.quantile(self.values, np.linspace(0.0, 1.0, self.bins + 1))))
+            return np.asarray(np.unique(np.quantile(self.values, np.linspace(0.0, 1.0, bins + 1))))
         if self.spacing is Spacing.LOGARITHMIC and low > 0.0:
-            return np.geomspace(low, high, self.bins + 1)
-        return np.linspace(low, high, self.bins + 1)
+            return np.geomspace(low, high, bins + 1)
+        return np.linspace(low, high, bins + 1)
 
     def numbers(self) -> IntArray:
         """The bin of each point, shape (m,)."""
@@ -87,13 +95,18 @@ class Bins:
     count: IntArray
 
 
-def binned(coordinate: Coordinate, y: FloatArray, rows: BoolArray | None = None) -> Bins:
-    """Means of y over a coordinate; of the chosen ``rows`` only, where given."""
+def binned(
+    coordinate: Coordinate, y: FloatArray, rows: BoolArray | None = None, least: int = LEAST_IN_BIN
+) -> Bins:
+    """Means of y over a coordinate; of the chosen ``rows`` only, where given.
+
+    Bins of fewer than ``least`` points are left out.
+    """
     number, x = coordinate.numbers(), coordinate.values
     if rows is not None:
         number, x, y = number[rows], x[rows], y[rows]
     count = np.bincount(number)
-    kept = np.flatnonzero(count >= LEAST_IN_BIN)
+    kept = np.flatnonzero(count >= least)
 
     def mean(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(number, values, len(count))[kept] / count[kept])
@@ -178,7 +191,7 @@ def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
         if values is not None:
             spacing = Spacing.EVEN if name == "temperature" else Spacing.FILLED
             found.append(Coordinate(name, unit, values[rows], spacing=spacing, bins=40))
-    return {each.name: each for each in found if float(np.ptp(each.values)) > 0.0}
+    return {each.name: each for each in found if _varies(each.values)}
 
 
 def since_reversal(motion: Motion) -> tuple[FloatArray, FloatArray]:
@@ -197,6 +210,10 @@ def since_change_s(motion: Motion) -> FloatArray:
     change = np.flatnonzero(np.diff(np.sign(speed), prepend=np.nan) != 0.0)
     last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
     return np.asarray(time - time[last])
+
+
+def _varies(values: FloatArray) -> bool:
+    return bool(np.ptp(values) > SAME * np.max(np.abs(values)) + NOTHING)
 
 
 def _time(motion: Motion) -> FloatArray:

@@ -41,15 +41,15 @@ def portrait_chart(portrait: Portrait) -> Chart:
     home, residual, own = portrait.coordinate, portrait.residual_arcsec, portrait.own_arcsec
     rows = portrait.rows
     series = [_cloud("readings", home.values[rows], residual[rows], CLOUD)]
-    ways = _ways(portrait.forward) if home.both_ways else [("", BLUE, rows)]
+    ways = _ways(portrait.forward, rows) if home.both_ways else [("", BLUE, rows)]
     for way, colour, chosen in ways:
-        means = binned(home, residual, rows & chosen)
+        means = binned(home, residual, chosen)
         name = f"mean, {way}" if way else "mean"
         series.append(Series(name, means.place, means.mean, Mark.POINTS, spread=means.spread, colour=colour))
     if own is not None:
         fine = replace(home, bins=FINER * home.bins)
         for way, colour, chosen in ways:
-            curve = binned(fine, own, rows & chosen)
+            curve = binned(fine, own, chosen, least=1)
             name = f"the finding, {way}" if way else "the finding"
             series.append(Series(name, curve.place, curve.mean, colour=colour if way else ORANGE))
     shown = residual[rows] if own is None else np.concatenate([residual[rows], own[rows]])
@@ -83,6 +83,8 @@ def residual_charts(seen: Seen) -> Iterator[Chart]:
     """Over each coordinate the model as it was given and the extended one, all to one scale."""
     reach = _reach(seen.given_arcsec)
     shares = seen.shares()
+    forward = seen.direction > 0.0
+    everywhere = np.ones_like(forward)
     for name, _ in sorted(shares.items(), key=lambda each: -each[1][0]):
         home = seen.coordinates[name]
         few_turns = name == "position" and float(np.ptp(home.values)) < MORE_TURNS_DEG
@@ -93,7 +95,7 @@ def residual_charts(seen: Seen) -> Iterator[Chart]:
             ("as given", ORANGE, seen.given_arcsec),
             ("extended", BLUE, seen.left_arcsec),
         ):
-            ways = _ways(seen.direction > 0.0) if home.both_ways else [("", colour, None)]
+            ways = _ways(forward, everywhere) if home.both_ways else [("", colour, everywhere)]
             for way, _, chosen in ways:
                 means = binned(home, values, chosen)
                 series.append(
@@ -114,7 +116,7 @@ def residual_charts(seen: Seen) -> Iterator[Chart]:
             y_range=reach,
             x_log=home.spacing is Spacing.LOGARITHMIC,
         )
-    groups = {way: seen.given_arcsec[rows] for way, _, rows in _ways(seen.direction > 0.0) if np.any(rows)}
+    groups = {way: seen.given_arcsec[rows] for way, _, rows in _ways(forward, everywhere)}
     yield histogram("By direction: how often which, as given", R_LABEL, groups, bins=40, height_px=230)
 
 
@@ -126,10 +128,10 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
     length = min(CLOSER_POINTS, len(whole))
     gained = np.concatenate([[0.0], np.cumsum(given - left)])
     first = int(np.argmax(gained[length:] - gained[:-length]))
-    for caption, rows in (
-        ("The whole record", whole),
-        ("Closer: where the extended model gains most", whole[first : first + length]),
-    ):
+    stretches = [("The whole record", whole)]
+    if length < len(whole):
+        stretches.append(("Closer: where the extended model gains most", whole[first : first + length]))
+    for caption, rows in stretches:
         time = traces.time_s[rows]
         gap = np.diff(time, prepend=time[0]) > PAUSE_STEPS * float(np.median(np.diff(time)))
         lines = [
@@ -142,8 +144,10 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
         dots = Series(
             "measured", *sampled(time, traces.measured_arcsec[rows], LINE_POINTS), Mark.POINTS, colour=GREEN
         )
-        closer = len(time) <= CLOSER_POINTS
-        yield Chart(caption, "time, s", E_LABEL, [*lines, dots] if closer else [dots, *lines], height_px=280)
+        dots_on_top = len(time) <= CLOSER_POINTS
+        yield Chart(
+            caption, "time, s", E_LABEL, [*lines, dots] if dots_on_top else [dots, *lines], height_px=280
+        )
 
 
 def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
@@ -154,8 +158,10 @@ def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
     return Series(label, x, y, Mark.FAINT)
 
 
-def _ways(forward: BoolArray) -> list[tuple[str, int, BoolArray]]:
-    return [(FORWARD, BLUE, forward), (BACKWARD, ORANGE, ~forward)]
+def _ways(forward: BoolArray, rows: BoolArray) -> list[tuple[str, int, BoolArray]]:
+    """Name, colour and points of each direction that there is."""
+    both = ((FORWARD, BLUE, rows & forward), (BACKWARD, ORANGE, rows & ~forward))
+    return [each for each in both if np.any(each[2])]
 
 
 def _reach(values: FloatArray) -> tuple[float, float]:
