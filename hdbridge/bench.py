@@ -252,18 +252,21 @@ class Bench:
 
     def _await_channels(self, feedback: Feedback) -> Feedback:
         """Stand until every channel of the axis file has told something."""
-        channels = self._image.channels
-        while any(each.value is None and not each.lost for each in channels):
+        image, period_s = self._image, self.cycle.period_s
+        rarest = max((each.every_cycles for each in image.axis.channels.values()), default=0)
+        for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s) + 2 * rarest):
+            waiting = [each for each in image.channels if each.value is None]
+            if not waiting:
+                return feedback
+            if waiting[0].lost:
+                break
             feedback = self.cycle.tick()
-        silent = [each.key for each in channels if each.lost]
-        if silent:
-            self._image.power.go(State.SWITCH_ON_DISABLED)
-            self._rest()
-            raise DriveError(
-                f"{self._image.axis.where(silent[0])}: no reading came that can be believed "
-                f"({self.supervision.events[-1].detail}); check the sensor, or leave the key out"
-            )
-        return feedback
+        image.power.go(State.SWITCH_ON_DISABLED)
+        self._rest()
+        raise DriveError(
+            f"{image.axis.where(waiting[0].key)}: no reading came that can be believed ({waiting[0].why}); "
+            "check the sensor, or leave the key out"
+        )
 
     def _walk(
         self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]

@@ -29,7 +29,7 @@ class ChannelFollower:
 
     __slots__ = (
         "_age", "_at_zero", "_every", "_greatest", "_hold", "_least", "_overdue", "_per_count", "_unit",
-        "_why", "key", "lost", "value",
+        "key", "lost", "value", "why",
     )  # fmt: skip
 
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
@@ -52,8 +52,9 @@ class ChannelFollower:
         """The last good reading in the unit of the channel; None before the first, and while it is lost."""
         self.lost = False
         """None has come for so long that none is waited for."""
+        self.why = "none came"
+        """What there is to say about the value, where there is none or it is an old one."""
         self._age = 0
-        self._why = ""
 
     def accept(self, counts: int) -> None:
         """A reading has come."""
@@ -62,9 +63,9 @@ class ChannelFollower:
             self.value = value
             self.lost = False
             self._age = 0
-            self._why = ""
+            self.why = "none came"
         else:
-            self._why = (
+            self.why = (
                 f"{value:g} {self._unit} is not within {self._least:g} to {self._greatest:g} {self._unit}"
             )
 
@@ -77,7 +78,7 @@ class ChannelFollower:
         self._age = age + 1
         if age < self._overdue or self.lost:
             return None
-        text = f"{self.key}: {self._why or 'none came'}"
+        text = f"{self.key}: {self.why}"
         if age > self._hold:
             self.value = None
             self.lost = True

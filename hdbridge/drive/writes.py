@@ -197,6 +197,8 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
     """
     node_id, number, can_id, codec, every = layout
     field = next(filter(None, fields), "")
+    of_channel = communication == objects.TPDO_COMMUNICATION and number > 2
+    often = f"{field.split('.')[0]}.every_cycles" if of_channel else ""
     communication += number - 1
     mapping += number - 1
     name = f"{'TPDO' if communication >= objects.TPDO_COMMUNICATION else 'RPDO'}{number}"
@@ -211,7 +213,7 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
         )
     yield PlannedWrite(node_id, mapping, 0, count, f"{name} maps {count} objects", field, byte), False
     when = "every SYNC" if every == SYNCHRONOUS else f"every SYNC in {every}"
-    yield PlannedWrite(node_id, communication, 2, every, f"{name} goes with {when}", field, byte), False
+    yield PlannedWrite(node_id, communication, 2, every, f"{name} goes with {when}", often, byte), False
     yield (
         PlannedWrite(
             node_id,

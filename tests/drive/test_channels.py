@@ -60,6 +60,7 @@ def test_the_plan_maps_them_and_says_which_key_decides(build_axis: Build) -> Non
     assert (rows[0x1A02, 1].value, rows[0x1A02, 1].field) == (0x2101_0020, "load_torque.source")
     assert (rows[0x1A03, 1].value, rows[0x1A03, 1].field) == (0x2100_0010, "temperature.source")
     assert (rows[0x1802, 2].value, rows[0x1803, 2].value) == (1, 25)
+    assert rows[0x1803, 2].field == "temperature.every_cycles"
     assert (rows[0x1802, 1].value, rows[0x1803, 1].value) == (0x381, 0x481)
 
 
