@@ -14,6 +14,7 @@ from hdbridge.bench import Bench, axis_view
 from hdbridge.calibration.journal import Journal
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.files.atomic import make_folder
 from hdbridge.procedures.plan import Plan, Task
 from hdbridge.procedures.rehearsal import rehearse
 
@@ -115,6 +116,7 @@ def measure(
     left = outlook(journal.plan, drive.axis, journal.done)
     if not left.tasks:
         return
+    make_folder(journal.folder)  # a disk that cannot be written is noticed before the axis moves
     pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
     bench = Bench(drive, interrupted=pace.interrupted)
     journal.begin_session()

@@ -128,14 +128,14 @@ def run_comparison(
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
         with progress_bar() as bar:
-            bars = {
-                each: bar.add_task(f"{each.value:>12}", total=1.0, start=False, visible=False)
-                for each in wanted
-            }
+            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
+
+            begun: set[Scheme] = set()
 
             def show(scheme: Scheme, share: float) -> None:
-                if not bar.tasks[bars[scheme]].started:
-                    bar.start_task(bars[scheme])
+                if scheme not in begun:
+                    begun.add(scheme)
+                    bar.reset(bars[scheme])  # its time begins now
                     for each in bars.values():  # none is shown of a test that is refused
                         bar.update(each, visible=True)
                 bar.update(bars[scheme], completed=share)

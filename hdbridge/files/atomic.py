@@ -21,12 +21,16 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
     target = Path(path).resolve()  # through a link, or the rename would replace the link
     try:
         with _temporary(target) as descriptor:
-            os.ftruncate(descriptor, 0)
-            written = 0
-            while written < len(data):
-                written += os.write(descriptor, data[written:])
-            os.fsync(descriptor)
-            _temporary_name(target).rename(target)
+            try:
+                os.ftruncate(descriptor, 0)
+                written = 0
+                while written < len(data):
+                    written += os.write(descriptor, data[written:])
+                os.fsync(descriptor)
+                _temporary_name(target).rename(target)
+            except OSError:  # a full disk needs its space back
+                _temporary_name(target).unlink(missing_ok=True)
+                raise
         folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)

@@ -1,0 +1,26 @@
+"""A disk that is full: the old file stands, and nothing that fills the disk is left."""
+
+import subprocess
+import sys
+
+SCRIPT = """
+import resource, sys
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # a file cannot grow beyond this: stands for a full disk
+try:
+    write_atomically(sys.argv[1], "new" * 1000)
+except InputError as error:
+    print(error)
+"""
+
+
+def test_the_old_file_stands_and_no_part_of_the_new_one_remains(tmp_path):
+    path = tmp_path / "model.yaml"
+    path.write_text("old")
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(path)], capture_output=True, text=True, check=True
+    )
+    assert "model.yaml: cannot be written" in done.stdout
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
