@@ -11,7 +11,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
-from hdbridge.effects import AmplitudeDrift, Compliance
+from hdbridge.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.errors import DriveError, InputError, SdoError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import Dwell, MoveTo
@@ -54,10 +54,11 @@ def compliance(**changes) -> Compliance:
 
 
 @contextmanager
-def loaded(axis: AxisConfig, more: str = ""):
+def loaded(axis: AxisConfig, more: str = "", gear: str = ""):
     """The article's axis with a mass on it, booted: its drive and its node."""
     place, mass = MASS
     text = (PROFILE / "truth.yaml").read_text().replace(place, mass + place) + more
+    text = text.replace("gear:\n", "gear:\n" + gear)
     with (
         simulated_bench(Truth.from_text(text), axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
         Drive(bus, axis, clock) as drive,
@@ -119,6 +120,22 @@ def test_with_the_load_torque_a_mass_on_the_axis_is_made_up_for():
     # 33 steps each way are few for a standard deviation: the limit of 1.15 is for 240.
     assert three_sigma[3] < 1.3 * floor
     assert abs(mean[3]) < 1
+
+
+def test_with_the_load_torque_a_ripple_that_grows_with_it_is_made_up_for():
+    axis = axis_with()
+    growth = TorqueModulation.candidate(50.0, model_with().effects).model_copy(
+        update={"growth_percent_per_nm": 5.0, "limit_nm": 12.0}
+    )
+    stepping = Stepping(count=33, start_deg=60.0)  # where the mass hangs out: 6 to 7 Nm
+    three_sigma = []
+    for model in (model_with(compliance()), model_with(compliance(), growth)):
+        with loaded(axis, gear="  torque_growth_per_nm: 0.05\n") as (drive, _):
+            run = Bench(drive, compensation_for(axis, model)).run(stepping)
+        three_sigma.append(SchemeResult.of(run.outcome).pooled.three_sigma_arcsec)
+    floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+    assert three_sigma[0] > 3 * floor  # a third more ripple
+    assert three_sigma[1] < 1.3 * floor
 
 
 def test_with_the_temperature_a_warm_gear_is_made_up_for():
