@@ -35,6 +35,7 @@ OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 MINIMUM_SAMPLES: Final = 2
+_DEG_PER_RAD: Final = float(np.degrees(1.0))
 
 WRONG_RATIO: Final = 0.003
 """A ratio this far off, relatively, is another gear's; the closest pair of common ones is 0.6 % apart."""
@@ -186,7 +187,7 @@ class Record:
             cure = "turn the direction of one encoder round"
         else:
             found = f"the motor makes {1 / slope:.5g} turns per turn of the load"
-            cure = "correct the ratio, or the counts per turn of an encoder"
+            cure = _cure(slope * ratio, ratio)
         name = f"{self.source}: " if self.source else ""
         over = f"measured over {travel_deg:.3g} deg of the load"
         raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
@@ -247,6 +248,18 @@ def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
             end_s = float(record.time_s[-1]) + shift_s
         shifts.append(shift_s)
     return tuple(shifts)
+
+
+def _cure(times: float, ratio: float) -> str:
+    """What may be wrong where the load goes so many times as far as the ratio says."""
+    usual = {
+        1.0 / _DEG_PER_RAD: "the load's angle is in radians: convert it to degrees",
+        _DEG_PER_RAD: "the motor's angle is in radians: convert it to degrees",
+        ratio**2: "the columns of motor and load are exchanged",
+        ratio: "the motor's angle is told at the gear's output: multiply it by the ratio",
+    }
+    near = [cure for value, cure in usual.items() if abs(times / value - 1.0) < WRONG_RATIO]
+    return near[0] if near else "correct the ratio, or the counts per turn of an encoder"
 
 
 def _frozen(column: Any) -> Column:

@@ -17,6 +17,7 @@ from hdbridge.diagnose.planned import plan_report
 from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
+from hdbridge.foreign import check_records
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.recording import Recording
@@ -79,6 +80,11 @@ def run(
             f"{records[0]}: recorded with ratio {recording.ratio:g}, {model} has {known.ratio:g}; use the "
             "model of this gear"
         )
+    parts = recording.record.parts()
+    whole = len(parts) == len(records)
+    check_records(
+        dict(zip(records, parts, strict=True)) if whole else {records[0]: recording.record}, known.ratio
+    )
     result = diagnose(
         recording.record,
         known,

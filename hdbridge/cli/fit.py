@@ -13,6 +13,7 @@ from hdbridge.calibration import conclude
 from hdbridge.cli.findings import print_calibration, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
 from hdbridge.errors import InputError
+from hdbridge.foreign import check_records
 from hdbridge.model import TransmissionModel
 from hdbridge.recording import Recording
 
@@ -58,8 +59,7 @@ def command(
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
     recordings = {each: Recording.load(each) for each in records}
     known = _ratio(ratio, config, recordings)
-    for each in recordings.values():
-        each.record.check_ratio(known)
+    check_records({path: each.record for path, each in recordings.items()}, known)
     compared = TransmissionModel.load(active) if active else None
     if compared and config:
         compared.check_ratio(config)

@@ -97,7 +97,8 @@ def _wrong(text: str) -> InputError:
 def _content(path: Path) -> bytes:
     """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
     try:
-        content = path.read_bytes()
+        with path.open("rb") as plain:
+            content = plain.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         raise _wrong(f"{path}: no such file") from None
     except OSError as problem:
@@ -176,8 +177,10 @@ def _slow(path: Path, reader: Any, names: Sequence[str], finite: Collection[str]
     lines: list[int] = []
     for row in _rows(path, reader):
         if len(row) != len(names):
+            hint = "; decimal commas? write 0.5, not 0,5" if len(row) == 2 * len(names) else ""
             raise _wrong(
-                f"{path}:{reader.line_num}: {len(row)} values; expected {len(names)}, one for each column"
+                f"{path}:{reader.line_num}: {len(row)} values; expected {len(names)}, one for each "
+                f"column{hint}"
             )
         rows.append(row)
         lines.append(reader.line_num)

@@ -1,0 +1,70 @@
+"""What goes wrong with records of other benches, refused in words before anything is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects import FloatArray
+from hdbridge.errors import InputError
+from hdbridge.files.csvfile import line_of_row
+from hdbridge.record import Record
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+WRAPPED_SHARE = 0.05
+"""How near a whole number of turns a jump is when it is an angle that began anew."""
+LEAST_JUMP_DEG = 900.0 / ARCSEC_PER_DEG
+"""No gear's error jumps by as much."""
+
+
+def check_records(records: Mapping[Path, Record], ratio: float) -> None:
+    """Refuse (InputError) records that no axis of this ratio can have made, or that say nothing of one.
+
+    Time has to pass, angles have to be multi-turn, the ratio has to be the gear's, and in one of the records
+    the motor has to move. Each record is named by its path.
+    """
+    for path, record in records.items():
+        if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
+            raise InputError(
+                f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected time that passes"
+            )
+        _check_wrapped(path, record, ratio)
+        record.check_ratio(ratio)
+    counts = sum(len(each) for each in records.values())
+    if counts and not any(_moves(each) for each in records.values()):
+        raise InputError(
+            f"{', '.join(map(str, records))}: the motor never moves in {counts} samples; expected a move: "
+            "record sweeps in both directions"
+        )
+
+
+def _moves(record: Record) -> bool:
+    return len(record) > 1 and float(np.ptp(record.motor_position_deg)) > 0.0
+
+
+def _check_wrapped(path: Path, record: Record, ratio: float) -> None:
+    """Refuse an angle that jumps by a turn of its encoder from one sample to the next."""
+    slip = np.diff(record.load_position_deg) - np.diff(record.motor_position_deg) / ratio
+    for name, turn_deg in (("load_position_deg", DEG_PER_TURN), ("motor_position_deg", DEG_PER_TURN / ratio)):
+        angle = record.columns[name]
+        rows = _wraps(slip, turn_deg)
+        rows = rows[np.abs(np.diff(angle)[rows]) > 0.5 * DEG_PER_TURN]
+        if len(rows):
+            row = int(rows[0]) + 1
+            where = f"{path}:{line_of_row(path, row)}" if path.is_file() else f"{path}"
+            raise InputError(
+                f"{where}: {name}: {angle[row]:g} after {angle[row - 1]:g}, a jump of a whole turn that the "
+                f"other angle does not make; expected multi-turn angles: unwrap the column "
+                f"({len(rows)} such jumps)"
+            )
+
+
+def _wraps(slip_deg: FloatArray, turn_deg: float) -> NDArray[np.intp]:
+    """The steps that are off by a turn, or several, of an encoder; no gear's error is as large."""
+    turns = slip_deg / turn_deg
+    whole = np.round(turns)
+    near = (whole != 0.0) & (np.abs(turns - whole) < WRAPPED_SHARE * np.abs(whole))
+    return np.flatnonzero(near & (np.abs(slip_deg) > LEAST_JUMP_DEG))
