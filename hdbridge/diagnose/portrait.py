@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose.result import Finding, Traces
+from hdbridge.diagnose.result import Diagnosis, Finding, Traces
 from hdbridge.diagnose.seeing import BoolArray, Coordinate, Spacing, coordinates
 from hdbridge.effects import (
     AmplitudeDrift,
@@ -22,6 +22,7 @@ from hdbridge.effects import (
     FloatArray,
     Hysteresis,
     HysteresisMemory,
+    HysteresisParameters,
     MotorOrder,
     MotorOrders,
     RateDependence,
@@ -29,7 +30,9 @@ from hdbridge.effects import (
     TorqueModulation,
     Vibration,
     Wear,
+    loop_of,
 )
+from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 HOMES: Final[Mapping[str, str]] = {
@@ -87,25 +90,34 @@ class Portrait:
     strength: Strength | None = None
 
 
-def portrait(finding: Finding, traces: Traces, ratio: float) -> Portrait:
-    """Draw one finding; ``ratio`` is the gear's."""
-    own = contribution(finding, traces)
+def portrait(finding: Finding, diagnosis: Diagnosis) -> Portrait:
+    """Draw one finding of a diagnosis."""
+    traces = diagnosis.traces
+    effect = _in_model(finding, diagnosis.model)
+    own = None if effect is None else _does(effect, traces)
     left = traces.measured_arcsec - traces.extended_arcsec
-    home = _home(finding, traces, ratio)
+    home = _home(finding, traces, diagnosis.model.ratio)
     rows = np.ones(len(left), dtype=np.bool_)
     resting = traces.speed_deg_s == 0.0
     if finding.cause == "creep" and np.count_nonzero(resting) >= LEAST_RESTING:
         rows = resting
     residual = left if own is None else left + own
     forward = traces.direction > 0.0
-    return Portrait(home, residual, own, rows, forward, _strength(finding, traces, home, residual, own))
+    strength = _strength(effect, traces, home, residual, own)
+    return Portrait(home, residual, own, rows, forward, strength)
 
 
-def contribution(finding: Finding, traces: Traces) -> FloatArray | None:
-    """What a finding does at the points of the traces, arcsec, shape (m,); None where it has no law."""
+def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
+    """The finding's effect as the extended model has it, so that picture and model are of one fit."""
     effect = effect_of(finding)
-    if effect is None:
-        return None
+    if isinstance(effect, HysteresisParameters):
+        now = loop_of(model.effects)
+        return effect.model_copy(update=now.model_dump(exclude={"memory"}))
+    return next((each for each in model.effects if type(each) is type(effect)), effect)
+
+
+def _does(effect: Effect, traces: Traces) -> FloatArray:
+    """What an effect does at the points of the traces, arcsec, shape (m,)."""
     does = effect.predict(traces.motion, traces.start)
     if isinstance(effect, HysteresisMemory):  # it stands in the place of the law without memory
         does = does - Hysteresis(**effect.parameters()).predict(traces.motion, traces.start)
@@ -188,9 +200,9 @@ def _own_coordinate(effect: Effect | None, traces: Traces, ratio: float) -> Coor
 
 
 def _strength(
-    finding: Finding, traces: Traces, home: Coordinate, residual: FloatArray, own: FloatArray | None
+    effect: Effect | None, traces: Traces, home: Coordinate, residual: FloatArray, own: FloatArray | None
 ) -> Strength | None:
-    scaled = _scaled(finding.effect, traces)
+    scaled = _scaled(effect, traces)
     if scaled is None or own is None:
         return None
     words, part = scaled

@@ -154,7 +154,7 @@ def _found(diagnosis: Diagnosis) -> Section:
 
 def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     title = _title(finding.cause)
-    drawn = portrait(finding, diagnosis.traces, diagnosis.model.ratio)
+    drawn = portrait(finding, diagnosis)
     blocks: list[Block] = [portrait_chart(drawn)]
     if finding.parameters:
         blocks.append(_parameters(finding))

@@ -22,6 +22,7 @@ from hdbridge.effects import (
     Step,
     Synchronous,
     Vibration,
+    extended,
 )
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
@@ -103,6 +104,9 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
     )
     measured = model + own + noise * rng.normal(size=len(driven))
     direction = direction_of(driven)
+    effects = MODEL.effects
+    for each in findings:
+        effects = effects if each.effect is None else extended(effects, each.effect)
     return Diagnosis(
         baseline=Figures(3.1, 9.3),
         refitted=Figures(2.9, 8.7),
@@ -115,7 +119,7 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
         },
         by_kind={"standing": (Figures(2.0, 6.0), Figures(0.4, 1.2)), "forward": (Figures(3.0, 9.0),) * 2},
         remarks=("no command (motor_target_deg)",),
-        model=MODEL,
+        model=TransmissionModel(RATIO, effects),
         traces=Traces(
             driven.time_s,
             driven.motor_deg,
@@ -350,3 +354,14 @@ def test_a_page_of_the_longest_traces_stays_small():
     found = [finding(), finding("backlash"), finding("count_loss"), finding("subdivisional_error")]
     text = render(diagnosis_page(diagnosis(*found, driven=motion(50_000)), title="long"))
     assert len(text) < 1_500_000
+
+
+def test_the_picture_of_a_changed_loop_is_of_the_loop_that_the_model_has():
+    """A finding may come from a fit with more freedom than the model has; the picture must not repeat it."""
+    told = CATALOGUE["hysteresis_parameters"].candidate(RATIO, MODEL.effects)
+    boasted = told.model_copy(update={"offset_arcsec": told.base.offset_arcsec + 100.0})
+    honest = diagnosis(finding("hysteresis_parameters", effect=told))
+    loud = dataclasses.replace(honest, findings=(finding("hysteresis_parameters", effect=boasted),))
+    drawn = [charts(render(diagnosis_page(each, title="t"))) for each in (honest, loud)]
+    caption = "Residual without it, over the motor angle since the last reversal"
+    assert drawn[0][caption]["series"] == drawn[1][caption]["series"]
