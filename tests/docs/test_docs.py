@@ -1,0 +1,92 @@
+"""What the documents promise: links that lead somewhere, commands that exist, examples that run."""
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+COMMANDS = runpy.run_path(str(ROOT / "tools" / "command_reference.py"))
+API_EXAMPLES = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.DOTALL
+)
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def anchors(page: Path) -> set[str]:
+    """The names that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+def command_lines(page: Path) -> list[str]:
+    """Lines of code blocks that call hdbridge, continued lines joined."""
+    text = re.sub(r"\\\n\s*", " ", page.read_text(encoding="utf-8"))
+    fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    code = [*"\n".join(fenced).splitlines(), *re.findall(r"^    .*$", text, re.MULTILINE)]
+    found = (re.match(r"\s*(?:\$ )?(?:\.venv/bin/)?(hdbridge [a-z-].*)", each) for each in code)
+    return [each[1] for each in found if each]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    lost = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            lost.append(link)
+    assert lost == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_on_the_pages_exist_with_their_options(page):
+    wrong = [COMMANDS["refused"](line) for line in command_lines(page)]
+    assert [each for each in wrong if each] == []
+
+
+def test_the_check_of_command_lines_finds_what_is_wrong():
+    refused = COMMANDS["refused"]
+    assert refused("hdbridge step my-axis --simulate --count 60   # with a remark") is None
+    assert refused("hdbridge model activate my-axis 3 --reason summer") is None
+    assert "no option --cuont" in refused("hdbridge step my-axis --cuont 60")
+    assert "no value" in refused("hdbridge step my-axis --count")
+    assert "missing" in refused("hdbridge step --simulate")
+    assert "too many" in refused("hdbridge step one two")
+    assert "no command" in refused("hdbridge stpe one")
+
+
+def test_the_reference_of_commands_is_up_to_date():
+    page = COMMANDS["PAGE"].read_text(encoding="utf-8")
+    assert page == COMMANDS["page"](), "run python tools/command_reference.py"
+
+
+def test_every_command_stands_under_a_heading_and_every_option_says_what_it_does():
+    page = COMMANDS["page"]()
+    for command in COMMANDS["commands"]():
+        assert f"### `{command.usage}`" in page
+        assert [each.names[0] for each in command.parameters if each.is_option and not each.help] == []
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    linked = set(re.findall(r"\]\(([\w-]+\.md)\)", index))
+    assert {each.name for each in (ROOT / "docs").glob("*.md")} - {"README.md"} == linked
+
+
+@pytest.mark.parametrize("number", range(len(API_EXAMPLES)))
+def test_examples_of_the_library_run(number, tmp_path, monkeypatch, capsys):
+    """Each example is a program of its own; what it prints, where it says so, stands behind `# ->`."""
+    monkeypatch.chdir(tmp_path)
+    program = API_EXAMPLES[number]
+    exec(compile(program, f"docs/api.md, example {number + 1}", "exec"), {"__name__": "__main__"})
+    promised = re.findall(r"# -> (.*)$", program, re.MULTILINE)
+    assert capsys.readouterr().out.splitlines() == promised

@@ -1,0 +1,227 @@
+"""Write docs/commands.md from the command line itself; `--check` only compares.
+
+python tools/command_reference.py
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any
+
+from typer.models import ArgumentInfo, OptionInfo
+
+from hdbridge.cli import PANELS, app
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "commands.md"
+
+_INTRODUCTION = """# Commands
+
+Made from the command line by `python tools/command_reference.py`; a test compares them. `hdbridge COMMAND
+--help` says the same. What the commands read and write: [files](files.md).
+
+**PROFILE** is the folder of an axis (`axis.yaml` and what belongs to it), an axis file, or the name of a
+bundled profile: `article`, `demo`. Tables and results go to standard output, progress and remarks to the
+standard error. `--json FILE` writes the result for machines. Whether results can be written is checked before
+anything moves.
+
+**Ctrl-C** (and SIGTERM) lets the control cycle end its period and stops the axis; what was measured is kept.
+The third one ends the program at once.
+
+| exit status | |
+|---|---|
+| 0 | done |
+| 1 | an error in hdbridge itself |
+| 2 | bad input: a file, option or value; nothing was written, nothing moved |
+| 3 | the bus: cannot be opened, or went away |
+| 4 | the drive: absent, refuses, not the one expected, reports a fault |
+| 5 | the supervision stopped the axis while it moved |
+| 130 | Ctrl-C: the axis was stopped, the record kept |
+"""
+
+_VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "FILE"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An argument or option of a command."""
+
+    names: tuple[str, ...]
+    """Of an option: its names with dashes; of an argument: what stands for it."""
+    value: str
+    """What stands for its value; empty for a switch."""
+    help: str
+    default: str
+    is_option: bool
+    required: bool
+    many: bool
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command as a person types it."""
+
+    name: str
+    text: str
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def usage(self) -> str:
+        """The line that begins its section."""
+        words = ["hdbridge", self.name]
+        for each in self.parameters:
+            if not each.is_option:
+                word = each.names[0] + ("..." if each.many else "")
+                words.append(word if each.required else f"[{word}]")
+        return " ".join(words)
+
+
+def commands() -> Iterator[Command]:
+    """All commands, those of groups with the group's name before them, in the order of the overview."""
+    groups = {group.name: group.typer_instance for group in app.registered_groups}
+    for registered in app.registered_commands:
+        yield _command("", registered)
+    for name, group in groups.items():
+        assert group is not None
+        for registered in group.registered_commands:
+            yield _command(f"{name} ", registered)
+
+
+def page() -> str:
+    """The whole page."""
+    known = list(commands())
+    parts = [_INTRODUCTION]
+    for panel, modules in PANELS.items():
+        parts.append(f"## {panel}\n")
+        names = [module.__name__.rpartition(".")[2] for module in modules]
+        for name in names:
+            parts += (_section(each) for each in known if each.name.split()[0] == name)
+    return "\n".join(parts)
+
+
+def _section(command: Command) -> str:
+    lines = [f"### `{command.usage}`", "", command.text, ""]
+    if command.parameters:
+        lines += ["| | default | |", "|---|---|---|"]
+    for each in command.parameters:
+        name = ", ".join(f"`{name}{f' {each.value}' if each.value else ''}`" for name in each.names)
+        lines.append(f"| {name.replace('|', chr(92) + '|')} | {each.default} | {each.help} |")
+    return "\n".join(lines) + ("\n" if command.parameters else "")
+
+
+def _command(prefix: str, registered: Any) -> Command:
+    function: Callable[..., Any] = registered.callback
+    hints = typing.get_type_hints(function, include_extras=True)
+    parameters = tuple(
+        _parameter(name, hints[name], each.default)
+        for name, each in inspect.signature(function).parameters.items()
+    )
+    # Arguments first, as they are typed.
+    ordered = sorted(parameters, key=lambda each: each.is_option)
+    text = inspect.cleandoc(function.__doc__ or "")
+    return Command(prefix + (registered.name or function.__name__), text, tuple(ordered))
+
+
+def _parameter(name: str, hint: Any, default: Any) -> Parameter:
+    kind, info = typing.get_args(hint)[:2]
+    kind, many = _plain(kind)
+    required = default is inspect.Parameter.empty
+    shown = "" if required or default is None or default is False else f"`{_text(default)}`"
+    if isinstance(info, ArgumentInfo):
+        label = (info.metavar or name.upper()).removesuffix("...")
+        return Parameter((label,), "", info.help or "", shown, False, required, many)
+    assert isinstance(info, OptionInfo)
+    # In an Annotated hint the first name stands where else a default would.
+    declared = (*((info.default,) if isinstance(info.default, str) else ()), *(info.param_decls or ()))
+    names = tuple(part for each in declared for part in each.split("/"))
+    if not names:
+        names = (f"--{name.replace('_', '-')}",)
+        names += (f"--no-{name.replace('_', '-')}",) if kind is bool else ()
+    value = "" if kind is bool else info.metavar or _value(kind)
+    shown = "" if kind is bool else shown
+    if kind is bool and default is True:
+        shown = f"`{names[0]}`"
+    return Parameter(names, value, (info.help or "") + _range(info), shown, True, required, many)
+
+
+def _plain(kind: Any) -> tuple[Any, bool]:
+    """The type without "or nothing" and without "a list of"; whether it may stand several times."""
+    if isinstance(kind, UnionType) or typing.get_origin(kind) is typing.Union:
+        (kind,) = (each for each in typing.get_args(kind) if each is not NoneType)
+    if typing.get_origin(kind) is list:
+        return typing.get_args(kind)[0], True
+    return kind, False
+
+
+def _value(kind: Any) -> str:
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return "|".join(str(each.value) for each in kind)
+    return _VALUES[kind]
+
+
+def _range(info: OptionInfo) -> str:
+    low, high = info.min, info.max
+    if low is None and high is None:
+        return ""
+    if high is None:
+        return f" At least {low:,.10g}."
+    return f" {low:,.10g} to {high:,.10g}."
+
+
+def _text(default: Any) -> str:
+    return f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def refused(line: str) -> str | None:
+    """Why a command line as docs print it is not one of hdbridge; None if it is.
+
+    Values may be placeholders; of an option only whether it exists and takes a value is looked at.
+    """
+    words = re.sub(r"\s+(#|>|&|\|).*$", "", line.strip()).split()[1:]
+    known = {each.name: each for each in commands()}
+    name = next((text for text in (" ".join(words[:2]), words[0] if words else "") if text in known), None)
+    if name is None:
+        return None if words and words[0] in {"--version", "--help"} else f"no command: {line}"
+    command = known[name]
+    options = {name: each for each in command.parameters if each.is_option for name in each.names}
+    rest, given = words[len(name.split()) :], 0
+    while rest:
+        word = rest.pop(0)
+        if word in {"--help", "-h"}:
+            return None
+        if not word.startswith("-"):
+            given += 1
+        elif word not in options:
+            return f"no option {word}: {line}"
+        elif options[word].value:
+            if not rest:
+                return f"no value for {word}: {line}"
+            rest.pop(0)
+    arguments = [each for each in command.parameters if not each.is_option]
+    if given < sum(each.required for each in arguments):
+        return f"an argument is missing: {line}"
+    if given > len(arguments) and not any(each.many for each in arguments):
+        return f"too many arguments: {line}"
+    return None
+
+
+def main(arguments: list[str]) -> int:
+    """Rewrite, or check with ``--check``."""
+    new = page()
+    if "--check" in arguments:
+        same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == new
+        print("up to date" if same else f"{PAGE} lags behind: run python tools/command_reference.py")
+        return int(not same)
+    PAGE.write_text(new, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
