@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half
 from hdbridge.identify.joint import Solution, is_valid
 from hdbridge.identify.linear import solve_symmetric
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Family, Selection, threshold
+from hdbridge.identify.orders import Family, Order, Selection, threshold
 from hdbridge.identify.residuals import residual_tests
 from hdbridge.identify.result import ChosenOrder, FitResult, NoiseFigures, Nuisance, Outliers, Traces
 from hdbridge.identify.samples import KINDS, Samples
@@ -23,6 +24,9 @@ from hdbridge.identify.spectrum import Curve, Spectrum, assemble, plain_spectrum
 from hdbridge.identify.state import State, System
 from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
+
+MOST_NAMED = 4
+"""Orders that are named one by one."""
 
 
 def conclude(
@@ -198,10 +202,10 @@ def _describe_limits(
     selection: Selection, lines: Spectrum, outliers: Outliers, samples: Samples, warnings: list[str]
 ) -> None:
     """Warnings about what the record's angles cannot tell apart, and about samples left out."""
-    for one, other in selection.twins:
-        warnings.append(f"{one} and {other} cannot be told apart at the angles of this record")
-    for order in selection.unresolved:
-        warnings.append(f"{order} cannot be told from what else was fitted")
+    for alike in _families(selection.twins):
+        warnings.append(f"{_named(alike)} cannot be told apart at the angles of this record")
+    if selection.unresolved:
+        warnings.append(f"{_named(selection.unresolved)} cannot be told from what else was fitted")
     if lines.resolution.load_turns < 0.95:
         warnings.append(
             f"the record spans {lines.resolution.load_turns:.2f} load turns: errors that repeat with the "
@@ -218,3 +222,20 @@ def _describe_limits(
             warnings.append(
                 f"{order} shows in this record; the model has no part for it, a diagnosis may name it"
             )
+
+
+def _families(twins: Sequence[tuple[Order, Order]]) -> list[list[Order]]:
+    """What hangs together by pairs, each in the order in which it was met."""
+    families: list[list[Order]] = []
+    for pair in twins:
+        joined = [each for each in families if pair[0] in each or pair[1] in each]
+        whole = list(dict.fromkeys(order for each in (*joined, pair) for order in each))
+        families = [each for each in families if each not in joined] + [whole]
+    return families
+
+
+def _named(orders: Sequence[Order]) -> str:
+    """Their names; of many only the first and the last."""
+    if len(orders) > MOST_NAMED:
+        return f"{orders[0]} to {orders[-1]} ({len(orders)} orders)"
+    return " and ".join(map(str, orders))

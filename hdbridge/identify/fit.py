@@ -23,8 +23,11 @@ from hdbridge.identify.result import FitResult, Outliers
 from hdbridge.identify.samples import Samples, gather
 from hdbridge.identify.segment import Segment
 from hdbridge.identify.state import State, System, candidate_orders
+from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50
+LEAST_TRAVEL_DEG = 10.0
+"""Motor angle that a record has to cover: less is rest and the beginning of a move, and half of a loop."""
 EFFECT_SHARE = 1e-3
 """An effect of whose columns less than this is left by the zeros and orders is not in the record."""
 SEARCH_BLOCKS = 8_000
@@ -46,6 +49,22 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
         raise InputError(
             f"{segments[0].name}: only {usable} of {len(samples)} samples are slow enough to be used; "
             f"expected at least {MINIMUM_USABLE}: record slow sweeps, sines and rests"
+        )
+    travel = max(
+        float(np.ptp(samples.motor_deg[rows]))
+        for rows in (
+            samples.usable & (samples.zero == each) for each in np.unique(samples.zero[samples.usable])
+        )
+    )
+    if travel < LEAST_TRAVEL_DEG:
+        raise InputError(
+            f"{segments[0].name}: the motor moves by {travel:.2g} deg in the {usable} of {len(samples)} "
+            f"samples that are slow and steady enough to be used; expected at least "
+            f"{LEAST_TRAVEL_DEG:g}: record slow sweeps at a steady speed, both ways"
+        )
+    if usable < 0.5 * len(samples):
+        warnings.append(
+            f"only {usable} of {len(samples)} samples were used: what is fast or accelerates is left out"
         )
     state = _prepare(samples, options, warnings)
     state = _search(state, warnings)
@@ -129,14 +148,14 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
     selection = state.selected(options)
     problem = state.problem(selection)
     solution = joint_fit(problem, state.precision(), exact=False)
+    samples = state.design.samples
     weight, outliers = outlying(
-        problem.design.residual(solution.effects, problem.beside.columns @ solution.beside)
+        problem.design.residual(solution.effects, problem.beside.columns @ solution.beside),
+        samples.count_deg / samples.ratio * ARCSEC_PER_DEG,
     )
     delay_ms = dict(zip(problem.beside.names, solution.beside.tolist(), strict=True)).get(DELAY, 0.0)
     if outliers.samples or delay_ms:
-        state = state.after(solution).remade(
-            state.design.samples.delayed(delay_ms / 1000.0), weight, delay_ms
-        )
+        state = state.after(solution).remade(samples.delayed(delay_ms / 1000.0), weight, delay_ms)
     for turn in range(ROUNDS):
         state = state.after(solution)
         solution = joint_fit(state.problem(selection), state.precision())
