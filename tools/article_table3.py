@@ -1,6 +1,6 @@
 """Why the article's Tables 1 and 2 cannot give its Table 3: every figure of docs/article-table-3.md.
 
-    python tools/article_table3.py [--json FILE] [--simulate]
+    python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
 
 The axis is taken as ideal but for the article's own error model and its two encoders: no dynamics, no noise.
 The law comes from the project's effects; the inverse and the statistics are computed here, on their own, so
@@ -243,6 +243,16 @@ def memory_gaps(law: Hysteresis) -> tuple[float, float]:
     return back_step, gap(staircase)
 
 
+def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Table 3 taken as a measurement."""
+    from table3_budget import budget  # noqa: PLC0415 - found only where this file is run as a script
+
+    computed = result["computed"]
+    return budget(
+        TABLE_3, computed["none"]["cw"][0], computed["synchronous"]["cw"][1], result["floor_arcsec"]
+    )
+
+
 def simulated() -> dict[str, Any]:
     """The same test on the simulated drive: its figures, and how far its steps are from the computed ones."""
     profile = bundled_profile("article")
@@ -284,9 +294,12 @@ def _print(result: Mapping[str, Any]) -> None:
         for name, parts in result["simulated"].items():
             off = "off the computed steps, arcsec"
             print(_row(name, parts, None), f" {off}: {_words(parts[off])}")
+    for name, lines in result.get("as_data", {}).items():
+        print(f"\nTable 3 as data: {name}; arcsec\n")
+        print("\n".join(f"{line:>75}  {_words(value)}" for line, value in lines.items()))
     print()
     for name, value in result.items():
-        if name in {"computed", "both_by_the_formula_as_printed", "table_3", "simulated"}:
+        if name in {"computed", "both_by_the_formula_as_printed", "table_3", "simulated", "as_data"}:
             continue
         print(f"{name.replace('_', ' ')}: {_words(value)}")
 
@@ -299,6 +312,8 @@ def _row(name: str, parts: Parts, table: tuple[float, float] | None) -> str:
 def _words(value: object) -> str:
     if isinstance(value, dict):
         return "; ".join(f"{key} {_words(each)}" for key, each in value.items())
+    if isinstance(value, list):
+        return " to ".join(_words(each) for each in value)
     return f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
@@ -307,8 +322,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Why Tables 1 and 2 cannot give Table 3.")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures for machines")
     parser.add_argument("--simulate", action="store_true", help="run the test on the simulated drive too")
+    parser.add_argument("--as-data", action="store_true", help="take Table 3 as a measurement: what it lacks")
     options = parser.parse_args()
     result = figures()
+    if options.as_data:
+        result["as_data"] = as_data(result)
     if options.simulate:
         result["simulated"] = simulated()
     _print(result)

@@ -1,0 +1,83 @@
+"""What four rows of scatter and mean say of the runs behind them, tried on runs that are known."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+ROOT = Path(__file__).parents[2]
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+TOOL = load("table3_budget")
+ARTICLE = load("article_table3")
+ONE, ALONE = "one error under four schemes", "what one cause alone would have to be"
+
+
+def row(error: np.ndarray) -> tuple[float, float]:
+    return 3.0 * float(np.std(error)), float(np.mean(error))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_ranges_hold_what_was_put_in(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 480
+    share = rng.uniform(0.55, 0.98)
+    one_way = np.where(np.arange(count) < share * count, 1.0, -1.0)
+    wave = 17.0 * np.cos(rng.uniform(0.0, 2.0 * np.pi, count))
+    correction = rng.uniform(20.0, 70.0) * one_way
+    error = rng.uniform(0.3, 2.0) * wave + rng.uniform(0.3, 2.0) * correction + rng.normal(5.0, 8.0, count)
+    table = {
+        "none": row(error),
+        "synchronous": row(error - wave),
+        "hysteresis": row(error - correction),
+        "both": row(error - wave - correction),
+    }
+    found = TOOL.budget(table, row(wave)[0], 40.0, 2.8)[ONE]
+    assert found["means: they add up to within"] == pytest.approx(0.0, abs=1e-9)
+    low, high = found["hysteresis correction, standard deviation"]
+    assert 0.99 * low <= np.std(correction) <= 1.01 * high
+    low, high = found["... if of two values: its size"]
+    assert 0.99 * low <= abs(correction[0]) <= 1.01 * high
+    low, high = found["... and the share of the steps one way, %"]
+    assert low - 1.0 <= 100.0 * np.mean(one_way > 0.0) <= high + 1.0
+
+
+def test_rows_that_no_one_error_can_leave_are_told() -> None:
+    rows = {"none": (30.0, 0.0), "synchronous": (3.0, 0.0), "hysteresis": (3.0, 0.0), "both": (90.0, 0.0)}
+    found = TOOL.budget(rows, 10.0, 40.0, 2.8)[ONE]
+    assert "hysteresis correction: no variance of it is possible" in found
+
+
+def test_the_page_says_what_the_script_computes() -> None:
+    page = (ROOT / "docs" / "article-table-3.md").read_text(encoding="utf-8")
+    section = page.split("## Table 3 as data")[1].split("\n## ")[0]
+    computed = ARTICLE.figures()
+    wave, floor = computed["computed"]["none"]["cw"][0], computed["floor_arcsec"]
+    figures = TOOL.budget(ARTICLE.TABLE_3, wave, 40.0, floor)
+    lines: dict[str, Any] = {**figures[ONE], **figures[ALONE]}
+    rows = re.findall(r"^\| ([^|]+) \| ([\d. to]+) \|[^|]*\|$", section, re.MULTILINE)
+    assert len(rows) == 15
+    for name, shown in rows:
+        value = lines[name]
+        wanted = value if isinstance(value, list) else [value]
+        for each, whole in zip(shown.split(" to "), wanted, strict=True):
+            digits = len(each.partition(".")[2])
+            assert float(each) == pytest.approx(whole, abs=0.51 * 10.0**-digits), name

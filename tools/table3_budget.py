@@ -1,0 +1,120 @@
+"""What the article's Table 3, taken as a measurement, says the model lacks: `article_table3.py --as-data`.
+
+Four runs of one test give four scatters and four means. If the four share one uncompensated error e, of which
+the runs took off a synchronous correction w, a hysteresis correction h, or both, then
+
+    var(e - w) = var e + var w - 2 cov(e, w)                               and so on for h and w + h,
+
+so the four scatters give cov(e, w), cov(w, h) and, for each var h, cov(e, h). A covariance matrix has no
+negative eigenvalue: that bounds var h, and with the means the size of h and the share of the steps that went
+one way. Nothing is assumed of the shape of any part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+Row = tuple[float, float]
+"""3 sigma and mean, arcsec."""
+
+
+def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -> dict[str, Any]:
+    """All that four rows can say; arcsec.
+
+    ``wave`` and ``floor`` are 3 sigma of Table 1's wave and of one motor count, ``offset`` is Table 2's.
+    """
+    three = {name: each[0] for name, each in table.items()}
+    least = min(three.values())
+    return {
+        "one error under four schemes": {
+            **_means(table),
+            **_scatter({name: (each / 3.0) ** 2 for name, each in three.items()}, (wave / 3.0) ** 2),
+            **_two_values(table, (wave / 3.0) ** 2),
+        },
+        "what one cause alone would have to be": {
+            "white noise or another unknown part, the same in each run: 3 sigma at most": least,
+            "... and of 'none' it leaves": math.sqrt(three["none"] ** 2 - least**2),
+            "one unmodelled order: amplitude at most": math.sqrt(2.0) * least / 3.0,
+            "one motor count: coarser by": three["both"] / floor,
+            "a wrong offset in 'both': arcsec": math.hypot(three["both"] / 3.0, table["both"][1]),
+            "... with this share of the steps one way, %": _share(three["both"] / 3.0, table["both"][1]),
+            "the shift of the mean by hysteresis compensation: beyond Table 2's offset": abs(
+                table["hysteresis"][1] - table["none"][1]
+            )
+            - offset,
+        },
+    }
+
+
+def _means(table: Mapping[str, Row]) -> dict[str, float]:
+    """Whether the two corrections add up in the means, as corrections of one error must."""
+    mean = {name: each[1] for name, each in table.items()}
+    apart = mean["both"] - mean["synchronous"] - mean["hysteresis"] + mean["none"]
+    return {
+        "means: they add up to within": abs(apart),
+        "... so a zero that moved at random between the runs, each": abs(apart) / 2.0,
+    }
+
+
+def _scatter(variance: Mapping[str, float], wave: float) -> dict[str, float]:
+    along = (variance["none"] + wave - variance["synchronous"]) / 2.0
+    return {
+        "wave of Table 1: it goes along with the error this many times its size": along / wave,
+        "... of the variance of 'none' it can explain, %": 100.0 * along**2 / wave / variance["none"],
+        "covariance of the two corrections, arcsec^2": _between(variance),
+    }
+
+
+def _between(variance: Mapping[str, float]) -> float:
+    return (variance["both"] - variance["synchronous"] - variance["hysteresis"] + variance["none"]) / 2.0
+
+
+def _two_values(table: Mapping[str, Row], wave: float) -> dict[str, Any]:
+    """The hysteresis correction: its scatter, and its size where it has one value for each direction."""
+    variance = {name: (each[0] / 3.0) ** 2 for name, each in table.items()}
+    shift = 0.5 * (table["none"][1] - table["hysteresis"][1] + table["synchronous"][1] - table["both"][1])
+    possible = possible_variances(variance, wave)
+    if not len(possible):
+        return {"hysteresis correction: no variance of it is possible": True}
+    ends = [float(possible[0]), float(possible[-1])]
+    left = max(_neither(variance, wave, float(each)) for each in possible)
+    return {
+        "hysteresis correction, mean": shift,
+        "hysteresis correction, standard deviation": [math.sqrt(each) for each in ends],
+        "... if of two values: its size": [math.hypot(shift, math.sqrt(each)) for each in ends],
+        "... and the share of the steps one way, %": [
+            _share(math.sqrt(each), shift) for each in reversed(ends)
+        ],
+        "neither along the wave nor along the correction: 3 sigma at most": 3.0 * math.sqrt(left),
+    }
+
+
+def possible_variances(variance: Mapping[str, float], wave: float, most: float = 1e4) -> np.ndarray:
+    """The variances of the hysteresis correction, arcsec^2, for which all covariances can be, ascending."""
+    grid = np.geomspace(1e-2, most, 20_001)
+    matrices = np.array([_covariances(variance, wave, float(each)) for each in grid])
+    return np.asarray(grid[np.linalg.eigvalsh(matrices)[:, 0] >= 0.0])
+
+
+def _covariances(variance: Mapping[str, float], wave: float, correction: float) -> list[list[float]]:
+    """Of the error, the synchronous and the hysteresis correction."""
+    error = variance["none"]
+    along_wave = (error + wave - variance["synchronous"]) / 2.0
+    along = (error + correction - variance["hysteresis"]) / 2.0
+    between = _between(variance)
+    return [[error, along_wave, along], [along_wave, wave, between], [along, between, correction]]
+
+
+def _neither(variance: Mapping[str, float], wave: float, correction: float) -> float:
+    """Variance of the error that no size of the two corrections takes away."""
+    whole = np.array(_covariances(variance, wave, correction))
+    return float(whole[0, 0] - whole[0, 1:] @ np.linalg.pinv(whole[1:, 1:]) @ whole[1:, 0])
+
+
+def _share(deviation: float, mean: float) -> float:
+    """Share, per cent, of the more frequent of two equal and opposite values, from their scatter and mean."""
+    return 50.0 * (1.0 + abs(mean) / math.hypot(deviation, mean))
