@@ -43,6 +43,9 @@ from hdbridge.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 
+LEFT_OF_FLOOR = 1.5
+"""A stepping test this far above its floor has something left to find."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -157,6 +160,12 @@ def report(
     if result.trial is not None:
         print_stepping(result.trial.stepping)
         print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)
+        if result.trial.of_floor > LEFT_OF_FLOOR:
+            console.print(
+                f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "
+                "these data do not show; --auto, or a plan with two load turns, shows more",
+                soft_wrap=True,
+            )
     console.print(escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True)
     console.print(f"\nrecordings: {', '.join(result.recordings)}", soft_wrap=True)
     write_json(json_file, result.as_dict())

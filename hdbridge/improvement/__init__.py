@@ -10,7 +10,7 @@ Drive and dates come in; nothing here knows whether the drive is simulated.
 """
 
 from hdbridge.improvement.extension import Extension, extension_of
-from hdbridge.improvement.further import Choice, choose
+from hdbridge.improvement.further import Choice, choose, untold
 from hdbridge.improvement.improve import Source, improve
 from hdbridge.improvement.result import Improvement, Round
 from hdbridge.improvement.trial import Trial, try_out
@@ -26,4 +26,5 @@ __all__ = [
     "extension_of",
     "improve",
     "try_out",
+    "untold",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hdbridge.diagnose import Diagnosis, Finding
@@ -33,18 +33,34 @@ class Extension:
         )
 
 
-def extension_of(diagnosis: Diagnosis, active: TransmissionModel) -> Extension:
+def extension_of(
+    diagnosis: Diagnosis, active: TransmissionModel, rivals: Mapping[str, Sequence[str]] | None = None
+) -> Extension:
     """The diagnosis's extended model without what is tied to the time of its record.
 
     A lost count or the phase of a vibration says nothing of tomorrow. What is not compensated but repeats
     (orders of the load of unknown origin) stays in the model, where a person can state its origin.
+    ``rivals`` are the causes that each has not been told from (`further.untold`): where one of them must not
+    be compensated, what was found is left out too, for it may well be that one.
     """
     known = {each.name for each in active.effects}
-    kept = tuple(each for each in diagnosis.model.effects if each.name in known or not _of_its_time(each))
-    names = {each.name for each in kept}
-    uncertainty = {name: widths for name, widths in diagnosis.model.uncertainty.items() if name in names}
-    carried = tuple(each for each in diagnosis.findings if _is_carried(each))
-    left = tuple(_why_not(each) for each in diagnosis.findings if not _is_carried(each))
+    reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
+    carried = tuple(each for each in diagnosis.findings if not reasons[id(each)])
+    names = {each.cause for each in carried}
+    doubtful = {
+        each.cause for each in diagnosis.findings if each.effect is not None and each.effect.is_compensable()
+    } - names
+    kept = tuple(
+        each
+        for each in diagnosis.model.effects
+        if each.name in known or not (_of_its_time(each) or each.name in doubtful)
+    )
+    uncertainty = {
+        name: widths
+        for name, widths in diagnosis.model.uncertainty.items()
+        if name in {each.name for each in kept}
+    }
+    left = tuple(dict.fromkeys(each for each in reasons.values() if each))
     return Extension(replace(diagnosis.model, effects=kept, uncertainty=uncertainty), carried, left)
 
 
@@ -58,20 +74,23 @@ def alternatives(finding: Finding) -> str:
     return " or ".join((finding.cause, *finding.aliases))
 
 
-def _is_carried(finding: Finding) -> bool:
-    if finding.cause == "unexplained":
-        return False
-    # A change of a part that the model has already needs no effect of its own.
-    return finding.effect is None or finding.effect.is_compensable()
-
-
 def _of_its_time(effect: Effect) -> bool:
     return Channel.TIME in effect.needs() and not effect.is_compensable()
 
 
-def _why_not(finding: Finding) -> str:
+def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
+    """Why the compensation does not make up for a finding; empty where it does."""
     if finding.cause == "unexplained":
         return (
             f"unexplained, lives in the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
         )
-    return f"{finding.cause} is not compensated: {CATALOGUE[finding.cause].compensable.why}"
+    # A change of a part that the model has already needs no effect of its own.
+    if finding.effect is not None and not finding.effect.is_compensable():
+        return f"{finding.cause} is not compensated: {CATALOGUE[finding.cause].compensable.why}"
+    for rival in rivals:
+        if not CATALOGUE[rival].compensable.possible:
+            return (
+                f"{finding.cause} is not compensated: it has not been told from {rival}, which must not "
+                f"be: {CATALOGUE[rival].compensable.why}"
+            )
+    return ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,25 +27,55 @@ class Choice:
     """What it is predicted to tell, in words."""
 
 
-def choose(
-    diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, done: Collection[str] = ()
-) -> Choice | None:
-    """The shortest experiment, not ``done`` yet, predicted to separate a surviving pair of causes.
+def untold(
+    diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
+) -> dict[str, tuple[str, ...]]:
+    """Per cause that was found, the other causes that it has not been told from.
 
-    Where no pair survives but something is unexplained: the experiment that looks closer at where it lives.
-    None where the machine can learn nothing more by itself.
+    Those are its aliases in the diagnosis, and what none of the ``plans`` by which was measured can tell from
+    it: on a short way a load order is a ramp, and one of the two always fits a little better.
+    """
+    reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
+    rivals: dict[str, tuple[str, ...]] = {}
+    for finding in diagnosis.findings:
+        one = finding.cause
+        found = [*rivals.get(one, ()), *finding.aliases]
+        for other in reports[0][one]["aliases"] if reports and one in reports[0] else ():
+            if reports[0][other]["detectable"] and not any(
+                _separates(each, one, other, finding.peak_arcsec) for each in reports
+            ):
+                found.append(other)
+        if found:
+            rivals[one] = tuple(dict.fromkeys(found))
+    return rivals
+
+
+def choose(
+    diagnosis: Diagnosis,
+    rivals: Mapping[str, Sequence[str]],
+    model: TransmissionModel,
+    view: AxisView,
+    done: Collection[str] = (),
+) -> Choice | None:
+    """The shortest experiment, not ``done`` yet, predicted to tell a cause from one of its ``rivals``.
+
+    Where none does but something is unexplained: the experiment that looks closer at where it lives. None
+    where the machine can learn no more by itself.
     """
     menu = sorted(
         ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
         key=lambda each: each[0],
     )
-    pairs = [(each.cause, alias, each.peak_arcsec) for each in diagnosis.findings for alias in each.aliases]
-    if pairs:
-        for duration_s, plan in menu:
-            report = plan_report(plan, model, view.limits)["identifiability"]
-            told = [f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)]
-            if told:
-                return Choice(plan, duration_s, tuple(told))
+    pairs = [
+        (each.cause, other, each.peak_arcsec)
+        for each in diagnosis.findings
+        for other in rivals.get(each.cause, ())
+    ]
+    for duration_s, plan in menu if pairs else ():
+        report = plan_report(plan, model, view.limits)["identifiability"]
+        told = [f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)]
+        if told:
+            return Choice(plan, duration_s, tuple(dict.fromkeys(told)))
     for finding in diagnosis.findings:
         if finding.cause == "unexplained":
             name = machine_for_unexplained(finding.lives_in)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.improvement.extension import alternatives, extension_of, named
-from hdbridge.improvement.further import advice, choose
+from hdbridge.improvement.further import advice, choose, untold
 from hdbridge.improvement.result import Improvement, Round
 from hdbridge.improvement.trial import Trial, try_out
 from hdbridge.model import TransmissionModel
@@ -74,10 +74,13 @@ def improve(
     paths, recording, apart = _begin(source, bench)
     tell("diagnosing")
     diagnosis = _diagnosed(recording, active, apart)
+    view = axis_view(drive.axis)
+    plans = _plans_of(source, recording)
+    rivals = untold(diagnosis, active, view, plans)
     found: list[Round] = []
     while len(found) < rounds:
         folder = source.folder / f"round-{len(found) + 1}"
-        journal, tells = _journal(folder, bench, diagnosis, active, {each.experiment for each in found})
+        journal, tells = _journal(folder, bench, diagnosis, rivals, active, plans)
         if journal is None:
             break
         tell(diagnosis.verdict())
@@ -86,6 +89,8 @@ def improve(
         paths.append(folder)
         recording = Recording.load(*paths)
         diagnosis = _diagnosed(recording, active, apart)
+        plans.append(journal.plan)
+        rivals = untold(diagnosis, active, view, plans)
         left = tuple(map(alternatives, diagnosis.findings))
         found.append(Round(journal.plan.name, journal.plan.about, str(folder), tells, left))
     result = Improvement(
@@ -95,7 +100,8 @@ def improve(
         plan=source.plan.name,
         active=active,
         diagnosis=diagnosis,
-        extension=extension_of(diagnosis, active),
+        extension=extension_of(diagnosis, active, rivals),
+        untold=rivals,
         rounds=tuple(found),
         advice=advice(diagnosis),
         trial=None,
@@ -130,6 +136,14 @@ def _begin(source: Source, bench: _Bench) -> tuple[list[Path], Recording, bool]:
     return list(source.given), recording, source.independent_zeros
 
 
+def _plans_of(source: Source, recording: Recording) -> list[Plan]:
+    """The plans by which was measured, as far as they are known."""
+    if source.journal is not None:
+        return [source.journal.plan]
+    noted = recording.notes.get("plan")
+    return [Plan.model_validate(noted)] if noted else []
+
+
 def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
     for what, theirs, ours in (
         ("axis", recording.axis, axis.name),
@@ -147,7 +161,12 @@ def _diagnosed(recording: Recording, active: TransmissionModel, apart: bool) -> 
 
 
 def _journal(
-    folder: Path, bench: _Bench, diagnosis: Diagnosis, active: TransmissionModel, done: set[str]
+    folder: Path,
+    bench: _Bench,
+    diagnosis: Diagnosis,
+    rivals: Mapping[str, Sequence[str]],
+    active: TransmissionModel,
+    plans: Sequence[Plan],
 ) -> tuple[Journal | None, tuple[str, ...]]:
     """The next experiment's: one that was begun before, or the one that is worth most now."""
     axis = bench.drive.axis
@@ -155,7 +174,7 @@ def _journal(
         journal = Journal.open(folder)
         journal.check_is_of(axis, identity_of(bench.drive))
         return journal, ()
-    choice = choose(diagnosis, active, axis_view(axis), done)
+    choice = choose(diagnosis, rivals, active, axis_view(axis), [each.name for each in plans])
     if choice is None:
         return None, ()
     return start_journal(folder, axis, choice.plan, bench.date, identity_of(bench.drive)), choice.tells

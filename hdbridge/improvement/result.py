@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +48,8 @@ class Improvement:
     active: TransmissionModel
     diagnosis: Diagnosis
     extension: Extension
+    untold: Mapping[str, tuple[str, ...]]
+    """Per cause that was found, the other causes that it has not been told from."""
     rounds: tuple[Round, ...]
     advice: tuple[str, ...]
     """What a person can do about what is still open."""
@@ -69,6 +72,7 @@ class Improvement:
             "pending": str(self.offer.pending) if self.offer.pending else None,
             "compensated": [each.cause for each in self.extension.carried],
             "not_compensated": list(self.extension.left),
+            "not_told_from": {name: list(each) for name, each in self.untold.items()},
             "rounds": [each.as_dict() for each in self.rounds],
             "advice": list(self.advice),
             **trial,

@@ -49,6 +49,11 @@ class Trial:
         ]
         return any(each > CHANCE for each in gains) and all(each > -CHANCE for each in gains)
 
+    @property
+    def of_floor(self) -> float:
+        """Three sigma of the stepping test with the extended model over what the axis could do at best."""
+        return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
+
     def as_dict(self) -> dict[str, Any]:
         """Plain data; ``stepping`` is that of a calibration."""
         before, after = self.small
