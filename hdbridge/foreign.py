@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,28 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
             f"{', '.join(map(str, records))}: the motor never moves in {counts} samples; expected a move: "
             "record sweeps in both directions"
         )
+
+
+def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
+    """How far apart the zeros of records are that went the same way; None where that is no more than their
+    own errors, or there is nothing to compare.
+
+    Half the height of a loop lies between two directions, so only records of one direction are compared.
+    """
+    apart: list[float] = []
+    for sign in (-1.0, 1.0):
+        errors = [
+            each.transmission_error_arcsec(ratio)
+            for each in records
+            if len(each) > 1 and np.sign(each.motor_position_deg[-1] - each.motor_position_deg[0]) == sign
+        ]
+        if len(errors) < 2:
+            continue
+        means = [float(np.mean(each)) for each in errors]
+        own = float(np.sqrt(np.mean([np.var(each) for each in errors])))
+        if np.std(means) > 2.0 * own:
+            apart.append(float(np.ptp(means)))
+    return max(apart, default=None)
 
 
 def _moves(record: Record) -> bool:

@@ -17,7 +17,7 @@ from hdbridge.diagnose.planned import plan_report
 from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
-from hdbridge.foreign import check_records
+from hdbridge.foreign import check_records, zeros_apart_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.recording import Recording
@@ -85,6 +85,13 @@ def run(
     check_records(
         dict(zip(records, parts, strict=True)) if whole else {records[0]: recording.record}, known.ratio
     )
+    apart = None if independent_zeros else zeros_apart_arcsec(parts, known.ratio)
+    if apart is not None:
+        notes.print(
+            f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
+            "encoders' zeros were lost between them, give --independent-zeros",
+            soft_wrap=True,
+        )
     result = diagnose(
         recording.record,
         known,
