@@ -42,9 +42,19 @@ def test_every_key_has_a_meaning(tool):
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
+def examples(tool):
+    return re.findall(r"```yaml\n(.*?)```", tool.PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_channels_on_the_page_are_right(tool):
+    (example,) = [each for each in examples(tool) if "load_torque:" in each]
+    path = bundled_profile("article") / "axis.yaml"
+    axis = AxisConfig.from_text(path.read_text() + example, path)
+    assert set(axis.channels) == {"load_torque", "temperature"}
+
+
 def test_the_model_on_the_page_is_right(tool):
-    page = tool.PAGE.read_text(encoding="utf-8")
-    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (example,) = [each for each in examples(tool) if "schema: hdbridge.model/1" in each]
     model = TransmissionModel.from_text(example)
     assert [each.name for each in model.effects] == ["synchronous", "hysteresis"]
     model.check_bound_to(AxisConfig.load(bundled_profile("article")))
