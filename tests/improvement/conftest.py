@@ -1,0 +1,153 @@
+"""An axis with a model and something hidden in it, and `hdbridge improve` on its simulated drive."""
+
+import io
+import json
+import random
+import shutil
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pytest
+
+from hdbridge.cli import main
+from hdbridge.sim.hidden import Run, hide
+from hdbridge.sim.truth import Truth
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+MODEL = """\
+schema: hdbridge.model/1
+ratio: 50
+effects:
+  - effect: synchronous
+    parameters:
+      orders:
+        - {order: 1, amplitude_arcsec: 6.3, phase_deg: 38.5}
+        - {order: 2, amplitude_arcsec: 13.9, phase_deg: 161.0}
+        - {order: 3, amplitude_arcsec: 1.5, phase_deg: -73.0}
+        - {order: 4, amplitude_arcsec: 8.2, phase_deg: -23.0}
+        - {order: 6, amplitude_arcsec: 4.15, phase_deg: 88.0}
+        - {order: 8, amplitude_arcsec: 1.2, phase_deg: -150.0}
+  - effect: hysteresis
+    parameters: {offset_arcsec: 31.9, width_deg: 25.5, exponent: 1.71}
+provenance: {reason: an earlier calibration}
+"""
+PLAN = """\
+schema: hdbridge.plan/1
+name: small
+reference_s: 0.5
+procedures:
+  - {procedure: standstill, duration_s: 3}
+  - {procedure: sweep, motor_turns: 4, motor_turns_per_s: 0.3}
+  - {procedure: sines, amplitudes_deg: [180, 45, 5], frequency_hz: 0.1, periods: 1}
+  - {procedure: reversals, depths_deg: [2, 5, 9, 16], reach_deg: 45, motor_deg_per_s: 25, beyond: true}
+  - {procedure: sweep, load_turns: 1.05, motor_turns_per_s: 0.85}
+validation: {count: 20, step_deg: 403.56, cycles: 0}
+"""
+NARROW = PLAN.replace("name: small", "name: narrow").replace(
+    "  - {procedure: sweep, load_turns: 1.05, motor_turns_per_s: 0.85}\n", ""
+)
+COARSE = (("cycle_ms: 4", "cycle_ms: 10"), ("counts_per_turn: 8000", "counts_per_turn: 32768"))
+"""A command in whole counts is followed at a fixed part of one; many small ones leave no bias in a sweep."""
+
+
+class Cell:
+    """A folder in which somebody improves an axis: `axis/` is the profile, `small.yaml` a plan."""
+
+    def __init__(self, folder, run):
+        self.folder = folder
+        self.axis = folder / "axis"
+        self._run = run
+        self.axis.mkdir(parents=True)
+        text = (DEMO / "axis.yaml").read_text()
+        for old, new in COARSE:
+            assert old in text
+            text = text.replace(old, new)
+        (self.axis / "axis.yaml").write_text(text)
+        (self.axis / "model.yaml").write_text(MODEL)
+        (folder / "small.yaml").write_text(PLAN)
+        (folder / "narrow.yaml").write_text(NARROW)
+        self.hidden = self.hide()
+
+    def hide(self, cause=None, size_arcsec=5.0, seed=1):
+        """Write the truth file, with a cause in it."""
+        data = Truth.load(DEMO).model_dump(by_alias=True, mode="json")
+        data["substep_ms"] = 1.0
+        data["motor"]["encoder"].update(counts_per_turn=32768, interpolation=16)
+        data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
+        data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
+        truth, hidden = Truth.model_validate(data), None
+        if cause:
+            truth, hidden = hide(truth, cause, random.Random(seed), size_arcsec, Run(duration_s=120.0))
+        (self.axis / "truth.yaml").write_text(json.dumps(truth.model_dump(by_alias=True, mode="json")))
+        return hidden
+
+    def run(self, *arguments, status=0):
+        """`hdbridge ARGS...` in this folder; its standard output and standard error."""
+        return self._run(self.folder, arguments, status)
+
+    def improve(self, *arguments, status=0):
+        """The result for machines and what was printed."""
+        options = ("--simulate", "--plan", "small.yaml", "--out", "rec", "--json", "result.json")
+        options = () if "--resume" in arguments else options
+        out, err = self.run("improve", "axis", *options, *arguments, status=status)
+        return (self.json("result.json") if status == 0 else None), out, err
+
+    def json(self, name):
+        return json.loads((self.folder / name).read_text())
+
+    def files(self):
+        """The profile, byte for byte."""
+        return {each.name: each.read_bytes() for each in self.axis.rglob("*") if each.is_file()}
+
+    def copy(self, folder):
+        shutil.copytree(self.folder, folder)
+        cell = object.__new__(Cell)
+        cell.folder, cell.axis, cell._run, cell.hidden = folder, folder / "axis", self._run, self.hidden
+        return cell
+
+
+def run_here(folder, arguments, status):
+    """In this process, which spares its start."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["hdbridge", *map(str, arguments)])
+        with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as end:
+            main()
+    assert (end.value.code or 0) == status, err.getvalue()
+    return out.getvalue(), err.getvalue()
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A cell whose axis has nothing hidden in it yet."""
+    return Cell(tmp_path / "cell", run_here)
+
+
+@pytest.fixture(scope="session")
+def improved_once(tmp_path_factory):
+    """An axis with an order of the motor hidden in it, improved once for everybody to look at."""
+    cell = Cell(tmp_path_factory.mktemp("improved") / "cell", run_here)
+    cell.hidden = cell.hide("motor_order")
+    return cell, *cell.improve("--html", "page.html")
+
+
+@pytest.fixture
+def improved(improved_once, tmp_path):
+    """A cell with a recording, `rec/`, and a pending model."""
+    return improved_once[0].copy(tmp_path / "copy")
+
+
+@pytest.fixture
+def wait_until():
+    """Wait for something that another process does."""
+
+    def until(condition, timeout_s=60.0):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, "it did not come about"
+            time.sleep(0.01)
+
+    return until

@@ -1,0 +1,89 @@
+"""What the axis runs next by itself: the shortest experiment that is predicted to tell causes apart."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import axis_view
+from hdbridge.diagnose.experiment import machine_for_unexplained, machine_plans
+from hdbridge.diagnose.result import Finding
+from hdbridge.improvement import choose, untold
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.plan import Plan
+
+PROFILE = "profiles/article"
+
+
+@dataclass
+class Left:
+    """As much of a diagnosis as the choice looks at."""
+
+    findings: tuple
+
+
+def choice_of(left, known, done=()):
+    return choose(left, untold(left, *known), *known, done)
+
+
+def found(cause, *aliases, lives_in=""):
+    return Finding(cause, 0.9, aliases, {}, 2.0, 1.0, "", 5.0, lives_in=lives_in)
+
+
+@pytest.fixture(scope="module")
+def known(pytestconfig):
+    folder = pytestconfig.rootpath / PROFILE
+    return TransmissionModel.load(folder / "model.yaml"), axis_view(AxisConfig.load(folder))
+
+
+def test_what_two_sweeps_of_a_load_turn_tell_is_told_by_them(known):
+    choice = choice_of(Left((found("ratio_error", "load_order"),)), known)
+    assert "load-turn" in choice.plan.name
+    assert choice.tells == ("ratio_error or load_order",)
+    assert choice.duration_s > 60
+
+
+def test_the_shortest_that_tells_is_taken_and_not_twice(known):
+    left = Left((found("velocity_windup", "channel_skew"),))
+    first = choice_of(left, known)
+    second = choice_of(left, known, done={first.plan.name})
+    assert second is None or second.duration_s >= first.duration_s
+    assert second is None or second.plan.name != first.plan.name
+
+
+def test_what_only_a_person_can_tell_moves_nothing(known):
+    assert choice_of(Left((found("motor_order", "motor_encoder_eccentricity"),)), known) is None
+    assert choice_of(Left((found("load_order", "compliance"),)), known) is None
+
+
+def test_with_nothing_open_there_is_nothing_to_run(known):
+    assert choice_of(Left(()), known) is None
+    assert choice_of(Left((found("motor_order"),)), known) is None
+
+
+def test_something_unexplained_is_looked_at_where_it_lives(known):
+    left = Left((found("unexplained", lives_in="load angle"),))
+    assert choice_of(left, known).plan.name == machine_for_unexplained("load angle") == "two-load-turns"
+    assert choice_of(left, known, done={"two-load-turns"}) is None
+
+
+@pytest.mark.parametrize("name", list(machine_plans()))
+def test_every_experiment_suits_a_real_axis(known, name):
+    plan = machine_plans()[name]
+    tasks = plan.tasks(known[1])
+    assert plan.about
+    assert len(tasks.tasks) == len(plan.procedures) + 1
+
+
+def test_what_the_way_cannot_tell_is_not_told_however_well_it_fits(known):
+    short = Plan.model_validate(
+        {
+            "schema": "hdbridge.plan/1",
+            "name": "short",
+            "procedures": [{"procedure": "sweep", "motor_turns": 4, "motor_turns_per_s": 0.3}],
+        }
+    )
+    left = Left((found("ratio_error"),))
+    assert untold(left, *known) == {}
+    assert "load_order" in untold(left, *known, [short])["ratio_error"]
+    assert untold(left, *known, [short, machine_plans()["two-load-turns"]]) == {}

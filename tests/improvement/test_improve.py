@@ -1,0 +1,160 @@
+"""`hdbridge improve` on the simulated drive: what is hidden is named, and the axis points better."""
+
+import json
+
+import pytest
+
+from hdbridge.model import TransmissionModel
+from hdbridge.recording import Recording
+
+
+def causes(result):
+    return [each["cause"] for each in result["diagnosis"]["findings"]]
+
+
+def test_a_hidden_cause_is_named_and_the_axis_points_better(improved_once):
+    cell, result, out, err = improved_once
+    assert result["schema"] == "hdbridge.improvement/1"
+    assert causes(result) == ["motor_order"]
+    order, size = cell.hidden.parameters["order"], cell.hidden.size_arcsec
+    found = result["diagnosis"]["findings"][0]["parameters"][f"order_{order}_amplitude_arcsec"]
+    assert found["value"] == pytest.approx(size, abs=0.2)
+    assert result["offered"] is True
+    assert result["improves"] is True
+    stepping = result["stepping"]
+    before, after = (stepping[name]["pooled"]["three_sigma_arcsec"] for name in ("before", "after"))
+    assert before > 6.0
+    assert after < 1.3 * stepping["floor_arcsec"]
+    assert len(stepping["after"]["errors_arcsec"][0]) == 20
+    assert stepping["after"]["targets_deg"] == stepping["before"]["targets_deg"]
+    assert "motor_order" in out
+    assert "hdbridge model commit" in out
+    assert "100 %" in err
+
+
+def test_the_model_says_where_it_comes_from_and_waits(improved_once):
+    cell, *_ = improved_once
+    assert (cell.axis / "model.yaml").read_text().endswith("{reason: an earlier calibration}\n")
+    model = TransmissionModel.load(cell.axis / "pending.yaml")
+    assert "motor_order" in [each.name for each in model.effects]
+    source = model.provenance
+    assert source["recordings"] == ["rec"]
+    assert source["axis"] == "demo"
+    assert source["drive"]["product_code"] == 0x402
+    (found,) = source["found"]
+    assert found["cause"] == "motor_order"
+    assert found["probability"] > 0.9
+    assert source["held_out"]["after_arcsec"] < source["held_out"]["before_arcsec"]
+    assert "motor_order" in source["reason"]
+    assert "3 sigma" in source["reason"]
+
+
+def test_the_record_is_kept_with_both_models(improved_once):
+    cell, result, *_ = improved_once
+    folder = cell.folder / "rec"
+    assert {"sweep", "sine", "reversal", "standstill"} <= {
+        each.kind for each in Recording.load(folder).segments
+    }
+    for name in ("stepping-1-before", "stepping-1-after", "stepping-4-after", "small-steps-after"):
+        assert (folder / f"{name}.csv.gz").exists()
+    assert TransmissionModel.load(folder / "active.yaml").only(["motor_order"]).effects == ()
+    assert json.loads((folder / "improvement.json").read_text()) == result
+    page = (cell.folder / "page.html").read_text()
+    assert "motor_order" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_reviewed_committed_stepped_and_rolled_back_as_any_model(improved):
+    out, _ = improved.run("model", "diff", "axis", "--json", "diff.json")
+    assert "motor_order" in out
+    new = [each for each in improved.json("diff.json")["parameters"] if each["effect"] == "motor_order"]
+    assert all(each["before"] is None and each["half_width"] > 0.0 for each in new)
+    assert len(new) == 2
+    before = (improved.axis / "model.yaml").read_bytes()
+    improved.run("model", "commit", "axis")
+    improved.run(
+        "step", "axis", "--simulate", "--count", 8, "--step-deg", 403.56, "--json", "step.json",
+        "--scheme", "both", "--scheme", "extended",
+    )  # fmt: skip
+    stepped = improved.json("step.json")
+    both, extended = (stepped[name]["pooled"]["three_sigma_arcsec"] for name in ("both", "extended"))
+    assert extended < 0.5 * both
+    improved.run("model", "rollback", "axis", "--reason", "as a trial")
+    assert (improved.axis / "model.yaml").read_bytes() == before
+
+
+def test_from_a_recording_nothing_is_measured_first(improved):
+    (improved.axis / "pending.yaml").unlink()
+    result, _, err = improved.improve("--from", "rec", "--out", "again")
+    assert causes(result) == ["motor_order"]
+    assert result["offered"] is True
+    assert result["recordings"] == ["rec"]
+    assert "nothing is measured first" in err
+    assert not (improved.folder / "again" / "recording.yaml").exists()
+    assert (improved.folder / "again" / "stepping-1-after.csv.gz").exists()
+
+
+def test_improved_already_there_is_nothing_left_to_find(improved):
+    improved.run("model", "commit", "axis")
+    profile = improved.files()
+    result, *_ = improved.improve("--from", "rec", "--out", "again")
+    assert causes(result) == []
+    assert improved.files() == profile
+
+
+def test_with_nothing_hidden_nothing_is_proposed_and_no_file_changes(cell):
+    profile = cell.files()
+    result, out, _ = cell.improve()
+    assert causes(result) == []
+    assert result["offered"] is False
+    assert result["stepping"] is None
+    assert "nothing found" in result["reason"]
+    assert "Nothing found" in out
+    assert cell.files() == profile
+    assert (cell.folder / "rec" / "recording.yaml").exists()
+
+
+@pytest.mark.parametrize("cause", ["flexspline_order", "hysteresis_parameters", "hysteresis_memory"])
+def test_what_can_be_compensated_brings_stepping_back_to_the_floor(cell, cause):
+    cell.hide(cause, 15.0 if cause == "hysteresis_memory" else 8.0)
+    result, *_ = cell.improve()
+    assert causes(result) == [cause]
+    assert result["offered"] is True
+    assert result["stepping"]["of_floor"] < 1.3
+    assert (
+        result["small_steps"]["after"]["pooled"]["three_sigma_arcsec"]
+        < 1.5 * (result["stepping"]["floor_arcsec"])
+    )
+
+
+@pytest.mark.parametrize("cause", ["load_order", "count_loss"])
+def test_what_cannot_be_compensated_is_said_and_nothing_is_proposed(cell, cause):
+    profile = cell.files()
+    cell.hide(cause, 8.0, seed=3)
+    hidden = (cell.axis / "truth.yaml").read_bytes()
+    result, out, _ = cell.improve()
+    assert causes(result) == [cause]
+    assert result["offered"] is False
+    assert result["compensated"] == []
+    assert result["stepping"] is None
+    assert f"{cause} is not compensated" in out
+    assert cell.files() == {**profile, "truth.yaml": hidden}
+
+
+def test_auto_runs_the_experiment_that_tells_apart_what_a_short_way_cannot(cell):
+    """An eccentric disc of the load encoder, on four turns of the motor: a wrong ratio would look alike."""
+    cell.hide("load_order", 12.0, seed=3)
+    narrow, out, _ = cell.improve("--plan", "narrow.yaml", "--out", "first")
+    assert "load_order" in narrow["not_told_from"]["ratio_error"]
+    assert narrow["offered"] is False
+    assert "not been told from load_order" in out
+
+    result, _, err = cell.improve("--plan", "narrow.yaml", "--auto", "--rounds", 1)
+    (one,) = result["rounds"]
+    assert "ratio_error or load_order" in one["tells"]
+    assert "round 1" in err
+    assert causes(result) == ["load_order"]
+    assert result["recordings"] == ["rec", "rec/round-1"]
+    assert Recording.load(cell.folder / "rec" / "round-1").notes["plan"]["name"] == one["experiment"]
+    assert result["offered"] is False
+    assert "load_order is not compensated" in result["reason"]

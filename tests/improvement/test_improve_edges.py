@@ -1,0 +1,102 @@
+"""`hdbridge improve` at its edges: interrupted, refused, not better."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from hdbridge.calibration.validation import Floor, Stepped, Validation
+from hdbridge.improvement import Trial
+from hdbridge.procedures.stepping import Standing, SteppingOutcome
+
+
+def refused(err, *texts):
+    lines = [line for line in err.splitlines() if line.startswith("hdbridge: ")]
+    assert len(lines) == 1, err
+    for text in texts:
+        assert text in lines[0]
+
+
+def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell, wait_until):
+    cell.hide("motor_order")
+    options = ("--simulate", "--plan", "narrow.yaml", "--out", "rec")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hdbridge", "improve", "axis", *options],
+        cwd=cell.folder,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    about = cell.folder / "rec" / "recording.yaml"
+    wait_until(lambda: process.poll() is not None or (about.exists() and "02-sweep" in about.read_text()))
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "--resume rec" in err
+    assert "Traceback" not in err
+    tasks = yaml.safe_load(about.read_text())["notes"]["tasks"]
+    assert {"01-standstill", "02-sweep"} <= {each["task"] for each in tasks if each["complete"]}
+    assert not (cell.axis / "pending.yaml").exists()
+
+    result, _, err = cell.improve("--simulate", "--resume", "rec", "--json", "result.json")
+    assert "tasks are there already" in err
+    assert [each["cause"] for each in result["diagnosis"]["findings"]] == ["motor_order"]
+    assert result["offered"] is True
+
+
+def test_without_an_active_model_there_is_nothing_to_improve(cell):
+    (cell.axis / "model.yaml").unlink()
+    _, _, err = cell.improve(status=2)
+    refused(err, "model.yaml", "calibrate first")
+    assert not (cell.folder / "rec").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "texts"),
+    [
+        (("--from", "nowhere"), ("nowhere",)),
+        (("--from", "axis", "--resume", "rec", "--simulate"), ("--from", "--resume")),
+        (("--plan", "quik"), ("quik", "did you mean 'quick'")),
+    ],
+    ids=["no recording", "from and resume", "no plan"],
+)
+def test_bad_options_are_refused_before_anything_moves(cell, options, texts):
+    _, _, err = cell.improve(*options, status=2)
+    refused(err, *texts)
+    assert not (cell.folder / "rec").exists()
+
+
+def test_a_recording_of_another_axis_is_refused(improved):
+    path = improved.axis / "axis.yaml"
+    path.write_text(path.read_text().replace("name: demo", "name: other"))
+    _, _, err = improved.improve("--from", "rec", "--out", "again", status=2)
+    refused(err, "rec", "demo", "other")
+
+
+def stepped(*errors_arcsec):
+    stands = tuple(Standing(float(place), error, 0.1) for place, error in enumerate(errors_arcsec))
+    return Stepped.of("a model", SteppingOutcome(cw=stands[::2], ccw=stands[1::2]))
+
+
+WIDE = stepped(*(9.0, -8.0, 7.5, -9.5) * 8)
+NARROW = stepped(*(1.0, -1.2, 0.8, -0.9) * 8)
+NEARLY_AS_NARROW = stepped(*(1.1, -1.0, 0.8, -1.0) * 8)
+
+
+@pytest.mark.parametrize(
+    ("big", "small", "better"),
+    [
+        ((WIDE, NARROW), (NARROW, NEARLY_AS_NARROW), True),
+        ((NARROW, NEARLY_AS_NARROW), (WIDE, NARROW), True),
+        ((NARROW, NARROW), (NARROW, NARROW), False),
+        ((NARROW, NEARLY_AS_NARROW), (NEARLY_AS_NARROW, NARROW), False),
+        ((WIDE, NARROW), (NARROW, WIDE), False),
+    ],
+    ids=["big steps", "small steps", "the same", "by chance", "one worse"],
+)
+def test_better_is_better_somewhere_and_worse_nowhere(big, small, better):
+    assert Trial(Validation(*big, Floor(1.0, 0.5)), small).improves is better
