@@ -82,18 +82,25 @@ def conclude(
             solution.residual, blocks, precision, lines, {str(each) for each in selection.chosen}, figures
         ),
         held_out=held_out(problem, solution, state.noise, active, inside),
-        traces=Traces(
-            time_s=blocks.time_s,
-            motor_deg=blocks.motor_deg,
-            load_deg=blocks.motor_deg / samples.ratio + blocks.error_arcsec / ARCSEC_PER_DEG,
-            direction=blocks.heading * blocks.moving,
-            kind=tuple(each.value for each in KINDS),
-            kind_index=blocks.kind,
-            error_arcsec=blocks.error_arcsec - np.array(zeros)[blocks.zero],
-            predicted_arcsec=_sum(design, solution.effects),
-            residual_arcsec=solution.residual,
-        ),
+        traces=_traces(design, solution, zeros),
         warnings=tuple(warnings),
+    )
+
+
+def _traces(design: Design, solution: Solution, zeros: Sequence[float]) -> Traces:
+    """What is drawn: a block all of whose samples were given no weight has no mean to be drawn."""
+    blocks, ratio = design.blocks, design.samples.ratio
+    used = blocks.count > 0
+    return Traces(
+        time_s=blocks.time_s[used],
+        motor_deg=blocks.motor_deg[used],
+        load_deg=(blocks.motor_deg / ratio + blocks.error_arcsec / ARCSEC_PER_DEG)[used],
+        direction=(blocks.heading * blocks.moving)[used],
+        kind=tuple(each.value for each in KINDS),
+        kind_index=blocks.kind[used],
+        error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
+        predicted_arcsec=_sum(design, solution.effects)[used],
+        residual_arcsec=solution.residual[used],
     )
 
 

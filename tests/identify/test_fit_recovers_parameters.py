@@ -150,6 +150,8 @@ def test_spikes_are_left_out_and_counted(standard, bench):
     total = sum(len(each) for each in segments)
     assert result.outliers.samples == pytest.approx(0.005 * total, rel=0.4)
     assert any("stand out" in each for each in result.warnings)
+    drawn = result.traces
+    assert np.max(np.abs(drawn.error_arcsec - drawn.predicted_arcsec)) < 20.0  # nothing where nothing is left
     for name in ("offset_arcsec", "width_deg", "exponent"):
         clean, spiked = standard.interval("hysteresis", name), result.interval("hysteresis", name)
         assert abs(spiked.value - clean.value) < clean.half_width
