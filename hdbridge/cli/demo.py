@@ -28,8 +28,8 @@ def demo(
     """Step a simulated axis 240 times each way under four compensation schemes.
 
     A CANopen master boots and enables a simulated CiA-402 drive over python-can's virtual bus and steps it
-    in a SYNC-driven loop; the load encoder says how well it points. Table, JSON, records and a page go to
-    FOLDER.
+    in a SYNC-driven loop; the load encoder says how well it points. It takes half a minute to two. Table,
+    JSON, records and a page go to FOLDER.
     """
     files = Profile.find("article")
     axis = load_axis(files, None, None)
@@ -47,5 +47,7 @@ def demo(
     )
     print_result(axis, comparison)
     write_json(out / "stepping.json", comparison.as_dict())
-    write_page(out / "stepping.html", axis, comparison, stepping)
-    console.print(f"\nopen {out / 'stepping.html'} for the picture")
+    write_page(out / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
+    console.print(
+        f"\nopen {out / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md", soft_wrap=True
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -79,10 +80,11 @@ def step(
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
+    chosen = model or files.model
     comparison = run_comparison(
         axis,
         files,
-        TransmissionModel.load(model or files.model),
+        TransmissionModel.load(chosen),
         stepping,
         scheme,
         simulate=simulate,
@@ -93,7 +95,7 @@ def step(
     print_result(axis, comparison)
     write_json(json_file, comparison.as_dict())
     if html_file is not None:
-        write_page(html_file, axis, comparison, stepping)
+        write_page(html_file, axis, chosen, comparison, stepping, simulated_seed=seed if simulate else None)
 
 
 def run_comparison(
@@ -160,22 +162,42 @@ def print_result(axis: AxisConfig, comparison: Comparison) -> None:
         table.add_column("mean", justify="right")
     for scheme, result in comparison.results.items():
         cells = [
-            f"{value:.2f}"
+            f"{value:z.2f}"
             for part in (result.cw, result.ccw, result.pooled)
             for value in (part.three_sigma_arcsec, part.mean_arcsec)
         ]
         table.add_row(scheme.value, *cells)
     print_table(table)
+    best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
+    floor = comparison.quantisation_floor_arcsec
     console.print(
-        f"quantisation floor (3 sigma of one motor count): {comparison.quantisation_floor_arcsec:.2f}"
+        f"quantisation floor (3 sigma of one motor count): {floor:.2f}; "
+        f"'{best.value}' is at {result.pooled.three_sigma_arcsec / floor:.2f} times that",
+        soft_wrap=True,
     )
 
 
-def write_page(path: Path, axis: AxisConfig, comparison: Comparison, stepping: Stepping) -> None:
-    """The result as a self-contained page."""
+def write_page(
+    path: Path,
+    axis: AxisConfig,
+    model: Path,
+    comparison: Comparison,
+    stepping: Stepping,
+    *,
+    simulated_seed: int | None,
+) -> None:
+    """The result as a self-contained page; it says what was stepped, when, and by which model."""
+    cycle = f"cycle {axis.drive.cycle_ms:g} ms"
+    drive = (
+        f"node {axis.drive.node_id} on {axis.bus.interface}:{axis.bus.channel}, {cycle}"
+        if simulated_seed is None
+        else f"simulated, seed {simulated_seed}, {cycle}"
+    )
     facts = {
-        "axis": f"{axis.name} ({axis.path.name})",
-        "bus": f"{axis.bus.interface}, cycle {axis.drive.cycle_ms:g} ms",
+        "axis": f"{axis.name} ({axis.path})",
+        "model": str(model),
+        "drive": drive,
+        "date": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
         "steps": f"{stepping.count} of {stepping.step_deg:g} motor degrees each way",
         "gear ratio": f"{axis.gear.ratio:g}",
         "motor encoder": f"{axis.motor_encoder.counts_per_turn:,} counts per turn",
