@@ -108,11 +108,12 @@ def draw(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     return axis, truth
 
 
-def one(job: tuple[int, str]) -> Outcome:
-    seed, plan = job
+def one(job: tuple[int, str, Path | None]) -> Outcome:
+    seed, plan, kept = job
     axis_data, truth = draw(seed)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+        folder = kept / f"axis-{seed}" if kept else Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
         for file, data in (("axis.yaml", axis_data), ("truth.yaml", truth)):
             (folder / file).write_text(yaml.safe_dump(data))
         axis = AxisConfig.load(folder)
@@ -209,8 +210,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
     parser.add_argument("--plan", default="quick")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="folder for the axes' files and recordings")
     options = parser.parse_args()
-    jobs = [(seed, options.plan) for seed in range(options.first, options.first + options.axes)]
+    jobs = [(seed, options.plan, options.keep) for seed in range(options.first, options.first + options.axes)]
     print(HEAD)
     print(
         "worst: largest amplitude error over its tolerance (0.15 arcsec or 2 %); !: outside its 95 % interval"

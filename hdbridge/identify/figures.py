@@ -11,10 +11,12 @@ from hdbridge.effects import FloatArray
 from hdbridge.effects.hysteresis import branches
 from hdbridge.identify.blocks import REST_DEG_S
 from hdbridge.identify.result import Outliers, Standing
-from hdbridge.identify.samples import KINDS, Samples
+from hdbridge.identify.samples import KINDS, SLOW, Samples
 from hdbridge.identify.segment import Kind
+from hdbridge.units import ARCSEC_PER_DEG
 
 SHORTEST_REST_S = 1.0
+LONGEST_GAP_S = 0.5
 LAP_BIN_DEG = 30.0
 WINDOW = 51
 """Samples whose median an outlier is compared with."""
@@ -23,17 +25,28 @@ OUTLYING = 6.0
 
 
 def standing(samples: Samples) -> Standing | None:
-    """Noise at rest: rms about the mean of each rest, and how it hangs together in time."""
+    """Noise of the load encoder at rest: rms about the mean of each rest, and its correlation in time.
+
+    A motor that rests between two counts of its encoder flickers, which is no noise of the load; a sine or
+    sweep that creeps within a count seems to rest, while the load goes on.
+    """
     still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    still &= ~np.isin(samples.kind, [KINDS.index(each) for each in SLOW])
+    # What was not recorded may have been a motion.
+    pause = np.diff(samples.time_s, prepend=samples.time_s[0]) > LONGEST_GAP_S
+    rest = np.where(still, np.cumsum(pause) + 1, 0)
+    edges = np.flatnonzero(np.diff(rest, prepend=-1, append=-1))
     runs = [
         slice(begin, end)
-        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-        if end - begin >= 20 and samples.time_s[end - 1] - samples.time_s[begin] >= SHORTEST_REST_S
+        for begin, end in pairwise(edges.tolist())
+        if still[begin]
+        and end - begin >= 20
+        and samples.time_s[end - 1] - samples.time_s[begin] >= SHORTEST_REST_S
     ]
     if not runs:
         return None
-    parts = [samples.error_arcsec[run] - np.mean(samples.error_arcsec[run]) for run in runs]
+    loads = [samples.load_deg[run] * ARCSEC_PER_DEG for run in runs]
+    parts = [load - np.mean(load) for load in loads]
     every = np.concatenate(parts)
     period = float(np.median(np.concatenate([np.diff(samples.time_s[run]) for run in runs])))
     time = _integrated_correlation(parts)
@@ -73,11 +86,12 @@ def laps_arcsec(samples: Samples) -> float | None:
     return float(np.sqrt(np.mean(np.square(differences)) / 2.0))
 
 
-def outlying(residual: FloatArray) -> tuple[FloatArray, Outliers]:
+def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArray, Outliers]:
     """Weights (n,), 0 for samples far from the median of their neighbours; NaN residuals keep 1.
 
     Compared with neighbours and not with the model, so that what the model lacks is not thrown away, and a
-    step that stays (lost counts) is left in for all to see.
+    step that stays (lost counts) is left in for all to see. ``count_arcsec`` is the motor encoder's count at
+    the load: a motor between two counts reads now the one and now the other, and only their mean is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
@@ -86,7 +100,7 @@ def outlying(residual: FloatArray) -> tuple[FloatArray, Outliers]:
     values = residual[index]
     off = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
     scale = max(1.4826 * float(np.median(off)), 0.1)
-    out = off > OUTLYING * scale
+    out = off > OUTLYING * scale + count_arcsec
     weight[index[out]] = 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
     runs = edges[1::2] - edges[::2]

@@ -48,6 +48,8 @@ class Samples:
     time_s: FloatArray
     motor_deg: FloatArray
     """The driving angle."""
+    load_deg: FloatArray
+    """Measured load angle."""
     error_arcsec: FloatArray
     """Observed transmission error, load - motor / N, about an arbitrary zero."""
     speed_deg_s: FloatArray
@@ -127,6 +129,7 @@ def gather(
         ratio=ratio,
         time_s=time,
         motor_deg=np.concatenate([each.motion.motor_deg for each in chains]),
+        load_deg=load,
         error_arcsec=error * ARCSEC_PER_DEG,
         speed_deg_s=speed,
         usable=_usable(time, speed / ratio, kind, slow_deg_s),

@@ -98,3 +98,33 @@ def test_blocks_average_a_column_exactly():
     assert len(blocks) < 1500
     near = (blocks.motor_deg > 297.0) & (blocks.heading < 0)
     assert np.max(blocks.extent_deg[near]) < 0.5 < np.max(blocks.extent_deg)
+
+
+def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
+    rng = np.random.default_rng(6)
+    time, count, noise = np.arange(5000) / 250.0, 0.09, 0.5
+    position = np.where(rng.random(5000) < 0.05, count, 0.0)  # 6.5 arcsec at the load
+    load = rng.normal(size=5000) * noise / 3600.0
+    samples = gather(
+        [Segment(time, np.zeros(5000), load, Kind.STANDSTILL, position_deg=position)], 50.0, slow_deg_s=1e9
+    )
+    assert samples.count_deg == pytest.approx(count)
+    assert standing(samples).rms_arcsec == pytest.approx(noise, rel=0.05)
+    error = samples.error_arcsec
+    assert outlying(error)[1].samples > 100  # as it would be for an encoder without counts
+    assert outlying(error, count / 50.0 * 3600.0)[1].samples == 0
+
+
+def test_what_moved_unseen_or_slowly_is_not_at_rest():
+    rng = np.random.default_rng(7)
+    still = rng.normal(size=(3, 1000)) * 0.5 / 3600.0
+    time = np.arange(1000) / 250.0
+    creep = np.linspace(0.0, 0.02, 1000)  # a fifth of a count in four seconds, as in a sine's turn
+    segments = [
+        Segment(time, np.zeros(1000), still[0], Kind.STANDSTILL),
+        Segment(time + 60.0, np.full(1000, 90.0), 90.0 / 50.0 + still[1], Kind.STANDSTILL),
+        Segment(time + 64.0, 90.0 + creep, (90.0 + creep) / 50.0 + still[2], Kind.SINE),
+    ]
+    found = standing(gather(segments, 50.0, slow_deg_s=1e9))
+    assert found.rms_arcsec == pytest.approx(0.5, rel=0.06)
+    assert found.samples <= 2000
