@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.errors import InputError
 from hdbridge.identify import Segment, fit
 
 
@@ -43,11 +42,7 @@ def record(bench, speed, acceleration, turns, laps, measured):
 def test_no_hysteresis_is_larger_than_what_was_seen(bench, speed, acceleration, turns, laps, measured):
     seen = record(bench, speed, acceleration, turns, laps, measured)
     error = (seen.load_deg - seen.motor_deg / 20.0) * 3600.0
-    try:
-        result = fit([seen], 20.0, bench.options)
-    except InputError as refused:
-        assert "slow enough" in str(refused)
-        return
+    result = fit([seen], 20.0, bench.options)
     names = [each.name for each in result.model.effects]
     if "hysteresis" in names:
         assert result.interval("hysteresis", "offset_arcsec").value <= np.ptp(error)
