@@ -1,0 +1,141 @@
+"""Records that other people measured: is what is in them named, and does it hold on what was left out?
+
+The records are not part of the project (licences; docs/real-records.md names the sources). They are looked
+for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; without them these tests are
+skipped.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hdbridge.cli import app
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record, concatenate
+
+BESIDE = Path(__file__).parents[3] / "shared" / "data"
+NOTHING = TransmissionModel(100.0, ())
+"""A ratio and no error: what is known of the robot beforehand."""
+UNLIKELY = {
+    "local_defect",
+    "count_loss",
+    "vibration",
+    "backlash",
+    "load_order",
+    "wear",
+    "creep",
+    "zero_drift",
+}
+
+
+def measured(name: str) -> list[Path]:
+    folder = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE))
+    found = sorted(folder.glob(name))
+    if not found:
+        pytest.skip(f"no {name} in {folder}: set HDBRIDGE_REAL_RECORDS to the folder of the measured records")
+    return found
+
+
+@pytest.fixture(scope="module")
+def joints() -> dict[int, list[Record]]:
+    return {
+        joint: [Record.read_csv(each) for each in measured(f"cobot/joint{joint}-*.csv")] for joint in (4, 5)
+    }
+
+
+def names(found: Diagnosis) -> dict[str, tuple[str, ...]]:
+    return {each.cause: each.aliases for each in found.findings}
+
+
+@pytest.mark.parametrize("joint", [4, 5])
+def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
+    joints: dict[int, list[Record]], joint: int
+) -> None:
+    out, *others = joints[joint]
+    found = diagnose(concatenate(others), NOTHING, independent_zeros=True)
+    named = names(found)
+    assert "motor_encoder_eccentricity" in named["motor_order"]
+    orders = next(each for each in found.model.effects if each.name == "motor_order").orders
+    if joint == 4:
+        assert max(orders, key=lambda each: each.amplitude_arcsec).order == 2
+        assert "velocity_windup" in named["channel_skew"]
+    else:
+        assert "compliance" in named
+    assert not set(named) & UNLIKELY
+    assert all(each.probability <= 0.6 for each in found.findings if each.cause != "unexplained")
+    assert any("reversal" in each for each in found.remarks)
+    before, after = (diagnose(out, model).baseline.rms_arcsec for model in (NOTHING, found.model))
+    assert after < 0.4 * before
+
+
+def test_zeros_that_differ_are_told_and_nothing_is_named_for_them(
+    joints: dict[int, list[Record]], tmp_path: Path
+) -> None:
+    NOTHING.save(tmp_path / "model.yaml")
+    records = [each.source for each in joints[4]]
+    command = ["diagnose", *records, "--model", str(tmp_path / "model.yaml")]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert "--independent-zeros" in result.stderr
+    found = diagnose(concatenate(joints[4]), NOTHING)
+    assert set(names(found)) == {"unexplained"}
+
+
+def test_a_fit_of_one_fast_move_is_refused(joints: dict[int, list[Record]]) -> None:
+    result = CliRunner().invoke(app, ["fit", *(each.source for each in joints[4]), "--ratio", "100"])
+    assert isinstance(result.exception, InputError)
+    assert "slow sweeps" in str(result.exception)
+
+
+# A friction damper: displacement for the motor's angle (2 deg per mm), force for the error (100 N: 1 arcsec).
+DEG_PER_MM, ARCSEC_PER_N = 2.0, 0.01
+
+
+def damper(name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    (path,) = measured(f"damper/{name}.csv")
+    time, displacement, force = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
+    return time, DEG_PER_MM * displacement, ARCSEC_PER_N * force
+
+
+def columns(
+    law: type[Hysteresis | HysteresisMemory], angle: FloatArray, width: float, n: float
+) -> FloatArray:
+    loop = law(offset_arcsec=1.0, width_deg=width, exponent=n).predict(Motion(angle), Start.VIRGIN)
+    return np.column_stack([loop, angle, np.ones(len(angle))])
+
+
+def test_return_point_memory_fits_the_damper_and_predicts_its_other_motion() -> None:
+    _, angle, force = damper("sine")
+    _, other_angle, other_force = damper("earthquake")
+    fitted, predicted = {}, {}
+    for law in (Hysteresis, HysteresisMemory):
+        shapes = [(width, n) for width in (16.0, 24.0, 28.0, 32.0, 40.0) for n in (1.6, 2.0, 2.5)]
+        trials = []
+        for width, n in shapes:
+            table = columns(law, angle, width, n)
+            coefficients = np.linalg.lstsq(table, force, rcond=None)[0]
+            trials.append((float(np.std(force - table @ coefficients)), width, n, coefficients))
+        fitted[law], width, n, coefficients = min(trials, key=lambda each: each[0])
+        predicted[law] = float(np.std(other_force - columns(law, other_angle, width, n) @ coefficients))
+    assert fitted[HysteresisMemory] < 0.9 * fitted[Hysteresis]
+    assert predicted[HysteresisMemory] < 0.9 * predicted[Hysteresis]
+    assert predicted[HysteresisMemory] < 0.5 * float(np.std(other_force))
+
+
+@pytest.mark.parametrize("name", ["sine", "earthquake"])
+def test_the_damper_is_told_to_have_return_point_memory(name: str) -> None:
+    time, angle, force = damper(name)
+    record = Record(
+        {"time_s": time, "motor_position_deg": angle, "load_position_deg": angle / 50.0 + force / 3600.0}
+    )
+    law = Hysteresis(offset_arcsec=95.0, width_deg=32.0, exponent=2.2)
+    found = diagnose(record, TransmissionModel(50.0, (law,)))
+    assert "hysteresis_memory" in names(found)
+    assert name != "sine" or "backlash" in names(found)  # it is a damper with backlash
