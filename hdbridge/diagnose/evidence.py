@@ -277,8 +277,8 @@ def _smooth(values: FloatArray, window: int) -> FloatArray:
 
 def _resting(angle: FloatArray, window: int) -> BoolArray:
     moved = np.abs(np.diff(angle, prepend=angle[:1])) > 1e-9
-    near = np.convolve(moved.astype(np.float64), np.ones(2 * window + 1), mode="same")
-    return np.asarray(near < 0.5)
+    near = np.convolve(moved.astype(np.float64), np.ones(2 * window + 1))
+    return np.asarray(near[window : window + len(angle)] < 0.5)
 
 
 def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
