@@ -155,8 +155,13 @@ def report(
     print_diagnosis(result.diagnosis)
     for line in result.extension.left:
         console.print(escape(line), soft_wrap=True)
-    for line in result.advice:
-        console.print(f"only a person can tell further: {escape(line)}", soft_wrap=True)
+    if result.further is not None:
+        further = result.further
+        console.print(
+            f"the axis could tell {', '.join(further.tells)} by itself (--auto), in "
+            f"{further.duration_s / 60:.0f} min: {further.plan.about}",
+            soft_wrap=True,
+        )
     if result.trial is not None:
         print_stepping(result.trial.stepping)
         print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)

@@ -26,6 +26,15 @@ class Choice:
     tells: tuple[str, ...]
     """What it is predicted to tell, in words."""
 
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {
+            "experiment": self.plan.name,
+            "about": self.plan.about,
+            "duration_s": self.duration_s,
+            "tells": list(self.tells),
+        }
+
 
 def untold(
     diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()

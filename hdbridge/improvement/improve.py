@@ -103,6 +103,7 @@ def improve(
         extension=extension_of(diagnosis, active, rivals),
         untold=rivals,
         rounds=tuple(found),
+        further=choose(diagnosis, rivals, active, view, [each.name for each in plans]),
         advice=advice(diagnosis),
         trial=None,
         offer=Offer(False, "nothing found: the active model stays"),
@@ -140,8 +141,8 @@ def _plans_of(source: Source, recording: Recording) -> list[Plan]:
     """The plans by which was measured, as far as they are known."""
     if source.journal is not None:
         return [source.journal.plan]
-    noted = recording.notes.get("plan")
-    return [Plan.model_validate(noted)] if noted else []
+    given = [recording] if len(source.given) == 1 else [Recording.load(each) for each in source.given]
+    return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
 
 
 def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from hdbridge.calibration.result import Offer
 from hdbridge.diagnose import Diagnosis
 from hdbridge.improvement.extension import Extension
+from hdbridge.improvement.further import Choice
 from hdbridge.improvement.trial import Trial
 from hdbridge.model import TransmissionModel
 
@@ -51,6 +52,8 @@ class Improvement:
     untold: Mapping[str, tuple[str, ...]]
     """Per cause that was found, the other causes that it has not been told from."""
     rounds: tuple[Round, ...]
+    further: Choice | None
+    """What the axis could do by itself to learn more."""
     advice: tuple[str, ...]
     """What a person can do about what is still open."""
     trial: Trial | None
@@ -74,6 +77,7 @@ class Improvement:
             "not_compensated": list(self.extension.left),
             "not_told_from": {name: list(each) for name, each in self.untold.items()},
             "rounds": [each.as_dict() for each in self.rounds],
+            "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),
             **trial,
             "diagnosis": self.diagnosis.as_dict(),

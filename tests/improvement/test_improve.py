@@ -148,6 +148,8 @@ def test_auto_runs_the_experiment_that_tells_apart_what_a_short_way_cannot(cell)
     assert "load_order" in narrow["not_told_from"]["ratio_error"]
     assert narrow["offered"] is False
     assert "not been told from load_order" in out
+    assert "--auto" in out
+    assert "ratio_error or load_order" in narrow["further"]["tells"]
 
     result, _, err = cell.improve("--plan", "narrow.yaml", "--auto", "--rounds", 1)
     (one,) = result["rounds"]
