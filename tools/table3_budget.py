@@ -95,7 +95,7 @@ def _two_values(table: Mapping[str, Row], wave: float) -> dict[str, Any]:
 
 def possible_variances(variance: Mapping[str, float], wave: float, most: float = 1e4) -> np.ndarray:
     """The variances of the hysteresis correction, arcsec^2, for which all covariances can be, ascending."""
-    grid = np.geomspace(1e-2, most, 20_001)
+    grid = np.geomspace(1e-2, most, 6_001)
     matrices = np.array([_covariances(variance, wave, float(each)) for each in grid])
     return np.asarray(grid[np.linalg.eigvalsh(matrices)[:, 0] >= 0.0])
 

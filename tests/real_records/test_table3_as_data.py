@@ -34,7 +34,7 @@ def row(error: np.ndarray) -> tuple[float, float]:
     return 3.0 * float(np.std(error)), float(np.mean(error))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_ranges_hold_what_was_put_in(seed: int) -> None:
     rng = np.random.default_rng(seed)
