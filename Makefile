@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: help demo test unit check format test-socketcan clean
+.PHONY: help demo test unit check format test-socketcan blind clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -36,6 +36,12 @@ check: $(READY)  ## format, lint, types, import contracts
 format: $(READY) ## format and mend what can be mended
 	$(BIN)/ruff format hdbridge tests tools
 	$(BIN)/ruff check --fix hdbridge tests tools
+
+BLIND_SEED  ?= 1
+BLIND_CASES ?= single=4,power=1,pair=20,triple=10,none=20,other_law=20,unknown=20,no_torque=10
+blind: $(READY)  ## a blind suite of diagnoses into build/blind (hours; BLIND_SEED, BLIND_CASES)
+	$(BIN)/python tools/blind/generate.py --out build/blind --seed $(BLIND_SEED) --cases $(BLIND_CASES)
+	$(BIN)/python tools/blind/score.py build/blind --json build/blind/verdicts.json | tee build/blind/figures.md
 
 clean:           ## remove the environment and what the commands made
 	rm -rf $(VENV) demo-output dist build

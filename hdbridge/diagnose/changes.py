@@ -16,6 +16,7 @@ from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import EXTRAPOLATED, Trail
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
+    DirectionPhase,
     Effect,
     FloatArray,
     HysteresisParameters,
@@ -32,7 +33,7 @@ LAW_GAIN = 60.0
 """Chi square by which another elastic law has to be better."""
 LAW_ARCSEC = 0.5
 """... and the root mean square by which the two predictions differ there."""
-LOOP_SHARE = 0.07
+LOOP_SHARE = 0.12
 LOOP_ARCSEC = 1.5
 """A loop has changed when it differs by this share of itself, root mean square, and by this much."""
 ORDER_SHARE = 0.15
@@ -119,9 +120,16 @@ def _orders(
     changed: list[MotorOrder] = []
     parameters: dict[str, Parameter] = {}
     weight = 0.0
+    # Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift.
+    shift = next(
+        (math.radians(each.shift_deg) for each in fitted.theory.effects if isinstance(each, DirectionPhase)),
+        0.0,
+    )
     for number, (old, new) in enumerate(zip(given.orders, now.orders, strict=True)):
         one, other = _phasor(old), _phasor(new)
         apart = other - one
+        if shift and abs(other - one * math.cos(old.order * shift)) < max(ORDER_ARCSEC, 0.5 * abs(apart)):
+            continue
         pair = columns[2 * number : 2 * number + 2]
         deviation = math.sqrt(max(float(np.trace(spread[np.ix_(pair, pair)])), 0.0))
         if abs(apart) < max(ORDER_ARCSEC, ORDER_SHARE * abs(one), 5.0 * deviation):

@@ -17,22 +17,28 @@ from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.probability import probability
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import FLOORS_ARCSEC, PENALTY, Search, Trail
+from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
+from hdbridge.diagnose.twins import inertial, wound_up
 from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, many_of_one, rest
-from hdbridge.effects import Channel, ChannelSkew, Effect, FloatArray, InertialWindup, Start, unmet
+from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
-INERTIA_SHARE = 0.15
-"""A skew whose part in speed is less than this of its part in acceleration is none."""
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 SHADOW = 2.0
 """A name stands beside something unexplained when it takes away so many times its variance."""
+LEADS = 3.5
+"""A name comes before what is unexplained when its peak is so many times its root mean square."""
+LINES = frozenset({"subdivisional_error", "vibration"})
+"""Causes that are one sharp line of a spectrum."""
+LOOP_EXPLAINS = 0.3
+"""A loop of another shape accounts for what is left when the way since the reversal foretells this share
+of it."""
 PLAIN_ARCSEC = 1.0
 """More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
 particular."""
@@ -82,7 +88,7 @@ class _Judge:
         fitted, considered = self._named_only(trail.fitted)
         fitted, more = self._without_doubtful(fitted)
         considered += more
-        fitted = self._inertia(fitted)
+        fitted = wound_up(workshop, inertial(workshop, self.search, fitted), trail.base)
         trail = replace(trail, fitted=fitted)
         spread = covariance(workshop, fitted)
         findings = [self._finding(fitted, place, spread) for place in range(base, len(fitted.theory.effects))]
@@ -139,22 +145,6 @@ class _Judge:
             fitted = self.workshop.fit(fitted.theory.without(place))
         return fitted, considered
 
-    def _inertia(self, fitted: Fitted) -> Fitted:
-        """A skew that has all but no part in speed is an inertial wind-up."""
-        for place, effect in enumerate(fitted.theory.effects[self.trail.base :], self.trail.base):
-            if not isinstance(effect, ChannelSkew):
-                continue
-            parts = np.abs(self.workshop.columns(effect, fitted.theory.start) * effect.coefficients())
-            speed, acceleration = np.quantile(parts, 0.998, axis=0)
-            plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
-            if speed < INERTIA_SHARE * acceleration:
-                trial = self.workshop.fit(fitted.theory.instead(place, plain))
-                if self.search.peak(trial, place) < FLOORS_ARCSEC["inertial_windup"]:
-                    return self.workshop.fit(fitted.theory.without(place))
-                if not trial.theory.effects[place].violations():
-                    return trial
-        return fitted
-
     def _without_doubtful(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
         """Take out names that do less than what is left unexplained beside them: it may well be its
         shadow.
@@ -166,11 +156,13 @@ class _Judge:
                 break
             does = {}
             for place in range(self.trail.base, len(fitted.theory.effects)):
+                if fitted.theory.effects[place].name in LINES:
+                    continue  # what is left has no such line, and casts no shadow there
                 without = self.workshop.fit(fitted.theory.without(place))
                 lost = [each.residual / self.workshop.weight for each in (without, fitted)]
                 does[place] = (float(np.mean(lost[0] ** 2) - np.mean(lost[1] ** 2)), without)
-            place = min(does, key=lambda each: does[each][0])
-            if does[place][0] > SHADOW * left.arcsec**2:
+            place = min(does, key=lambda each: does[each][0], default=-1)
+            if place < 0 or does[place][0] > SHADOW * left.arcsec**2:
                 break
             considered.append(f"{fitted.theory.effects[place].name}: does less than what is left unexplained")
             fitted = does[place][1]
@@ -205,11 +197,11 @@ class _Judge:
         own = without.chi_square - fitted.chi_square
         aliases: list[str] = []
         margin = own
-        count = fitted.count()
+        count = fitted.free()
         # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - count, 1), 1.0)
         for name, trial in self.search.rivals(without, effect.name):
-            worse = trial.chi_square - fitted.chi_square + PENALTY * (trial.count() - count)
+            worse = trial.chi_square - fitted.chi_square + PENALTY * (trial.free() - count)
             if worse < 20.0 * excess + 0.01 * own:
                 aliases.append(name)
             else:
@@ -251,7 +243,8 @@ class _Judge:
             axis=left.lives_in,
         )
         loops = [each for each in findings if each.cause in LOOPS]
-        if many is None and loops and "last reversal" in lives:
+        foretold = left.explained_arcsec**2 > LOOP_EXPLAINS * left.arcsec**2
+        if many is None and loops and "last reversal" in lives and foretold:
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             told = replace(
                 loops[0],
@@ -264,7 +257,7 @@ class _Judge:
             )
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
-        return [*findings, unknown] if largest > 6.0 * size else [unknown, *findings]
+        return [*findings, unknown] if largest > LEADS * size else [unknown, *findings]
 
     def _is_unexplained(self, left: Rest) -> bool:
         evidence = self.workshop.evidence

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.diagnose.theory import Fitted, Workshop, orthonormal
-from hdbridge.effects import Backlash, FloatArray, LocalDefect, Wear
+from hdbridge.effects import Backlash, FloatArray, LocalDefect, RatioError, Wear
 from hdbridge.effects.hysteresis import branches
 
 BLOCKS_S = (1.0, 5.0)
@@ -26,6 +26,8 @@ SHARE_LEFT = 1e-5
 TURN_DEG = 60.0
 """Motor angle after a reversal within which an elastic loop is felt."""
 LEAST_GAP_ARCSEC = 2.0
+BEND = 0.6
+"""A ramp of which the slope in some third of the way differs by more than this share is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +105,32 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
+    if isinstance(effect, RatioError) and _bends(workshop, fitted, place):
+        return Gate(robust, needed, passed=False, reason="not the same slope everywhere")
     if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
         return Gate(robust, needed, passed=False, reason="too small to tell from the loop's shape")
     return Gate(robust, needed, passed=True)
+
+
+def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:
+    """Whether a ramp has another slope in some third of the way: a wrong ratio has the same everywhere."""
+    angle = workshop.motion.motor_deg[workshop.index]
+    low, span = float(np.min(angle)), float(np.ptp(angle))
+    hinges = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
+    own = fitted.places(place)
+    slope = float(fitted.theory.effects[place].coefficients()[0])
+    column = fitted.tangent[:, own[:1]]
+    scale = float(np.ptp(column[:, 0] / workshop.weight)) / max(span, 1e-9)
+    columns = workshop.weighted(np.column_stack(hinges)) * scale
+    basis = orthonormal(np.hstack([np.delete(fitted.tangent, own, axis=1), column]))
+    left = columns - basis @ (basis.T @ columns)
+    moment = left.T @ fitted.residual
+    bend = np.linalg.lstsq(left.T @ left, moment, rcond=1e-10)[0]
+    # The slope in the first third, with the bends in place.
+    others = np.delete(fitted.tangent, own, axis=1)
+    step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
+    slopes = slope + np.cumsum(step[:3])
+    return bool(np.ptp(slopes) > BEND * np.max(np.abs(slopes)) and float(moment @ bend) > ROBUST)
 
 
 def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:

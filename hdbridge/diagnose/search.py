@@ -18,7 +18,7 @@ from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
 from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
-from hdbridge.effects import Compliance, CountLoss, Creep, Effect, FloatArray, Start
+from hdbridge.effects import ChannelSkew, Compliance, CountLoss, Creep, Effect, FloatArray, Start
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.local_defect import LocalDefect
@@ -40,6 +40,7 @@ KIN = (
     {"zero_drift", "count_loss"},
     {"local_defect", "load_order"},
     {"backlash", "wear"},
+    {"wear", "amplitude_drift"},
 )
 """Causes of which one's wrong form leaves a rest that looks like the other."""
 SLOW = 0.8
@@ -63,12 +64,16 @@ REPEATED = frozenset(
     }
 )
 """Causes of which there may be more than one."""
-KIN_SHARE = 0.05
+KIN_SHARE = 0.15
 """... so that the second needs this share of the first one's evidence."""
 FLOOR_ARCSEC = 0.5
 """Findings whose peak is smaller than this are of no use to anybody, however certain."""
-FLOORS_ARCSEC = {"inertial_windup": 1.5}
-"""Every axis winds up a little in its fastest moves; it is a finding when it is more than that."""
+FLOORS_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
+"""Every axis winds up a little in its fastest moves, and no two encoders are read at the same instant; it is
+a finding when it is more than that."""
+LATE_MS2, LATE_SHARE = 30.0, 4.0
+"""A late sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz and
+more) it is at most so many ms^2 and so many times the delay squared."""
 LEFTOVER = 2e-5
 """Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
 
@@ -139,7 +144,7 @@ class Search:
         """With a hysteresis of any shape beside the law, where that does more than the best cause."""
         self.workshop.nuisance = self.workshop.free_loop(fitted.theory.start)
         loose = self.workshop.fit(fitted.theory)
-        added = loose.count() - fitted.count()
+        added = loose.free() - fitted.free()
         gain = fitted.chi_square - loose.chi_square - PENALTY * added - ENTER
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
         size = np.sqrt(max(gain, 0.0) / float(np.sum(self.workshop.weight**2)))
@@ -154,7 +159,7 @@ class Search:
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
             trial = self.workshop.fit(joined(fitted.theory, score.candidate.effect, self.base))
-            added = trial.count() - fitted.count()
+            added = trial.free() - fitted.free()
             net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
             if score.candidate.cause == "flexspline_order" and self._travel_turns() < 1.0:
                 net *= SHORT_TRAVEL  # not told from the motor's order there, which is the commoner
@@ -180,6 +185,8 @@ class Search:
         if effect.violations() and not isinstance(effect, OrderSeries):
             return False
         if isinstance(effect, Compliance) and not _stiffens(effect):
+            return False
+        if isinstance(effect, ChannelSkew) and not _late(effect):
             return False
         if isinstance(effect, LocalDefect) and not seek.is_met(effect, self.workshop):
             return False
@@ -267,8 +274,8 @@ class Search:
                 other = self._best_addition(without)
                 if other is None:
                     continue
-                before = fitted.chi_square + PENALTY * fitted.count()
-                after = other.chi_square + PENALTY * other.count()
+                before = fitted.chi_square + PENALTY * fitted.free()
+                after = other.chi_square + PENALTY * other.free()
                 if after < before - 5.0:
                     fitted, changed = other, True
                     break
@@ -334,6 +341,11 @@ def _stiffens(effect: Compliance) -> bool:
     """A gear's spring stiffens with torque; a zone that the record does not reach has no compliance."""
     zones = [each for each in effect.coefficients().tolist() if each != 0.0]
     return all(later <= 1.05 * earlier for earlier, later in pairwise(zones))
+
+
+def _late(effect: ChannelSkew) -> bool:
+    """Whether a part in speed and one in acceleration can be those of one late sample."""
+    return abs(effect.second_order_ms2) <= LATE_MS2 + LATE_SHARE * effect.delay_ms**2
 
 
 def _key(effect: Effect) -> object:

@@ -6,13 +6,23 @@ The baseline is refitted with every candidate, so what the baseline can take ove
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hdbridge.diagnose.evidence import Evidence, IntArray, Series
-from hdbridge.effects import Effect, FloatArray, Motion, Start, VelocityWindup, refreshed
+from hdbridge.effects import (
+    Channel,
+    DirectionPhase,
+    Effect,
+    FloatArray,
+    Motion,
+    Start,
+    VelocityWindup,
+    refreshed,
+)
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import OrderSeries
@@ -21,6 +31,11 @@ from hdbridge.effects.play import stop
 ITERATIONS = 8
 CONVERGED = 0.5
 """A step that gains less than this in chi square is the last."""
+ROUGHLY = 2e-5
+"""... or less than this share of it: where much is left, exactness is of no use."""
+KEPT_FITS = 8
+KEPT_COLUMNS = 64
+"""What is asked for again and again is kept; so many, for they are large."""
 FIXED_SHAPES = frozenset({"time_s", "frequency_hz", "torque1_nm", "torque2_nm"})
 """Shapes that a local step cannot improve: found by search over all their values."""
 ONE_SIDED = (Hysteresis, HysteresisMemory, VelocityWindup)
@@ -78,8 +93,12 @@ class Fitted:
     """Orthonormal basis of the tangent's columns."""
 
     def count(self) -> int:
-        """Free parameters."""
+        """Columns of the tangent matrix."""
         return len(self.parameters)
+
+    def free(self) -> int:
+        """Parameters that do anything in this record."""
+        return int(np.count_nonzero(np.any(self.tangent != 0.0, axis=0)))
 
     def places(self, effect: int) -> IntArray:
         """Columns of one effect."""
@@ -97,7 +116,11 @@ class Workshop:
         self.observed: FloatArray = points.error_arcsec[self.index]
         self.time_s: FloatArray = _time(points)[self.index]
         self.zero: IntArray = points.zero[self.index]
+        self.load_angles = 0
+        """How often the predicted load angle was exchanged."""
         self._memo: dict[object, FloatArray] = {}
+        self._recent: OrderedDict[object, FloatArray] = OrderedDict()
+        self._fits: OrderedDict[object, Fitted] = OrderedDict()
         # About the level that they have in common: an encoder's zero is no part of the physics.
         self.level = float(np.median(self.observed))
         self.nuisance: FloatArray = np.empty((len(self.index), 0))
@@ -115,7 +138,20 @@ class Workshop:
             if key not in self._memo:
                 self._memo[key] = effect.columns(self.motion, start)[self.index]
             return self._memo[key]
-        return effect.columns(self.motion, start)[self.index]
+        # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
+        # depend on those, and these are fields of them.
+        unit = effect
+        if not isinstance(effect, DirectionPhase):  # whose column is that at its present shift
+            unit = effect.fitted(np.ones(len(effect.coefficients())))
+        recent = (unit, start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
+        if recent in self._recent:
+            self._recent.move_to_end(recent)
+            return self._recent[recent]
+        columns = np.asarray(effect.columns(self.motion, start)[self.index])
+        self._recent[recent] = columns
+        if len(self._recent) > KEPT_COLUMNS:
+            self._recent.popitem(last=False)
+        return columns
 
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Columns in units of the noise."""
@@ -135,31 +171,41 @@ class Workshop:
 
     def fit(self, theory: Theory, iterations: int = ITERATIONS) -> Fitted:
         """Gauss-Newton from where the theory stands; never worse than where it began."""
+        counted = any(Channel.LOAD_ANGLE in each.channels for each in theory.effects)
+        key = (theory, iterations, self.nuisance.shape[1], self.load_angles if counted else 0)
+        if key in self._fits:
+            self._fits.move_to_end(key)
+            return self._fits[key]
+        fitted = self._fit(theory, iterations)
+        self._fits[key] = fitted
+        if len(self._fits) > KEPT_FITS:
+            self._fits.popitem(last=False)
+        return fitted
+
+    def _fit(self, theory: Theory, iterations: int) -> Fitted:
         effects = refreshed(theory.effects)
         best: Fitted | None = None
         step = 1.0
-        direction: tuple[tuple[Effect, ...], FloatArray, tuple[Parameter, ...]] | None = None
+        moves = np.empty(0)
         for _ in range(iterations):
             here = self._at(replace(theory, effects=effects))
             if best is None or here.chi_square < best.chi_square:
                 gain = math.inf if best is None else best.chi_square - here.chi_square
-                best = here
-                step = 1.0
-                moves = _solve(here.tangent, here.residual)
-                direction = (here.theory.effects, moves, here.parameters)
-                if gain < CONVERGED:
+                best = self._with_shapes(here)
+                if gain < max(CONVERGED, ROUGHLY * here.chi_square):
                     break
+                step = 1.0
+                moves = _solve(best.tangent, best.residual)
             else:
                 step *= 0.35
                 if step < 0.02:
                     break
-            assert direction is not None
-            effects = _moved(*direction, step)
+            effects = _moved(best.theory.effects, moves, best.parameters, step)
         assert best is not None
         return replace(best, basis=orthonormal(best.tangent))
 
     def _at(self, theory: Theory) -> Fitted:
-        """Residual and tangents at these shapes, with everything linear solved for."""
+        """Residual at these shapes, with everything linear solved for; shapes have no tangents yet."""
         blocks = [self.zero_columns(), self.nuisance]
         parameters = [Parameter(-1, f"zero{i}") for i in range(self.evidence.zeros)]
         parameters += [Parameter(-1, f"nuisance{i}") for i in range(self.nuisance.shape[1])]
@@ -185,8 +231,20 @@ class Workshop:
             effects.append(effect.fitted(solution[at : at + size]))
             at += size
         residual = observed - linear @ solution
+        return Fitted(
+            replace(theory, effects=tuple(effects)),
+            solution[: self.evidence.zeros],
+            residual,
+            linear,
+            tuple(parameters),
+            float(residual @ residual),
+        )
+
+    def _with_shapes(self, fitted: Fitted) -> Fitted:
+        """With the tangents of the shapes; the same where there are none."""
+        theory, parameters = fitted.theory, list(fitted.parameters)
         shapes: list[FloatArray] = []
-        for place, effect in enumerate(effects):
+        for place, effect in enumerate(theory.effects):
             for each in effect.shape:
                 if each.name in FIXED_SHAPES:
                     continue
@@ -203,15 +261,10 @@ class Workshop:
                 ]
                 shapes.append(self.weight * (either[1] - either[0]) / span)
                 parameters.append(Parameter(place, each.name, shape=True, logarithmic=each.logarithmic))
-        tangent = np.column_stack([linear, *shapes]) if shapes else linear
-        return Fitted(
-            replace(theory, effects=tuple(effects)),
-            solution[: self.evidence.zeros],
-            residual,
-            tangent,
-            tuple(parameters),
-            float(residual @ residual),
-        )
+        if not shapes:
+            return fitted
+        tangent = np.column_stack([fitted.tangent, *shapes])
+        return replace(fitted, tangent=tangent, parameters=tuple(parameters))
 
     def predicted(self, fitted: Fitted, series: Series | None = None) -> FloatArray:
         """What the theory says for each point of a series, zeros included, arcsec, shape (n,)."""

@@ -1,0 +1,62 @@
+"""Second looks at names whose twin is commoner: a late sample that is the load's own wind-up, a load
+order that is the wind-up under the load's torque.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdbridge.diagnose.search import FLOORS_ARCSEC, Search
+from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.effects import Channel, ChannelSkew, Compliance, InertialWindup, LoadOrders
+
+INERTIA_SHARE = 0.15
+"""A skew whose part in speed is less than this of its part in acceleration is none."""
+TWIN = 1e-3
+"""A spring is a first load order's better where it misses less than this share of its evidence."""
+
+
+def inertial(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
+    """A skew that has all but no part in speed is an inertial wind-up, or nothing."""
+    for place, effect in enumerate(fitted.theory.effects[search.base :], search.base):
+        if not isinstance(effect, ChannelSkew):
+            continue
+        parts = np.abs(workshop.columns(effect, fitted.theory.start) * effect.coefficients())
+        speed, acceleration = np.quantile(parts, 0.998, axis=0)
+        if speed < INERTIA_SHARE * acceleration:
+            plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
+            trial = workshop.fit(fitted.theory.instead(place, plain))
+            small = search.peak(trial, place) < FLOORS_ARCSEC["inertial_windup"]
+            if small or trial.theory.effects[place].violations():
+                return workshop.fit(fitted.theory.without(place))
+            return trial
+    return fitted
+
+
+def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
+    """A first load order that follows the load's torque is the torque's wind-up.
+
+    An order takes any phase, a spring only that of the torque: where it does as well but for what the noise
+    of the torque channel takes from it, the order would be a coincidence.
+    """
+    present = {each.name for each in fitted.theory.effects}
+    if Channel.LOAD_TORQUE not in workshop.motion.available() or "compliance" in present:
+        return fitted
+    for place, effect in enumerate(fitted.theory.effects[base:], base):
+        if not isinstance(effect, LoadOrders) or all(each.order != 1 for each in effect.orders):
+            continue
+        spring = Compliance(
+            c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
+            torque1_nm=1e4, torque2_nm=2e4, torque=Channel.LOAD_TORQUE.value,
+        )  # fmt: skip
+        theory, without = fitted.theory.instead(place, spring), fitted.theory.without(place)
+        others = tuple(each for each in effect.orders if each.order != 1)
+        if others:
+            more = effect.model_copy(update={"orders": others})
+            theory, without = theory.plus(more), without.plus(more)
+        trial = workshop.fit(theory)
+        own = workshop.fit(without).chi_square - fitted.chi_square
+        worse = trial.chi_square - fitted.chi_square
+        if worse < TWIN * own and not trial.theory.effects[place].violations():
+            return trial
+    return fitted

@@ -1,0 +1,64 @@
+"""Time and memory of a diagnosis against the number of samples.
+
+.venv/bin/python tools/bench/diagnose.py [samples ...]
+
+One axis (ratio 50) with two causes hidden goes through a bench plan; the record is laid end to end until
+there are enough samples. Processor time on one thread where OMP_NUM_THREADS=1 is set.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "diagnose"))
+import plant
+
+from hdbridge.diagnose import diagnose
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
+
+HIDDEN = {"backlash": {"gap": 6.0}, "load_order": {"orders": [(1, 5.0, 30.0)]}}
+
+
+def record(samples: int) -> Record:
+    """The same plan again and again, with a time and a noise of its own each time."""
+    once = plant.record(plant.Truth(effects=HIDDEN), plant.Plan(), 1)
+    count = len(once["time_s"])
+    period = float(np.median(np.diff(once["time_s"])))
+    rng = np.random.default_rng(1)
+    whole = {name: np.resize(values, samples) for name, values in once.items()}
+    whole["time_s"] = once["time_s"][0] + np.arange(samples) * period
+    later = np.arange(samples) >= count
+    whole["load_position_deg"] = whole["load_position_deg"] + later * rng.normal(0.0, 0.3 / 3600.0, samples)
+    return Record(whole)
+
+
+def main() -> None:
+    """Print a line for each size."""
+    sizes = [int(float(each)) for each in sys.argv[1:]] or [32_000, 100_000, 300_000, 1_000_000]
+    model = TransmissionModel.from_text(plant.model_text(1))
+    before: tuple[int, float] | None = None
+    for size in sizes:
+        measured = record(size)
+        begun, cpu = time.perf_counter(), time.process_time()
+        result = diagnose(measured, model)
+        taken, cpu = time.perf_counter() - begun, time.process_time() - cpu
+        growth = ""
+        if before:
+            growth = f", {cpu / before[1]:.2f} x the processor time for {size / before[0]:.2f} x the samples"
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        named = ", ".join(each.cause for each in result.findings) or "nothing"
+        print(
+            f"{size:9d} samples: {taken:6.1f} s, processor {cpu:6.1f} s, {memory:.0f} MB{growth}; {named}",
+            flush=True,
+        )
+        before = (size, cpu)
+
+
+if __name__ == "__main__":
+    main()
