@@ -32,6 +32,8 @@ ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 SHADOW = 2.0
 """A name stands beside something unexplained when it takes away so many times its variance."""
+FAST_ARCSEC = 0.75
+"""The same for what is faster, where it is also more than the noise."""
 LEADS = 3.5
 """A name comes before what is unexplained when its peak is so many times its root mean square."""
 LINES = frozenset({"subdivisional_error", "vibration"})
@@ -267,6 +269,11 @@ class _Judge:
         limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
         if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
             return True
+        # Where command and standstill tell noise and following error apart from the gear, fast things count.
+        if evidence.commanded and evidence.standstill:
+            floor = float(np.sqrt(np.mean(1.0 / self.workshop.weight**2)))
+            if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
+                return True
         return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
 
     def _as_given(self) -> FloatArray:

@@ -39,6 +39,8 @@ class Rest:
 
     arcsec: float
     """Root mean square beyond the noise, over short blocks."""
+    fast_arcsec: float
+    """The same over all points: what is too fast for short blocks as well."""
     standing_arcsec: float
     """The same at rest only; 0 where it never rests."""
     lives_in: str
@@ -68,6 +70,7 @@ def rest(workshop: Workshop, fitted: Fitted) -> Rest:
             best = (name, gain, places, curve)
     return Rest(
         arcsec,
+        float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / workshop.weight**2)), 0.0))),
         _standing(workshop, residual),
         best[0] or "time",
         float(np.sqrt(best[1])),
