@@ -200,7 +200,8 @@ def simulated_bench(
 
 def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
     """What a drive that controls this axis says of itself."""
-    ratio = Fraction(truth.gear.ratio).limit_denominator(10_000)
+    # The drive knows the ratio that the gear was sold with, not by how little the real one is off.
+    ratio = Fraction(truth.gear.ratio).limit_denominator(100)
     return Nameplate(
         serial=serial,
         motor_counts_per_turn=truth.motor.encoder.counts_per_turn,
