@@ -1,0 +1,226 @@
+"""A bench on the virtual bus with something hidden in its axis: measure, diagnose, extend, step.
+
+The axis is that of profiles/demo with sensors for torque and temperature. What is hidden is drawn by a seed
+and put into the truth by its physics; the model that the diagnosis is given is an earlier calibration, a few
+per cent off. Everything in between is what a user has: frames on a python-can bus, a recording folder,
+``hdbridge diagnose``, model files.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from hdbridge.axis import AxisConfig
+from hdbridge.bench import Bench, axis_view, compensation_for
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.drive.drive import Drive
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.chain import Chain
+from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
+from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.recording import Recording, Segment
+from hdbridge.sim.hidden import Hidden, Run, hide_all
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+from hdbridge.stepping import SchemeResult, quantisation_floor_arcsec
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+CYCLE_MS = 10
+MOTOR_COUNTS = 32_768
+"""A command in whole counts is followed at a fixed fraction of a count: half a count is a bias of a sweep."""
+SPEED_DEG_S = 6.1
+"""Of the load. Faster, and the load's resonance shows in the higher orders of the motor."""
+ACCELERATION_DEG_S2 = 5.0
+"""Of the load: gentle, because what accelerates winds the spring up."""
+REACH_DEG = (0.0, 372.0)
+"""Of the load: a little more than a turn."""
+SENSORS = """
+load_torque:
+  source: {index: 0x2101, type: int32}
+  newton_metres_per_count: 0.001
+temperature:
+  source: {index: 0x2100, type: int16}
+  celsius_per_count: 0.1
+"""
+
+
+@dataclass(frozen=True)
+class Nested:
+    """Reversals within reversals, some of them beyond an earlier turning point; motor degrees."""
+
+    depths_deg: tuple[float, ...] = (2.0, 5.0, 9.0, 16.0)
+    velocity_deg_s: float = 0.5
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """About the load's zero, each from the forward branch."""
+        for depth in self.depths_deg:
+            yield MoveTo(-40.0 / axis.ratio)
+            for part in (0.0, -1.0, -0.3, -0.8, -0.5, -1.4, 0.0):
+                yield MoveTo(part * depth / axis.ratio, self.velocity_deg_s, kind="reversal")
+
+
+@dataclass(frozen=True)
+class Still:
+    """Stand where the axis is."""
+
+    duration_s: float
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """No motion."""
+        yield Dwell(self.duration_s)
+
+
+STEPPING = Stepping(count=20, step_deg=403.56)
+"""At every phase of the motor, over most of a load turn."""
+
+
+def axis_config(folder: Path) -> AxisConfig:
+    """The axis file, written into a folder."""
+    text = (DEMO / "axis.yaml").read_text() + SENSORS
+    for old, new in (("cycle_ms: 4", f"cycle_ms: {CYCLE_MS}"), ("turn: 8000", f"turn: {MOTOR_COUNTS}")):
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "axis.yaml"
+    path.write_text(text)
+    return AxisConfig.load(path)
+
+
+def bare_truth() -> Truth:
+    """The axis before anything is hidden in it."""
+    data = Truth.load(DEMO).model_dump(by_alias=True)
+    data["substep_ms"] = 1.0
+    data["motor"]["encoder"].update(counts_per_turn=MOTOR_COUNTS, interpolation=16)
+    data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
+    data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
+    return Truth.model_validate(data)
+
+
+def model_text(truth: Truth, rng: random.Random) -> str:
+    """What an earlier calibration left: right in kind, a few per cent off in its numbers."""
+    law = truth.gear.hysteresis
+    rows = "\n".join(
+        f"        - {{order: {each.order}, amplitude_arcsec: "
+        f"{each.amplitude_arcsec * rng.uniform(0.96, 1.04):.3f}, "
+        f"phase_deg: {each.phase_deg + rng.uniform(-3.0, 3.0):.2f}}}"
+        for each in truth.gear.motor_orders
+    )
+    return f"""schema: hdbridge.model/1
+ratio: {truth.gear.ratio:g}
+effects:
+  - effect: synchronous
+    parameters:
+      orders:
+{rows}
+  - effect: hysteresis
+    parameters:
+      offset_arcsec: {law.offset_arcsec * rng.uniform(0.96, 1.04):.3f}
+      width_deg: {law.width_deg * rng.uniform(0.95, 1.05):.3f}
+      exponent: {law.exponent + rng.uniform(-0.03, 0.03):.3f}
+provenance:
+  reason: an earlier calibration, a few per cent off
+"""
+
+
+class Cell:
+    """A booted drive whose axis has something hidden in it, and a folder for what comes of it."""
+
+    def __init__(self, drive: Drive, folder: Path, bare: Truth, hidden: Sequence[Hidden]) -> None:
+        self.drive = drive
+        self.folder = folder
+        self.bare = bare
+        self.hidden = hidden
+        self.model = folder / "model.yaml"
+        self.recording = folder / "recording"
+        self.stepping = STEPPING
+
+    def measure(self, parts: Sequence[Procedure[Any]]) -> None:
+        """Run the procedures as one and keep them as a recording."""
+        run = Bench(self.drive).run(Chain(tuple(parts), ACCELERATION_DEG_S2))
+        axis = self.drive.axis
+        Recording(
+            run.record,
+            axis=axis.name,
+            ratio=axis.gear.ratio,
+            segments=tuple(
+                Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in run.legs
+            ),
+        ).save(self.recording)
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """Of the recording folder, against the model file."""
+        recording = Recording.load(self.recording)
+        return diagnose(recording.record, TransmissionModel.load(self.model), recording.segments)
+
+    def step(self, model: TransmissionModel) -> float:
+        """Pooled three sigma of the load error at rest with a model, arcsec."""
+        run = Bench(self.drive, compensation_for(self.drive.axis, model)).run(self.stepping)
+        return SchemeResult.of(run.outcome).pooled.three_sigma_arcsec
+
+    @property
+    def floor_arcsec(self) -> float:
+        """Three sigma that the counts of the motor target and the load encoder's noise leave."""
+        axis, encoder = self.drive.axis, self.bare.load_.encoder
+        rounding = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+        readings = self.stepping.settle.window_s / axis.drive.cycle_s
+        return math.hypot(rounding, 3.0 * encoder.noise_arcsec / math.sqrt(readings))
+
+
+def run_of(parts: Sequence[Procedure[Any]], axis: AxisConfig, highest_deg_s2: float) -> Run:
+    """What a plan means for the size of a cause; ``highest_deg_s2`` is the load's highest acceleration."""
+    view = axis_view(axis)
+    procedure = Chain(tuple(parts), ACCELERATION_DEG_S2)
+    ahead = rehearse(procedure, view)
+    way_deg, place = 0.0, 0.0
+    steps = procedure.moves(view)
+    move = next(steps)
+    while True:
+        path = move.path(place, view.limits)
+        there = path.at(path.duration_s)
+        way_deg += abs(there - place)
+        place = there
+        try:
+            move = steps.send([])
+        except StopIteration:
+            break
+    return Run(
+        duration_s=ahead.duration_s,
+        load_speed_deg_s=SPEED_DEG_S,
+        load_acceleration_deg_s2=highest_deg_s2,
+        motor_turns=way_deg * axis.gear.ratio / 360.0,
+        load_reach_deg=REACH_DEG,
+    )
+
+
+@contextmanager
+def hidden_bench(
+    folder: Path,
+    causes: Sequence[tuple[str, float]],
+    seed: int,
+    parts: Sequence[Procedure[Any]],
+    highest_deg_s2: float = ACCELERATION_DEG_S2,
+    truth: Truth | None = None,
+) -> Iterator[Cell]:
+    """An axis with causes of given sizes in it, measured."""
+    rng = random.Random(f"hidden {seed} {causes}")
+    folder.mkdir(parents=True, exist_ok=True)
+    axis = axis_config(folder)
+    bare = truth or bare_truth()
+    (folder / "model.yaml").write_text(model_text(bare_truth(), rng))
+    known, hidden = hide_all(bare, causes, rng, run_of(parts, axis, highest_deg_s2))
+    with (
+        simulated_bench(known, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        cell = Cell(drive, folder, bare, hidden)
+        cell.measure(parts)
+        yield cell
