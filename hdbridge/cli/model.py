@@ -64,10 +64,8 @@ def compare(
     folder = _folder(profile)
     names = {name for each in modelstore.log(folder) for name in _names(each)}
     if after is None and before is None and PENDING not in names:
-        raise InputError(
-            f"{folder}: there is no pending model to compare with; calibrate first, or name two of: "
-            f"{', '.join(sorted(names)) or 'none yet'}"
-        )
+        others = f", or name two of: {', '.join(sorted(names))}" if len(names) > 1 else ""
+        raise InputError(f"{folder}: there is no pending model to compare with; calibrate first{others}")
     if before is None and ACTIVE not in names:
         later = modelstore.find(folder, after or PENDING)
         earlier_name, model = "no model", later.model.only(())
