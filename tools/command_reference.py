@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import shlex
 import sys
 import typing
 from collections.abc import Callable, Iterator
@@ -184,7 +185,7 @@ def refused(line: str) -> str | None:
 
     Values may be placeholders; of an option only whether it exists and takes a value is looked at.
     """
-    words = re.sub(r"\s+(#|>|&|\|).*$", "", line.strip()).split()[1:]
+    words = shlex.split(re.sub(r"\s+(#|>|&|\|).*$", "", line.strip()))[1:]
     known = {each.name: each for each in commands()}
     name = next((text for text in (" ".join(words[:2]), words[0] if words else "") if text in known), None)
     if name is None:
