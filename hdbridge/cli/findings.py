@@ -28,20 +28,18 @@ def print_calibration(result: Calibration) -> None:
     table = Table(title=_title(result), title_justify="left")
     for name in ("effect", "parameter"):
         table.add_column(name)
-    for name in ("value", "± 95 %", "unit", *(("was",) if before else ())):
+    for name in ("value", "± 95 %", "was" if before else "unit"):
         table.add_column(name, justify="right" if name != "unit" else "left")
     for each in fit.intervals:
         was = before.get((each.effect, each.parameter))
-        cells = [
-            f"{each.value:.3f}" if each.identifiable else f"({each.value:.3f})",
-            f"{each.half_width:.3f}" if each.identifiable else "not known",
-            unit_of(each.parameter),
-        ]
+        known = each.identifiable
         table.add_row(
             each.effect,
             escape(each.parameter),
-            *cells,
-            *((f"{was:.3f}" if was is not None else "-",) if before else ()),
+            f"{each.value:.3f}" if known else f"({each.value:.3f})",
+            f"{each.half_width:.3f}" if known else "not known",
+            # With a model before, the table has no room for a column that the names tell already.
+            (f"{was:.3f}" if was is not None else "-") if before else unit_of(each.parameter),
         )
     print_table(table)
     noise = fit.noise
@@ -99,7 +97,7 @@ def print_steps(title: str, tests: Iterable[Stepped]) -> None:
         table.add_column("mean", justify="right")
     for each in tests:
         cells = [
-            f"{value:.2f}"
+            f"{value:z.2f}"
             for part in (each.cw, each.ccw, each.pooled)
             for value in (part.three_sigma_arcsec, part.mean_arcsec)
         ]
@@ -122,5 +120,5 @@ def _print_accuracy(checked: Validation) -> None:
         table.add_column(name, justify="right")
     for model, each in rows:
         figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
-        table.add_row(model, *(f"{value:.2f}" for value in figures))
+        table.add_row(model, *(f"{value:z.2f}" for value in figures))
     print_table(table)
