@@ -121,9 +121,10 @@ class Validation:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
-        """Read back."""
+        """Read back; the first calibrations measured no accuracy."""
         floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
-        accuracy = [_accuracy(data["accuracy"][name]) for name in ("before", "after")]
+        measured = data.get("accuracy", {})
+        accuracy = [_accuracy(measured.get(name)) for name in ("before", "after")]
         return cls(Stepped.from_dict(data["before"]), Stepped.from_dict(data["after"]), floor, *accuracy)
 
 

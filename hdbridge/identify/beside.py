@@ -5,7 +5,8 @@ counts reads a motor that creeps from count to count, or rests just short of one
 count *in the direction of motion*: that looks like hysteresis too, and the fraction changes with speed.
 Each turn is known to within a count only, and a hysteresis that is narrow or steep cannot be known better
 than its turns. Each has a column; a fraction of a count it cannot exceed. With fine encoders these columns
-vanish by themselves.
+vanish by themselves. The load on the gear's spring swings beyond the error that shakes it, the more the
+faster: two speeds tell that from the orders' amplitudes, at one they are known the less for it.
 """
 
 from __future__ import annotations
@@ -25,11 +26,17 @@ from hdbridge.units import ARCSEC_PER_DEG
 DELAY = "delay_ms"
 ROUNDING = "rounding"
 TURNS = "turns"
+SWING = "swing_ms2"
 TEXTS = {
     DELAY: "the load encoder is read later than the motor's by",
     ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
+    SWING: "the load swings beyond the error that shakes it, by its own acceleration times",
 }
-UNITS = {DELAY: "ms", ROUNDING: "counts"}
+UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
+SWING_MS2 = 25.0
+"""Standard deviation beforehand: 1 / (2 pi f)^2 of a load that swings at f = 32 Hz."""
+SWING_COUNT_ARCSEC = 2.0
+"""With a coarser motor encoder its sawtooth, which differs from speed to speed too, poses as swing."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
@@ -127,8 +134,24 @@ def is_rounding(name: str) -> bool:
     return is_turn(name) or name.startswith(ROUNDING)
 
 
-def beside(design: Design, nuisances: Sequence[str], effects: Sequence[Effect]) -> Beside:
-    """Zeros and the nuisances named."""
+def swing_column(design: Design, waves: Sequence[tuple[float, FloatArray]]) -> FloatArray:
+    """What the load shows beyond waves of the motor angle, per ms^2; shape (b, 1), arcsec.
+
+    ``waves`` are orders and what they contribute to each block, (b,). Driven by a cos(w t) well below its
+    natural frequency f a load answers with (1 + w^2 / (2 pi f)^2) a cos(w t).
+    """
+    rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
+    column = sum(((order * rate) ** 2 * wave for order, wave in waves), start=np.zeros(len(rate)))
+    return np.asarray(column * 1e-6)[:, np.newaxis]
+
+
+def beside(
+    design: Design,
+    nuisances: Sequence[str],
+    effects: Sequence[Effect],
+    waves: Sequence[tuple[float, FloatArray]] = (),
+) -> Beside:
+    """Zeros and the nuisances named; ``waves`` as for `swing_column`."""
     count = design.samples.zeros
     columns = [zeros(design)]
     names = [f"zero {number}" for number in range(count)]
@@ -147,6 +170,10 @@ def beside(design: Design, nuisances: Sequence[str], effects: Sequence[Effect]) 
         columns.append(column)
         names += [f"turn {number}" for number in range(column.shape[1])]
         prior += [COUNTS**-2] * column.shape[1]
+    if SWING in nuisances and waves:
+        columns.append(swing_column(design, waves))
+        names.append(SWING)
+        prior.append(SWING_MS2**-2)
     return Beside(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
 
 

@@ -189,7 +189,7 @@ def _nuisances(
 ) -> tuple[Nuisance, ...]:
     found = []
     for name in state.nuisances:
-        if name not in TEXTS:
+        if name not in TEXTS or name not in further:
             continue
         value, half = further[name]
         found.append(

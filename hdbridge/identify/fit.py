@@ -9,7 +9,17 @@ import numpy as np
 
 from hdbridge.effects import Channel, Effect, FloatArray, Start
 from hdbridge.errors import InputError
-from hdbridge.identify.beside import DELAY, ROUNDING, SHARE, TURNS, delay_column, share_left, zeros
+from hdbridge.identify.beside import (
+    DELAY,
+    ROUNDING,
+    SHARE,
+    SWING,
+    SWING_COUNT_ARCSEC,
+    TURNS,
+    delay_column,
+    share_left,
+    zeros,
+)
 from hdbridge.identify.blocks import make_blocks
 from hdbridge.identify.conclude import conclude
 from hdbridge.identify.design import Design, harmonics
@@ -108,6 +118,8 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         )
     if samples.count_deg and effects:
         nuisances += [ROUNDING, TURNS]
+    if samples.count_deg / samples.ratio * ARCSEC_PER_DEG < SWING_COUNT_ARCSEC:
+        nuisances.append(SWING)
     return State(design, candidates, waves, tuple(nuisances), tuple(effects), NoiseModel(1.0, 1.0))
 
 
@@ -166,7 +178,13 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
         if again.chosen == selection.chosen and turn:
             break
         selection = again
-    solution = joint_fit(state.problem(selection), state.precision())
+    problem = state.problem(selection)
+    solution = joint_fit(problem, state.precision())
+    if dict(zip(problem.beside.names, solution.beside.tolist(), strict=True)).get(SWING, 0.0) < 0.0:
+        # No load is held back below its natural frequency: something else differs from speed to speed.
+        state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
+        solution = joint_fit(state.problem(selection), state.precision())
+        system = state.information()
     return state.after(solution), solution, selection, system, outliers
 
 

@@ -34,10 +34,25 @@ class State(NamedTuple):
     noise: NoiseModel
     delay_ms: float = 0.0
     """By which the samples have been put right already."""
+    synchronous: Synchronous | None = None
+    """As last fitted."""
 
     def beside(self) -> Beside:
         """Zeros and nuisances."""
-        return beside(self.design, self.nuisances, self.effects)
+        return beside(self.design, self.nuisances, self.effects, self._shaking())
+
+    def _shaking(self) -> list[tuple[float, FloatArray]]:
+        """Orders of the synchronous part, and what each contributes to the blocks."""
+        if self.synchronous is None:
+            return []
+        places = {each.number: at for at, each in enumerate(self.candidates) if each.family is Family.MOTOR}
+        waves = []
+        for each in self.synchronous.orders:
+            phase = np.deg2rad(each.phase_deg)
+            pair = self.waves[:, 2 * places[each.order] : 2 * places[each.order] + 2]
+            both = each.amplitude_arcsec * np.array([np.cos(phase), -np.sin(phase)])
+            waves.append((float(each.order), np.asarray(pair @ both)))
+        return waves
 
     def precision(self) -> Precision:
         """Of the present noise model."""
@@ -88,7 +103,8 @@ class State(NamedTuple):
         effects = tuple(
             each for each in solution.effects if not isinstance(each, Synchronous) and is_valid(each)
         )
-        return self._replace(effects=effects, design=self.design.blurred(effects))
+        synchronous = next((each for each in solution.effects if isinstance(each, Synchronous)), None)
+        return self._replace(effects=effects, design=self.design.blurred(effects), synchronous=synchronous)
 
     def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
         """With corrected samples and without outliers."""

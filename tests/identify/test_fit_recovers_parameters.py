@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hdbridge.effects import Hysteresis, MotorOrder, Start, Synchronous
-from hdbridge.identify import FitOptions, Segment, fit
+from hdbridge.identify import FitOptions, Kind, Segment, fit
 from hdbridge.model import TransmissionModel
 
 
@@ -173,6 +173,36 @@ def test_a_delay_between_the_encoders_is_told_from_the_offset(bench):
     delay = next(each for each in result.nuisances if each.name == "delay_ms")
     assert delay.value == pytest.approx(2.0, abs=0.05)
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
+
+
+def test_a_load_that_swings_does_not_raise_the_orders(bench):
+    """Sweeps at two speeds, each order raised as a load of 16 Hz natural frequency raises it."""
+    axis = bench.axis(orders={1: (5.0, -120.0), 6: (8.0, 100.0)}, noise=0.2)
+    segments = []
+    for each in axis.record(
+        [
+            *bench.plan(turns=20.0, speed=100.7),
+            ("sweep", bench.ramp(0.0, 1800.0, 40.3)),
+            ("sweep", bench.ramp(1800.0, 0.0, 40.3)),
+        ]
+    ):
+        if each.kind not in {Kind.SWEEP, Kind.SINE}:
+            segments.append(each)
+            continue
+        rate = np.gradient(np.deg2rad(each.motor_deg), each.time_s)
+        swing = sum(
+            (order * rate / (2.0 * np.pi * 16.0)) ** 2
+            * amplitude
+            * np.cos(order * np.deg2rad(each.motor_deg) + np.deg2rad(phase))
+            for order, (amplitude, phase) in axis.orders.items()
+        )
+        segments.append(replace(each, load_deg=each.load_deg + swing / 3600.0))
+    result = fit(segments, axis.ratio, bench.options)
+    found = {each.order.number: each.amplitude_arcsec for each in result.orders}
+    assert found == pytest.approx({1: 5.0, 6: 8.0}, abs=0.03)
+    natural_ms2 = 1e6 / (2.0 * np.pi * 16.0) ** 2
+    swing = next(each for each in result.nuisances if each.name == "swing_ms2")
+    assert swing.value == pytest.approx(natural_ms2, rel=0.2)
 
 
 def test_default_options_suit_a_bare_record(bench):
