@@ -154,7 +154,7 @@ class _Judge:
         considered: list[str] = []
         while len(fitted.theory.effects) > self.trail.base:
             left = rest(self.workshop, fitted)
-            if not self._is_unexplained(left):
+            if not self._is_unexplained(replace(left, fast_arcsec=0.0)):  # what is fast casts no shadow
                 break
             does = {}
             for place in range(self.trail.base, len(fitted.theory.effects)):
