@@ -145,6 +145,17 @@ def swing_column(design: Design, waves: Sequence[tuple[float, FloatArray]]) -> F
     return np.asarray(column * 1e-6)[:, np.newaxis]
 
 
+def speeds_differ(design: Design) -> float:
+    """Share of the squared speed that its mean leaves: 0 where everything moves at one speed.
+
+    At one speed a swing of the load cannot be told from the orders that shake it.
+    """
+    squared = design.blocks.speed_deg_s[design.blocks.moving] ** 2
+    count = design.blocks.count[design.blocks.moving]
+    fourth = float(count @ squared**2)
+    return 1.0 - float(count @ squared) ** 2 / (float(np.sum(count)) * fourth) if fourth > 0.0 else 0.0
+
+
 def beside(
     design: Design,
     nuisances: Sequence[str],

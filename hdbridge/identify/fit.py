@@ -18,6 +18,7 @@ from hdbridge.identify.beside import (
     TURNS,
     delay_column,
     share_left,
+    speeds_differ,
     zeros,
 )
 from hdbridge.identify.blocks import make_blocks
@@ -118,7 +119,8 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         )
     if samples.count_deg and effects:
         nuisances += [ROUNDING, TURNS]
-    if samples.count_deg / samples.ratio * ARCSEC_PER_DEG < SWING_COUNT_ARCSEC:
+    fine = samples.count_deg / samples.ratio * ARCSEC_PER_DEG < SWING_COUNT_ARCSEC
+    if fine and speeds_differ(design) > SHARE:
         nuisances.append(SWING)
     return State(design, candidates, waves, tuple(nuisances), tuple(effects), NoiseModel(1.0, 1.0))
 
