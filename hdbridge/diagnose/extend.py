@@ -11,6 +11,7 @@ from hdbridge.diagnose.parameters import half_widths, parameters_of
 from hdbridge.diagnose.search import EXTRAPOLATED
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import Effect, FloatArray, Synchronous, conflicts, extended
+from hdbridge.effects.backlash import Backlash
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import OrderSeries
@@ -46,28 +47,33 @@ def extended_model(
     base: int,
 ) -> TransmissionModel:
     """``model`` with the fitted baseline (`supported`) and the findings at ``places`` of the theory."""
-    effects: tuple[Effect, ...] = tuple(_tidy(each) for each in fitted.theory.effects[:base])
+    ratio = model.ratio
+    effects: tuple[Effect, ...] = tuple(_tidy(each, ratio) for each in fitted.theory.effects[:base])
     uncertainty: dict[str, dict[str, Any]] = {}
     chosen = [*range(base), *places]
     for place in places:
-        effect = _tidy(fitted.theory.effects[place])
+        effect = _tidy(fitted.theory.effects[place], ratio)
         if effect.violations():
             continue
         effects = extended(effects, effect)
     if conflicts(effects, model.ratio):
-        effects = tuple(_tidy(each) for each in fitted.theory.effects[:base])
+        effects = tuple(_tidy(each, ratio) for each in fitted.theory.effects[:base])
     kept = {each.name for each in effects}
     for place in chosen:
         effect = fitted.theory.effects[place]
         if effect.name in kept:
-            uncertainty[effect.name] = half_widths(_tidy(effect), parameters_of(fitted, place, spread))
+            uncertainty[effect.name] = half_widths(_tidy(effect, ratio), parameters_of(fitted, place, spread))
     provenance = {**model.provenance, "reason": reason}
     return TransmissionModel(model.ratio, effects, uncertainty, provenance)
 
 
-def _tidy(effect: Effect) -> Effect:
-    """Without orders of no amplitude, whose phases mean nothing."""
+def _tidy(effect: Effect, ratio: float) -> Effect:
+    """Without orders of no amplitude, whose phases mean nothing; play as wide as an inverse needs."""
     if isinstance(effect, OrderSeries):
         orders = tuple(each for each in effect.orders if each.amplitude_arcsec > 1e-6)
         return effect.model_copy(update={"orders": orders})
+    if isinstance(effect, Backlash):
+        # The load rests while the motor crosses; noise lets the fit make that angle smaller than it can be.
+        gentlest = Backlash.of_gap(effect.gap_arcsec, ratio)
+        return gentlest if gentlest.crossing_deg > effect.crossing_deg else effect
     return effect

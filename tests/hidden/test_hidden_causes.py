@@ -213,8 +213,6 @@ NOT_NAMED = {
 NOT_MADE_UP_FOR = {
     "torque_modulation": "not named",
     "velocity_windup": "the play that is named in place of its friction has no inverse",
-    "backlash": "while the play is crossed the load rests: the model's error falls as steeply as the gear "
-    "turns, and has no inverse",
     "zero_drift": "not named",
     "amplitude_drift": "not named",
     "wear": "the play that grows is crossed within too short a way: no inverse",
