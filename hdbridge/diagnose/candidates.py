@@ -153,7 +153,9 @@ def _warm(evidence: Evidence, base: Sequence[Effect], modulated: bool) -> Iterat
     time_s = evidence.points.motion.time_s
     assert time_s is not None
     span = float(np.ptp(time_s))
-    for tau in (60.0, 240.0, 600.0, 1500.0, 4000.0):
+    # A sensor on the gear itself is hardly ahead of it. Without one, what settles within a minute is creep.
+    quick = (2.0, 15.0) if driven == "temperature" else ()
+    for tau in (*quick, 60.0, 240.0, 600.0, 1500.0, 4000.0):
         if tau > 6.0 * span and driven == "time":
             continue
         yield ZeroDrift(drift_arcsec_per_k=1.0, tau_s=tau, driven_by=driven)

@@ -21,7 +21,7 @@ class Warmed(Effect):
     """
 
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("tau_s", 60.0, 3 * 3600.0, logarithmic=True),)
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("tau_s", 2.0, 3 * 3600.0, logarithmic=True),)
 
     tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant of the gear's temperature")]
     driven_by: Annotated[

@@ -206,15 +206,11 @@ NOT_NAMED = {
     "what is left unexplained, and an order of the motor is named in its place",
     "velocity_windup": "grease that thins is not of the catalogue's law: what is left of the drag is named "
     "channel_skew, and the friction that comes with it backlash and creep",
-    "zero_drift": "the sensor is where it drifts; the lag behind it is only sought from 60 s on",
-    "amplitude_drift": "the sensor is where it drifts; the lag behind it is only sought from 60 s on",
     "motor_order and channel_skew": "0.3 arcsec are named velocity_windup beside both",
 }
 NOT_MADE_UP_FOR = {
     "torque_modulation": "not named",
     "velocity_windup": "the play that is named in place of its friction has no inverse",
-    "zero_drift": "not named",
-    "amplitude_drift": "not named",
     "wear": "the play that grows is crossed within too short a way: no inverse",
 }
 
