@@ -28,7 +28,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
-MOST_POINTS = 50_000
+MOST_POINTS = 100_000
 CHATTER_COUNTS = 1.6
 """Turns of the driving angle smaller than this are no turns: a servo that settles, not a move."""
 CHATTER_SIGMAS = 8.0

@@ -107,6 +107,8 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
             return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
     if isinstance(effect, RatioError) and _bends(workshop, fitted, place):
         return Gate(robust, needed, passed=False, reason="not the same slope everywhere")
+    if isinstance(effect, Backlash) and workshop.evidence.reversals < 2:
+        return Gate(robust, needed, passed=False, reason="no reversal in which play would show")
     if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
         return Gate(robust, needed, passed=False, reason="too small to tell from the loop's shape")
     return Gate(robust, needed, passed=True)

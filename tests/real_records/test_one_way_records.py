@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hdbridge.diagnose import diagnose
@@ -65,8 +65,9 @@ def baseline(rng: np.random.Generator) -> TransmissionModel:
     return TransmissionModel(50.0, parts[kind])
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**32 - 1))
+@example(133954)  # play was named once
 def test_no_confident_name_and_no_wild_model(seed: int) -> None:
     rng = np.random.default_rng(seed)
     record, model = move(rng), baseline(rng)

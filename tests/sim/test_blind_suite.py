@@ -200,13 +200,13 @@ def test_several_causes_are_met_once_each(tools: Any) -> None:
 
 
 def test_parameters_are_compared_where_both_have_them(tools: Any) -> None:
-    hidden = secret("channel_skew", delay_ms=0.5)
+    hidden = secret("channel_skew", delay_ms=-0.5)  # the age of the load's sample
     late = {"value": 0.55, "unit": "ms", "ci95": [0.45, 0.65]}
     verdict = tools("blindscore").judged(hidden, answer(finding("channel_skew", delay_ms=late)), 1.0)
-    assert [(each.true, each.covered) for each in verdict.compared] == [(0.5, True)]
+    assert [(each.true, each.covered) for each in verdict.compared] == [(-0.5, True)]
     assert verdict.compared[0].error == pytest.approx(0.1)
-    in_seconds = {"value": 0.0007, "unit": "s", "ci95": [0.0006, 0.0008]}
-    verdict = tools("blindscore").judged(hidden, answer(finding("channel_skew", delay_s=in_seconds)), 1.0)
+    early = {"value": -0.7, "unit": "ms", "ci95": [-0.8, -0.6]}
+    verdict = tools("blindscore").judged(hidden, answer(finding("channel_skew", delay_ms=early)), 1.0)
     assert [each.covered for each in verdict.compared] == [False]
     assert verdict.compared[0].found == pytest.approx(0.7)
 
