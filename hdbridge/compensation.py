@@ -6,8 +6,8 @@ coming from its present state and w the ramp's weight. Three choices matter:
 * It is driven by the command, never by a measured angle: near a reversal the elastic law's slope is infinite
   and one count of encoder chatter would become several arcseconds.
 * The root is bracketed. The left side rises with theta_M as long as the repeating part cannot fall faster
-  than the gear rises (refused otherwise), so there is exactly one root; a naive fixed point does not
-  contract near a reversal.
+  than the gear rises (refused otherwise; play is crossed more gently), so there is exactly one root; a naive
+  fixed point does not contract near a reversal.
 * The model's state moves on only when a command is issued (`Compensation.command`), with the angle issued,
   whatever caps and ramps have made of it.
 
@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from hdbridge.effects import Channel, Moment, Start, Tracker, compensable, fall_bound
+from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
 from hdbridge.effects.base import Memoryless
 from hdbridge.errors import InputError
 from hdbridge.model import ModelTracker, TransmissionModel
@@ -30,6 +30,8 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
+_SAFE = 0.9
+"""Of that, what is used where the choice is ours."""
 _NOWHERE = Moment()
 LOSABLE = frozenset({Channel.LOAD_TORQUE, Channel.TEMPERATURE})
 """The channels that come from sensors of their own."""
@@ -78,7 +80,8 @@ class Inverse:
         Refuses (InputError) a model whose repeating part is too steep to have one inverse.
         """
         model = replace(model, effects=compensable(model.effects))
-        trackers = [each.tracker(start) for each in model.effects]
+        self._slope = ARCSEC_PER_DEG / model.ratio
+        trackers, self._fall = _gentle(model.effects, start, _STEEPEST_FALL * self._slope)
         stateful = [not isinstance(each, Memoryless) for each in trackers]
         self.faded: list[_Faded] = []
         """Those that need a channel that can be lost."""
@@ -88,8 +91,6 @@ class Inverse:
                 self.faded.append(faded)
         self._tracker: Tracker = trackers[0] if len(trackers) == 1 else ModelTracker(trackers)
         self._stateful = [each for each, keeps in zip(trackers, stateful, strict=True) if keeps]
-        self._slope = ARCSEC_PER_DEG / model.ratio
-        self._fall = fall_bound(model.effects)
         if self._fall > _STEEPEST_FALL * self._slope:
             raise InputError(
                 f"the model's error can fall by {self._fall:.3g} arcsec per motor degree, "
@@ -188,6 +189,27 @@ class Inverse:
                 edge = 2.0 * math.ulp(best) / width
                 t = min(max(t, edge), 1.0 - edge)
         return best
+
+
+def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
+    """Trackers of the effects, and a bound on how steeply their sum falls, arcsec per motor degree.
+
+    The load rests while the motor crosses play, so play falls as steeply as the gear rises, or steeper where
+    noise has made the fit of it narrower than it can be. Where the sum would fall steeper than ``steepest``,
+    the play in it is crossed as steeply as the other effects leave room for.
+    """
+    trackers = [each.tracker(start) for each in effects]
+    fall = fall_bound(effects)
+    if fall <= steepest:
+        return trackers, fall
+    play = [place for place, each in enumerate(effects) if each.gentle_tracker(start, steepest) is not None]
+    left = _SAFE * steepest - fall_bound(each for place, each in enumerate(effects) if place not in play)
+    if not play or left <= 0.0:
+        return trackers, fall
+    gentle = {place: effects[place].gentle_tracker(start, left / len(play)) for place in play}
+    if any(each is None for each in gentle.values()):
+        return trackers, fall
+    return [gentle.get(place) or each for place, each in enumerate(trackers)], _SAFE * steepest
 
 
 class Compensation:

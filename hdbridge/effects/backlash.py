@@ -30,8 +30,9 @@ class Backlash(Linear):
     """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap, on either side.
 
     In an ideal gap the load rests while the motor crosses ``gap N / 3600`` degrees, and then the total has no
-    inverse: many motor angles give one load angle. `crossing_deg` may be larger (a soft contact); from 1.25
-    times the ideal on the compensation can invert it, and then makes the motor jump most of the gap at once.
+    inverse: many motor angles give one load angle. `crossing_deg` may be larger (a soft contact). The
+    compensation takes a gap that is steeper than it can invert for a softer one (`gentle_tracker`), and then
+    makes the motor jump most of the gap at once.
     """
 
     name: ClassVar[str] = "backlash"
@@ -75,6 +76,11 @@ class Backlash(Linear):
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; its first `advance` only says where the motor stands."""
         return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """One of a gap that takes more motor angle to cross."""
+        crossing = max(self.crossing_deg, self.gap_arcsec / fall_arcsec_per_deg)
+        return _Tracker(-0.5 * self.gap_arcsec, Stop(crossing, start))
 
     def bound_arcsec(self) -> float:
         """Half the gap."""

@@ -237,6 +237,14 @@ class Effect(BaseModel, ABC):
         3600 / N. Hysteresis only ever rises along its path, so its bound is zero.
         """
 
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """A tracker that falls nowhere steeper than that, for the inverse; None where there is none.
+
+        Play has one: on either side of it the error is what it is, and how the load gets across, within a
+        fraction of a motor degree, hardly matters.
+        """
+        return None
+
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
         """One of typical size for a gear of this ratio, to start a fit or a plan from.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -19,43 +20,50 @@ from hdbridge.effects.base import (
     Start,
     Tracker,
 )
-from hdbridge.effects.play import Stop, stop
+from hdbridge.effects.play import stop
 from hdbridge.units import DEG_PER_TURN
 
 
 class Wear(Linear):
-    """(growth / 2) run s: a loop whose height grows with the motor turns run since the model was measured.
+    """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the motor turns run.
 
     Growth is signed: a loop that widens in the sense of the elastic one is positive, a growing gap (the load
-    lags) negative.
+    lags) negative. Steady wear has the exponent one; while a gear runs in it wears fast at first and then
+    less, with one below. Within the first turn the height grows in proportion: no power law holds there.
     """
 
     name: ClassVar[str] = "wear"
     about: ClassVar[Cause] = Cause(
         title="lost motion that grows",
-        equation="(growth / 2) run s, run = turns_before + sum |d theta_M| / 360, s = clip(s_before + 2 d "
-        "theta_M / width, -1, 1)",
+        equation="(growth / 2) (run / 1000)^exponent s, run = turns_before + sum |d theta_M| / 360, "
+        "s = clip(s_before + 2 d theta_M / width, -1, 1)",
         signature="the distance between the two directions grows steadily with the turns run, at one "
         "temperature",
         consequence="repeatability from either side gets worse with time",
         remedy="calibrate again at intervals; watch the rate; grease; replace the gear when it speeds up",
         experiment="the same stepping test again, cold, some hours of running apart",
         aliases=("amplitude_drift", "zero_drift", "ratio_error", "backlash"),
-        source="lost motion proportional to sliding distance (Archard's law)",
+        source="lost motion proportional to sliding distance (Archard's law), slowing down while it runs in",
         size="grows by 0.1-10 arcsec per thousand motor turns in a fast test",
     )
     compensable: ClassVar[Compensable] = Compensable(
         True, "the turns run are known; they have to be carried over from run to run in turns_before"
     )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("width_deg", 0.05, 60.0, logarithmic=True),)
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("width_deg", 0.05, 60.0, logarithmic=True),
+        Shape("exponent", 0.3, 1.5),
+    )
     linear: ClassVar[tuple[str, ...]] = ("growth_arcsec_per_kiloturn",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
     """One arcsec per thousand turns, crossed in two degrees."""
 
     growth_arcsec_per_kiloturn: Annotated[
-        float, Field(ge=-1000, le=1000, description="growth of the loop's height per 1000 motor turns")
+        float, Field(ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns")
     ]
     width_deg: Annotated[float, Field(gt=0, le=360, description="motor angle of a full crossing")]
+    exponent: Annotated[
+        float, Field(ge=0.1, le=3, description="1 for steady wear, below 1 while it runs in")
+    ] = 1.0
     turns_before: Annotated[
         float, Field(ge=0, le=1e9, description="motor turns run before the first sample")
     ] = 0.0
@@ -64,50 +72,83 @@ class Wear(Linear):
     ] = 10_000.0
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A growth of one arcsec per 1000 turns, shape (n, 1)."""
+        """A growth of one arcsec in 1000 turns, shape (n, 1)."""
         angle = motion.motor_deg
         run = self.turns_before + np.cumsum(np.abs(np.diff(angle, prepend=angle[:1]))) / DEG_PER_TURN
-        height = 0.5e-3 * np.minimum(run, self.turns_limit)
-        return (height * stop(angle, self.width_deg, start))[:, np.newaxis]
+        run = np.minimum(run, self.turns_limit)
+        share = np.where(run < 1.0, run, np.maximum(run, 1.0) ** self.exponent)
+        half: FloatArray = 0.5 * _kiloturns(1.0, self.exponent) * share
+        column: FloatArray = half * stop(angle, self.width_deg, start)
+        return column[:, np.newaxis]
+
+    def after(self, turns: float) -> Self:
+        """The same when the motor has run so many turns more."""
+        return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; its first `advance` only says where the motor stands."""
-        return _Tracker(self, start)
+        return _Tracker(self, start, math.inf)
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """One that takes as much motor angle for the crossing as the present height asks for."""
+        if self.growth_arcsec_per_kiloturn >= 0.0:
+            return None
+        crossing = fall_arcsec_per_deg - self._fastest_growth()
+        return _Tracker(self, start, crossing) if crossing > 0.0 else None
 
     def bound_arcsec(self) -> float:
         """The height at the limit."""
-        return 0.5e-3 * abs(self.growth_arcsec_per_kiloturn) * self.turns_limit
+        return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
         """The crossing at full height (where it crosses downwards), and the growth along the way."""
-        height = self.bound_arcsec()
-        crossing = 2.0 * height / self.width_deg if self.growth_arcsec_per_kiloturn < 0.0 else 0.0
-        return crossing + 0.5e-3 * abs(self.growth_arcsec_per_kiloturn) / DEG_PER_TURN
+        crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
+        return crossing + self._fastest_growth()
+
+    def _half(self, turns: float) -> float:
+        """Half the height after so many turns, arcsec, signed."""
+        return 0.5 * self.growth_arcsec_per_kiloturn * _kiloturns(turns, self.exponent)
+
+    def _fastest_growth(self) -> float:
+        """Half the height's growth where it is fastest, arcsec per motor degree."""
+        late = self.exponent * math.pow(max(self.turns_limit, 1.0), self.exponent - 1.0)
+        return abs(self._half(1.0)) * max(1.0, self.exponent, late) / DEG_PER_TURN
+
+
+def _kiloturns(turns: float, exponent: float) -> float:
+    """The height's share of that of the first thousand turns."""
+    return math.pow(1e-3, exponent) * (turns if turns < 1.0 else math.pow(turns, exponent))
 
 
 class _Tracker(Tracker):
-    """State: the stop operator, the distance run (degrees), the last angle."""
+    """State: the stop operator's value, the distance run (degrees), the last angle."""
 
-    __slots__ = ("_angle", "_before", "_distance", "_limit", "_rate", "_stop")
+    __slots__ = ("_angle", "_before", "_distance", "_fall", "_gain", "_half", "_limit", "_value")
 
-    def __init__(self, effect: Wear, start: Start) -> None:
-        self._rate = 0.5e-3 * effect.growth_arcsec_per_kiloturn
+    def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
+        """``fall_arcsec_per_deg``: no crossing is steeper."""
+        self._half = effect._half
+        self._gain = 2.0 / effect.width_deg
+        self._fall = fall_arcsec_per_deg
         self._before = effect.turns_before
         self._limit = effect.turns_limit
-        self._stop = Stop(effect.width_deg, start)
+        self._value = float(start.value)
         self._distance = 0.0
         self._angle: float | None = None
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._rate * self._run(self._to(motor_deg)) * self._stop.at(motor_deg)
+        _, half, value = self._at(motor_deg)
+        return half * value
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        self._distance = self._to(motor_deg)
+        self._distance, half, self._value = self._at(motor_deg)
         self._angle = motor_deg
-        return self._rate * self._run(self._distance) * self._stop.to(motor_deg)
+        return half * self._value
 
-    def _to(self, motor_deg: float) -> float:
-        return self._distance if self._angle is None else self._distance + abs(motor_deg - self._angle)
-
-    def _run(self, distance_deg: float) -> float:
-        return min(self._before + distance_deg / DEG_PER_TURN, self._limit)
+    def _at(self, motor_deg: float) -> tuple[float, float, float]:
+        """Distance run, half the height and the stop operator's value at an angle."""
+        step = 0.0 if self._angle is None else motor_deg - self._angle
+        distance = self._distance + abs(step)
+        half = self._half(min(self._before + distance / DEG_PER_TURN, self._limit))
+        gain = self._gain if abs(half) * self._gain <= self._fall else self._fall / abs(half)
+        return distance, half, min(max(self._value + gain * step, -1.0), 1.0)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from hdbridge.diagnose import Diagnosis, Finding
-from hdbridge.effects import CATALOGUE, Channel, Effect
+from hdbridge.effects import CATALOGUE, Channel, Effect, Wear
 from hdbridge.model import TransmissionModel
+from hdbridge.units import DEG_PER_TURN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +42,8 @@ def extension_of(
     """The diagnosis's extended model without what is tied to the time of its record.
 
     A lost count or the phase of a vibration says nothing of tomorrow. What is not compensated but repeats
-    (orders of the load of unknown origin) stays in the model, where a person can state its origin.
+    (orders of the load of unknown origin) stays in the model, where a person can state its origin. Wear goes
+    on from the turns that the motor has run by the end of the record.
     ``rivals`` are the causes that each has not been told from (`further.untold`): where one of them must not
     be compensated, what was found is left out too, for it may well be that one.
     """
@@ -50,8 +54,9 @@ def extension_of(
     doubtful = {
         each.cause for each in diagnosis.findings if each.effect is not None and each.effect.is_compensable()
     } - names
+    turns = _turns_run(diagnosis)
     kept = tuple(
-        each
+        each.after(turns) if isinstance(each, Wear) else each
         for each in diagnosis.model.effects
         if each.name in known or not (_of_its_time(each) or each.name in doubtful)
     )
@@ -72,6 +77,11 @@ def named(findings: Sequence[Finding]) -> str:
 def alternatives(finding: Finding) -> str:
     """A cause and what it could also be, in words."""
     return " or ".join((finding.cause, *finding.aliases))
+
+
+def _turns_run(diagnosis: Diagnosis) -> float:
+    """Motor turns of the record."""
+    return float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
 
 
 def _of_its_time(effect: Effect) -> bool:

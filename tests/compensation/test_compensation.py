@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.compensation import Compensation, CompensationLimits, Inverse
-from hdbridge.effects import CATALOGUE, Hysteresis, Moment, MotorOrder, Start, Synchronous
+from hdbridge.effects import CATALOGUE, Backlash, Hysteresis, Moment, MotorOrder, Start, Synchronous, Wear
 from hdbridge.effects.hysteresis import rise_at
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -96,6 +96,44 @@ def test_a_model_too_steep_to_invert_is_refused():
     )
     with pytest.raises(InputError, match=r"fall by 105 arcsec per motor degree.*check the amplitudes"):
         Inverse(steep)
+
+
+PLAY = {
+    "narrower than it can be": (Backlash(gap_arcsec=20, crossing_deg=0.02),),
+    "growing": (Wear(growth_arcsec_per_kiloturn=-100, width_deg=0.05, exponent=0.7, turns_before=40),),
+    "both": (
+        Backlash(gap_arcsec=6, crossing_deg=0.02),
+        Wear(growth_arcsec_per_kiloturn=-100, width_deg=0.05, turns_before=40),
+    ),
+}
+
+
+@pytest.mark.parametrize("play", PLAY.values(), ids=PLAY)
+def test_past_the_crossing_play_is_made_up_for_though_it_has_no_inverse(play):
+    bare = model()
+    worn = TransmissionModel(bare.ratio, (*bare.effects, *play))
+    inverse, gear = Inverse(worn, Start.FORWARD), worn.tracker(Start.FORWARD)
+    inverse.advance(0.0)
+    gear.advance(0.0, NOW)
+    for load_deg in (1.0, 8.0, 7.0, 7.5, -3.0, -2.9, 4.0):
+        motor_deg = inverse.solve(load_deg)
+        inverse.advance(motor_deg)
+        assert motor_deg / 50.0 + gear.advance(motor_deg, NOW) / 3600 == pytest.approx(load_deg, abs=1e-8)
+
+
+def test_within_the_crossing_of_play_the_motor_runs_ahead_but_never_back():
+    inverse = Inverse(TransmissionModel(50.0, PLAY["growing"]), Start.FORWARD)
+    inverse.advance(0.0)
+    path = [inverse.solve(0.1)]
+    inverse.advance(path[0])
+    for back in range(1, 40):
+        path.append(inverse.solve(0.1 - 1e-4 * back))
+        inverse.advance(path[-1])
+    steps = -np.diff(path)
+    assert np.all(steps > 0.0)
+    # It takes up the lost motion on either side, and goes on as the load is told to.
+    assert steps[0] > 3 * 50e-4
+    assert steps[-1] == pytest.approx(50e-4, rel=1e-3)
 
 
 def travel(seconds: float, speed_deg_s: float = 10.0) -> list[float]:

@@ -123,6 +123,7 @@ EXAMPLES = {
         Wear,
         growth_arcsec_per_kiloturn=st.floats(-100, 100),
         width_deg=st.floats(0.1, 30),
+        exponent=st.one_of(st.just(1.0), st.floats(0.3, 1.5)),
         turns_before=st.floats(0, 50),
         turns_limit=st.floats(1, 1000),
     ),

@@ -244,6 +244,42 @@ def test_lost_motion_grows_with_the_turns_run():
     np.testing.assert_allclose(error, [0, 3, -4, 4])  # half of 1.5, then of 2 (the limit) times 4
 
 
+def test_a_gear_that_runs_in_wears_less_and_less():
+    effect = Wear(growth_arcsec_per_kiloturn=-40, width_deg=1, exponent=0.5)
+    turns = np.array([0.0, 10.0, 40.0, 1000.0])
+    np.testing.assert_allclose(effect.predict(Motion(360.0 * turns)), [0, -2, -4, -20])
+    later = effect.after(10.0).predict(Motion(360.0 * (turns[1:] - turns[1])), Start.FORWARD)
+    np.testing.assert_allclose(later, [-2, -4, -20])
+
+
+PLAY = [
+    Backlash(gap_arcsec=20, crossing_deg=0.01),
+    Wear(growth_arcsec_per_kiloturn=-100, width_deg=0.05, exponent=0.7, turns_before=40),
+]
+
+
+@pytest.mark.parametrize("effect", PLAY, ids=lambda each: each.name)
+def test_play_for_an_inverse_is_crossed_no_steeper_than_asked_and_is_the_same_beyond(effect):
+    gentle, exact = effect.gentle_tracker(Start.FORWARD, 50.0), effect.tracker(Start.FORWARD)
+    for angle in (0.0, 720.0):
+        gentle.advance(angle, Moment())
+        exact.advance(angle, Moment())
+    back = 720.0 - np.linspace(0, 5, 5001)
+    soft = np.array([gentle.peek(float(each), Moment()) for each in back])
+    assert np.max(np.diff(soft)) <= 50.0 * 0.001 * (1 + 1e-6)
+    assert soft[0] == exact.peek(720.0, Moment())
+    assert soft[-1] == exact.peek(715.0, Moment())
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [Synchronous(orders=(ORDER_4,)), Wear(growth_arcsec_per_kiloturn=4, width_deg=1)],
+    ids=lambda each: each.name,
+)
+def test_what_is_no_play_has_no_gentler_form(effect):
+    assert effect.gentle_tracker(Start.FORWARD, 50.0) is None
+
+
 def test_after_a_stop_the_load_relaxes_exponentially_however_it_is_sampled():
     effect = Creep(parts=(Relaxation(amplitude_arcsec=6, tau_s=2),), build_up=0.01)
     for rest in ([2.0, 4.0, 10.0], [0.3, 1.9, 2.0, 3.0, 4.0, 7.7, 10.0]):
@@ -310,6 +346,7 @@ STEEP = [
     DirectionPhase(orders=(ORDER_4,), shift_deg=3),
     Backlash(gap_arcsec=10, crossing_deg=2),
     Wear(growth_arcsec_per_kiloturn=-40, width_deg=2, turns_before=1000, turns_limit=1000),
+    Wear(growth_arcsec_per_kiloturn=-40, width_deg=2, exponent=0.5, turns_before=1000, turns_limit=1000),
     RatioError(ramp_arcsec_per_turn=-30),
 ]
 
