@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
+from hdbridge.identify.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, locked_counts
 from hdbridge.identify.design import Design
 from hdbridge.identify.linear import solve_symmetric
 from hdbridge.identify.samples import IntArray
@@ -27,6 +28,7 @@ DELAY = "delay_ms"
 ROUNDING = "rounding"
 TURNS = "turns"
 SWING = "swing_ms2"
+SWING_LAG = "swing_ms3"
 TEXTS = {
     DELAY: "the load encoder is read later than the motor's by",
     ROUNDING: "in the direction of its last motion the motor is behind what its encoder says, at rest, by",
@@ -35,20 +37,16 @@ TEXTS = {
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
 """Standard deviation beforehand: 1 / (2 pi f)^2 of a load that swings at f = 32 Hz."""
+SWING_MS3 = 50.0
+"""The same for a damping ratio z of the swing: 2 z / (2 pi f)^3."""
 SWING_COUNT_ARCSEC = 2.0
 """With a coarser motor encoder its sawtooth, which differs from speed to speed too, poses as swing."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
 """Standard deviation that an unknown place within a count has."""
-DIFFERENT_COUNTS = 0.15
-"""The same for how much rounding differs from one speed to another."""
-LOCKED_COUNTS = 0.03
-"""At least so much there may be at any speed: it may keep step with the counts."""
 SPEEDS_COUNTS_S = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0, np.inf)
 """Edges of the classes of speed that round alike; at rest is a class of its own."""
-AVERAGED_COUNTS_S = 200.0
-"""Faster than this a servo passes several counts before it answers, and rounding averages out."""
 SHARE = 0.1
 """A nuisance of whose column less than this is left by what else is fitted stays out."""
 
@@ -105,12 +103,12 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
     rate = np.abs(blocks.speed_deg_s) / max(samples.count_deg, 1e-12)
     share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
     columns = [~blocks.moving, np.where(blocks.moving, share, 1.0)]
-    sizes = [DIFFERENT_COUNTS, COUNTS]
+    sizes = [LOCKED_COUNTS, COUNTS]
     for low, high in pairwise(SPEEDS_COUNTS_S):
         inside = blocks.moving & (rate >= low) & (rate < high)
         if inside.any():
             columns.append(inside)
-            sizes.append(max(DIFFERENT_COUNTS * float(np.median(share[inside])), LOCKED_COUNTS))
+            sizes.append(float(np.median(locked_counts(blocks.speed_deg_s[inside], samples.count_deg))))
     against = -blocks.heading * count_arcsec
     return np.stack([against * each for each in columns], axis=1), np.array(sizes)
 
@@ -134,15 +132,19 @@ def is_rounding(name: str) -> bool:
     return is_turn(name) or name.startswith(ROUNDING)
 
 
-def swing_column(design: Design, waves: Sequence[tuple[float, FloatArray]]) -> FloatArray:
-    """What the load shows beyond waves of the motor angle, per ms^2; shape (b, 1), arcsec.
+def swing_columns(design: Design, waves: Sequence[tuple[float, FloatArray, FloatArray]]) -> FloatArray:
+    """What the load shows beyond waves of the motor angle, per ms^2 and per ms^3; shape (b, 2), arcsec.
 
-    ``waves`` are orders and what they contribute to each block, (b,). Driven by a cos(w t) well below its
-    natural frequency f a load answers with (1 + w^2 / (2 pi f)^2) a cos(w t).
+    ``waves`` are orders, what they contribute to each block, (b,), and the same a quarter of a wave later.
+    Driven by a cos(w t) well below its natural frequency f a load on a spring with damping ratio z answers
+    with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): more, and later both ways.
     """
     rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
-    column = sum(((order * rate) ** 2 * wave for order, wave in waves), start=np.zeros(len(rate)))
-    return np.asarray(column * 1e-6)[:, np.newaxis]
+    columns = np.zeros((len(rate), 2))
+    for order, wave, later in waves:
+        columns[:, 0] += (order * rate * 1e-3) ** 2 * wave
+        columns[:, 1] += (order * rate * 1e-3) ** 3 * later
+    return columns
 
 
 def speeds_differ(design: Design) -> float:
@@ -160,9 +162,9 @@ def beside(
     design: Design,
     nuisances: Sequence[str],
     effects: Sequence[Effect],
-    waves: Sequence[tuple[float, FloatArray]] = (),
+    waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Beside:
-    """Zeros and the nuisances named; ``waves`` as for `swing_column`."""
+    """Zeros and the nuisances named; ``waves`` as for `swing_columns`."""
     count = design.samples.zeros
     columns = [zeros(design)]
     names = [f"zero {number}" for number in range(count)]
@@ -182,9 +184,9 @@ def beside(
         names += [f"turn {number}" for number in range(column.shape[1])]
         prior += [COUNTS**-2] * column.shape[1]
     if SWING in nuisances and waves:
-        columns.append(swing_column(design, waves))
-        names.append(SWING)
-        prior.append(SWING_MS2**-2)
+        columns.append(swing_columns(design, waves))
+        names += [SWING, SWING_LAG]
+        prior += [SWING_MS2**-2, SWING_MS3**-2]
     return Beside(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.effects.hysteresis import branches
 from hdbridge.identify.samples import BoolArray, IntArray, Samples
+from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000
 LONGEST_S = 0.25
@@ -23,6 +24,13 @@ FINE_DEG = 0.4
 """Just after a reversal blocks are a twentieth of this angle plus of the angle since the reversal."""
 REST_DEG_S = 0.05
 """Motor speed below which an axis stands."""
+AVERAGED_COUNTS_S = 200.0
+"""Faster than this a servo passes several counts before it answers, and rounding averages out."""
+LOCKED_COUNTS = 0.15
+"""Standard deviation of what rounding leaves over a leg: sampled in step with the counts that it passes, an
+encoder is read at the same few places within a count all the way to the next turn."""
+LEAST_LOCKED_COUNTS = 0.03
+"""At least so much there may be at any speed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +62,10 @@ class Blocks:
     middle: IntArray
     """The sample in the middle of each block."""
     error_arcsec: FloatArray
+    leg: IntArray
+    """Number of the way from turn to turn that a block lies on."""
+    locked_arcsec: FloatArray
+    """Standard deviation of an error that is the same over a leg, from reading the motor in whole counts."""
     blur: FloatArray
     """Variance of each block, arcsec squared, because the driving angle is known to a count only."""
 
@@ -101,12 +113,14 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
     index = np.flatnonzero(samples.usable)
     travel = np.concatenate([_travel(samples.motor_deg[chain.rows]) for chain in samples.chains])
     chain = np.empty(len(samples), dtype=np.intp)
+    leg = np.empty(len(samples), dtype=np.intp)
     key = np.empty(len(samples), dtype=np.int64)
     coarsest = float(
         np.clip(sum(float(travel[each.rows][-1]) for each in samples.chains) / TARGET_BLOCKS, 1.0, 6.0)
     )
     for number, each in enumerate(samples.chains):
         chain[each.rows] = number
+        leg[each.rows] = _legs(samples.motor_deg[each.rows]) + (leg[each.rows.start - 1] + 1 if number else 0)
         key[each.rows] = _cells(samples.motor_deg[each.rows], coarsest)
     time = samples.time_s
     cut = np.ones(len(index), dtype=bool)
@@ -132,6 +146,7 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
 
     weighted_error = np.add.reduceat(samples.error_arcsec[index] * weights, first) / np.maximum(count, 1e-300)
     middle = index[(first + last) // 2]
+    speed, moving = mean(samples.speed_deg_s), np.abs(samples.speed_deg_s[middle]) > REST_DEG_S
     return Blocks(
         index=index,
         first=first,
@@ -142,20 +157,36 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
         motor_deg=mean(samples.motor_deg),
         travel_deg=mean(travel),
         extent_deg=travel[index[last]] - travel[index[first]],
-        speed_deg_s=mean(samples.speed_deg_s),
-        moving=np.abs(samples.speed_deg_s[middle]) > REST_DEG_S,
+        speed_deg_s=speed,
+        moving=moving,
         heading=np.concatenate([_heading(samples.motor_deg[each.rows]) for each in samples.chains])[middle],
         kind=samples.kind[middle],
         zero=samples.zero[middle],
         chain=chain[middle],
         middle=middle,
         error_arcsec=weighted_error,
+        leg=leg[middle],
+        locked_arcsec=moving
+        * locked_counts(speed, samples.count_deg)
+        * (samples.count_deg / samples.ratio * ARCSEC_PER_DEG),
         blur=np.zeros(len(first)),
     )
 
 
+def locked_counts(speed_deg_s: FloatArray, count_deg: float) -> FloatArray:
+    """What rounding leaves over a leg at a motor speed, counts (standard deviation)."""
+    rate = np.abs(speed_deg_s) / max(count_deg, 1e-12)
+    share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
+    return np.maximum(LOCKED_COUNTS * share, LEAST_LOCKED_COUNTS)
+
+
 def _travel(motor_deg: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(motor_deg)))])
+
+
+def _legs(motor_deg: FloatArray) -> IntArray:
+    turning, _ = branches(motor_deg)
+    return np.searchsorted(turning[1:-1], np.arange(len(motor_deg)), "left")
 
 
 def _heading(motor_deg: FloatArray) -> FloatArray:

@@ -2,7 +2,9 @@
 
 The covariance of a fit under the noise model is the inverse information. Where the noise model is wrong the
 scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger
-1986) finds out, and wherever it is wider it is believed.
+1986) finds out, and wherever it is wider it is believed. What reading in counts leaves in a wave is the same
+all along a sweep, and other in the next: for waves the stretches are whole legs as well, and since there are
+few of these, all waves are taken together.
 """
 
 from __future__ import annotations
@@ -15,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects import Effect, FloatArray, Synchronous
 from hdbridge.identify.beside import is_turn
 from hdbridge.identify.blocks import Blocks
 from hdbridge.identify.design import clusters, moved
-from hdbridge.identify.joint import Solution
+from hdbridge.identify.joint import Column, Solution
 from hdbridge.identify.linear import inverse_symmetric
 from hdbridge.identify.noise import Precision
 
@@ -68,7 +70,30 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
     sandwich = inner @ (sums.T @ sums) @ inner * count / (count - 1.0)
     widen = np.ones(len(model))
     widen[main] = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inner), 1e-300), 1.0))
+    waves = np.array([at for at, each in enumerate(solution.columns) if _is_wave(solution, each)], dtype=int)
+    if len(waves):
+        between = math.sqrt(_between_legs(solution.jacobian[:, waves], precision, solution.residual, blocks))
+        widen[waves] = np.maximum(widen[waves], between)
     return np.asarray(model * np.outer(widen, widen))
+
+
+def _is_wave(solution: Solution, column: Column) -> bool:
+    return column.effect >= 0 and isinstance(solution.effects[column.effect], Synchronous)
+
+
+def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
+    """By how much the variance of waves, taken from leg to leg, is more than the noise model's; at least 1.
+
+    Waves (b, p) of one kind have nearly the same information and hardly share any, so that each tells of all.
+    """
+    scores = np.zeros((int(blocks.leg[-1]) + 1, waves.shape[1]))
+    own = np.zeros_like(scores)
+    np.add.at(scores, blocks.leg, waves * precision.apply(residual)[:, np.newaxis])
+    np.add.at(own, blocks.leg, waves * precision.apply(waves))
+    information = np.sum(own, axis=0)
+    legs = information**2 / np.sum(own**2, axis=0)
+    ratio = np.sum(scores**2, axis=0) / information * legs / np.maximum(legs - 1.0, 0.5)
+    return max(float(np.mean(ratio)), 1.0)
 
 
 def effect_intervals(solution: Solution, index: int, cov: FloatArray) -> list[Interval]:

@@ -1,9 +1,10 @@
 """Noise that is not white, and least squares that know it.
 
-Three parts: white noise (its size may differ between standing and moving), a slow wander in time, and a
-wander over the motor's *way*: an axis rests anywhere within a count of its encoder, the same way as long as
-it stands and another way at the next stop. Both wanders are first-order Markov processes, so the inverse of
-their covariance is banded, and a fit costs no more than one with white noise (Rybicki and Press 1995).
+Four parts: white noise (its size may differ between standing and moving), a slow wander in time, a wander
+over the motor's *way*: an axis rests anywhere within a count of its encoder, the same way as long as it
+stands and another way at the next stop; and what rounding to counts leaves over a whole leg, of a size that
+the count gives. The wanders are first-order Markov processes, so the inverse of their covariance is banded,
+and a fit costs no more than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from hdbridge.identify.samples import BoolArray, IntArray
 PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC = 1e-3
+SAME_LEG = 1e-6
+"""A block's step along a wander that stays the same over a leg: as good as none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,21 +64,27 @@ class Precision:
         self._loads: list[FloatArray] = []
         chains: list[tuple[FloatArray, FloatArray]] = []
         fresh = np.diff(blocks.chain) != 0
+        other_leg = np.where(np.diff(blocks.leg) != 0, np.inf, SAME_LEG)
         self._log_determinant = float(np.sum(np.log(weight[weight > 0])))
+        steps: list[FloatArray] = []
         for size, length, place, extent in (
             (noise.slow_arcsec, noise.slow_s, blocks.time_s, blocks.duration_s),
             (noise.place_arcsec, noise.place_deg, blocks.travel_deg, blocks.extent_deg),
         ):
-            if size <= 0:
-                continue
-            step = np.where(fresh, np.inf, np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length)
+            if size > 0:
+                way = np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length
+                steps.append(np.where(fresh, np.inf, way))
+                self._loads.append(size * np.sqrt(_averaged(extent / length)))
+        if np.any(blocks.locked_arcsec):
+            steps.append(other_leg)
+            self._loads.append(blocks.locked_arcsec)
+        for step in steps:
             spread = -np.expm1(-2.0 * step)
             decay = np.exp(-step)
             diagonal = np.ones(len(blocks))
             diagonal[:-1] += decay**2 / spread
             diagonal[1:] += decay**2 / spread
             chains.append((diagonal, -decay / spread))
-            self._loads.append(size * np.sqrt(_averaged(extent / length)))
             self._log_determinant += float(-np.sum(np.log(spread)))
         self._factor = self._factored(chains) if chains else None
 
@@ -86,8 +95,9 @@ class Precision:
         for number, (diagonal, beside) in enumerate(chains):
             band[0, number::width] = diagonal + self.weight * self._loads[number] ** 2
             band[width, number : width * (count - 1) : width] = beside
-        if width == 2:
-            band[1, 0::2] = self.weight * self._loads[0] * self._loads[1]
+        for apart in range(1, width):
+            for number in range(width - apart):
+                band[apart, number::width] = self.weight * self._loads[number] * self._loads[number + apart]
         factor: FloatArray = cholesky_banded(band, lower=True, check_finite=False)
         self._log_determinant -= 2.0 * float(np.sum(np.log(factor[0])))
         return factor

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.effects import FloatArray, Motion, Start
+from hdbridge.effects.hysteresis import branches
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import driving_angle, quantum_deg
 from hdbridge.identify.segment import MINIMUM_SAMPLES, Kind, Segment
@@ -20,7 +22,10 @@ KINDS = tuple(Kind)
 SPEED_WINDOW_S = 0.02
 """The speed of a sample is taken over this much time on either side."""
 SETTLE_S = 0.1
-"""After a fast move the load is left this much time to come to rest."""
+"""After a fast move the load is left this much time to come to rest, and after a turn, where the hysteresis
+rises too steeply for a load on a spring to follow."""
+SETTLE_SHARE = 0.2
+"""But no more than this share of the way to the next turn."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis stands."""
 GENTLE_DEG_S2 = 40.0
@@ -120,6 +125,7 @@ def gather(
     load = np.concatenate([each.load_deg for each in segments])
     kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
     speed = np.concatenate([_rate(time[each.rows], each.motion.motor_deg) for each in chains])
+    turned = np.concatenate([_has_turned(time[each.rows], each.motion.motor_deg) for each in chains])
     zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
     _check_ratio(measured, load, zero, ratio, segments[0].name)
     error = load - measured / ratio
@@ -132,7 +138,7 @@ def gather(
         load_deg=load,
         error_arcsec=error * ARCSEC_PER_DEG,
         speed_deg_s=speed,
-        usable=_usable(time, speed / ratio, kind, slow_deg_s),
+        usable=_usable(time, speed / ratio, kind, slow_deg_s) & ~turned,
         kind=kind,
         zero=zero,
         zeros=len(names),
@@ -193,6 +199,16 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
             fast[part] |= bool(np.max(moving[part]) > slow_deg_s)
     last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
     return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))
+
+
+def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
+    """Samples within `SETTLE_S` after a turn."""
+    turned = np.zeros(len(time), dtype=bool)
+    turning, _ = branches(motor_deg)
+    for first, last in pairwise(turning[1:]):
+        settled = time[first] + min(SETTLE_S, SETTLE_SHARE * float(time[last] - time[first]))
+        turned[first + 1 : int(np.searchsorted(time, settled, "right"))] = True
+    return turned
 
 
 def _check_ratio(motor: FloatArray, load: FloatArray, zero: IntArray, ratio: float, name: str) -> None:

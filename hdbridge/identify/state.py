@@ -41,8 +41,8 @@ class State(NamedTuple):
         """Zeros and nuisances."""
         return beside(self.design, self.nuisances, self.effects, self._shaking())
 
-    def _shaking(self) -> list[tuple[float, FloatArray]]:
-        """Orders of the synchronous part, and what each contributes to the blocks."""
+    def _shaking(self) -> list[tuple[float, FloatArray, FloatArray]]:
+        """Orders of the synchronous part, what each contributes to the blocks, and a quarter later."""
         if self.synchronous is None:
             return []
         places = {each.number: at for at, each in enumerate(self.candidates) if each.family is Family.MOTOR}
@@ -50,8 +50,11 @@ class State(NamedTuple):
         for each in self.synchronous.orders:
             phase = np.deg2rad(each.phase_deg)
             pair = self.waves[:, 2 * places[each.order] : 2 * places[each.order] + 2]
-            both = each.amplitude_arcsec * np.array([np.cos(phase), -np.sin(phase)])
-            waves.append((float(each.order), np.asarray(pair @ both)))
+            both = each.amplitude_arcsec * np.array(
+                [[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]]
+            )
+            now, later = (pair @ both).T
+            waves.append((float(each.order), now, later))
         return waves
 
     def precision(self) -> Precision:

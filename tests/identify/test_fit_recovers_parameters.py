@@ -175,8 +175,25 @@ def test_a_delay_between_the_encoders_is_told_from_the_offset(bench):
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
 
 
-def test_a_load_that_swings_does_not_raise_the_orders(bench):
-    """Sweeps at two speeds, each order raised as a load of 16 Hz natural frequency raises it."""
+def test_a_load_that_cannot_follow_a_turn_bends_no_loop(bench):
+    """Just after each turn the hysteresis rises faster than a load on a spring can."""
+    axis = bench.axis(noise=0.2)
+    segments = []
+    for each in axis.record(bench.plan()):
+        motor = each.motor_deg
+        first = np.argmax(motor != motor[0])
+        behind = -2.0 * np.sign(motor[first] - motor[0]) * (np.arange(len(motor)) < 0.08 * bench.rate_hz)
+        segments.append(
+            replace(each, load_deg=each.load_deg + behind * (each.kind is Kind.REVERSAL) / 3600.0)
+        )
+    result = fit(segments, axis.ratio, bench.options)
+    assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 1.5
+    assert off(result, "hysteresis", "width_deg", axis.width) < 1.5
+    assert off(result, "hysteresis", "exponent", axis.exponent) < 1.5
+
+
+def test_a_load_that_swings_raises_and_shifts_no_orders(bench):
+    """Sweeps at two speeds, each order raised and delayed as a damped load of 16 Hz does it."""
     axis = bench.axis(orders={1: (5.0, -120.0), 6: (8.0, 100.0)}, noise=0.2)
     segments = []
     for each in axis.record(
@@ -190,12 +207,13 @@ def test_a_load_that_swings_does_not_raise_the_orders(bench):
             segments.append(each)
             continue
         rate = np.gradient(np.deg2rad(each.motor_deg), each.time_s)
-        swing = sum(
-            (order * rate / (2.0 * np.pi * 16.0)) ** 2
-            * amplitude
-            * np.cos(order * np.deg2rad(each.motor_deg) + np.deg2rad(phase))
-            for order, (amplitude, phase) in axis.orders.items()
-        )
+        swing = np.zeros(len(each))
+        for order, (amplitude, phase) in axis.orders.items():
+            angle, share = (
+                order * np.deg2rad(each.motor_deg) + np.deg2rad(phase),
+                order * rate / (32.0 * np.pi),
+            )
+            swing += amplitude * (share**2 * np.cos(angle) + 2.0 * 0.2 * share**3 * np.sin(angle))
         segments.append(replace(each, load_deg=each.load_deg + swing / 3600.0))
     result = fit(segments, axis.ratio, bench.options)
     found = {each.order.number: each.amplitude_arcsec for each in result.orders}
@@ -203,6 +221,9 @@ def test_a_load_that_swings_does_not_raise_the_orders(bench):
     natural_ms2 = 1e6 / (2.0 * np.pi * 16.0) ** 2
     swing = next(each for each in result.nuisances if each.name == "swing_ms2")
     assert swing.value == pytest.approx(natural_ms2, rel=0.2)
+    for order, (amplitude, phase) in axis.orders.items():
+        assert off(result, "synchronous", f"orders[{order}].amplitude_arcsec", amplitude) < 1.5
+        assert off(result, "synchronous", f"orders[{order}].phase_deg", phase) < 1.5
 
 
 def test_default_options_suit_a_bare_record(bench):

@@ -1,5 +1,7 @@
 """Noise that is not white: the banded algebra is the dense one, and its parameters are found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,15 +26,18 @@ def blocks_of(count, rng, motor=None, error=None, kind=Kind.SWEEP):
 @settings(deadline=None, max_examples=15)
 @given(
     st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.5, 50.0), st.floats(0.0, 2.0), st.floats(1.0, 50.0),
-    st.integers(0, 1000),
+    st.sampled_from([0.0, 0.3]), st.integers(0, 1000),
 )  # fmt: skip
-def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, seed):
+def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, locked, seed):
     rng = np.random.default_rng(seed)
     blocks, _ = blocks_of(40, rng)
+    legs = np.sort(rng.integers(0, 5, 40))
+    blocks = replace(blocks, leg=legs, locked_arcsec=locked * rng.uniform(size=40))
     noise = NoiseModel(white, white, slow, slow_s, place, place_deg)
     dense = np.diag(noise.white_variance(blocks))
     for size, length, at in ((slow, slow_s, blocks.time_s), (place, place_deg, blocks.travel_deg)):
         dense += size**2 * np.exp(-np.abs(at[:, np.newaxis] - at) / length)
+    dense += np.outer(blocks.locked_arcsec, blocks.locked_arcsec) * (legs[:, np.newaxis] == legs)
     columns = rng.normal(size=(40, 3))
     precision = Precision(noise, blocks)
     assert precision.apply(columns) == pytest.approx(np.linalg.solve(dense, columns), rel=1e-5, abs=1e-6)
@@ -96,8 +101,29 @@ def test_blocks_average_a_column_exactly():
     values = rng.normal(size=4000)
     assert blocks.count @ blocks.mean(values) == pytest.approx(np.sum(values[samples.usable]))
     assert len(blocks) < 1500
-    near = (blocks.motor_deg > 297.0) & (blocks.heading < 0)
+    near = (blocks.motor_deg > 292.0) & (blocks.heading < 0)
     assert np.max(blocks.extent_deg[near]) < 0.5 < np.max(blocks.extent_deg)
+
+
+def test_a_load_is_left_time_to_settle_after_a_turn_but_not_most_of_the_way():
+    time = np.arange(4000) / 250.0
+    up, down = np.linspace(0.0, 60.0, 1600), np.linspace(60.0, 40.0, 1600)
+    motor = np.concatenate([up, down, np.tile([38.0, 40.0], 20).repeat(20)])  # then a turn each 0.08 s
+    samples = gather([Segment(time, motor, motor / 50.0, Kind.SWEEP)], 50.0, slow_deg_s=1e9)
+    assert samples.usable[:1600].all()
+    assert np.flatnonzero(~samples.usable[1600:3200]) == pytest.approx(np.arange(1, 26))
+    assert np.mean(samples.usable[3200:]) > 0.6
+
+
+def test_what_is_the_same_over_a_leg_is_no_motion_of_the_leg():
+    """Legs that are read wrong by as much as their counts allow do not move a mean by more than its error."""
+    rng = np.random.default_rng(7)
+    motor = np.round(np.concatenate([rng.uniform(5.0, 30.0, 50).cumsum() * s for s in (1, -1, 1, -1)]) / 0.09)
+    blocks, _ = blocks_of(200, rng, motor * 0.09)
+    assert np.all(blocks.locked_arcsec > 0.0)
+    ones = np.ones(len(blocks))
+    free = Precision(NoiseModel(0.1, 0.1), replace(blocks, locked_arcsec=0.0 * ones))
+    assert ones @ Precision(NoiseModel(0.1, 0.1), blocks).apply(ones) < 0.5 * (ones @ free.apply(ones))
 
 
 def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
