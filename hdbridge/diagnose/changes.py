@@ -11,7 +11,7 @@ import numpy as np
 
 from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out
-from hdbridge.diagnose.parameters import parameters_of
+from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import EXTRAPOLATED, Trail
 from hdbridge.diagnose.theory import Fitted, Workshop
@@ -41,17 +41,18 @@ ORDER_ARCSEC = 0.8
 """The same for an order of the motor."""
 
 
-def findings(workshop: Workshop, model: TransmissionModel, trail: Trail, spread: FloatArray) -> list[Finding]:
-    """What has changed within the baseline."""
+def findings(
+    workshop: Workshop, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
+) -> list[Finding]:
+    """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
     result: list[Finding] = []
-    fitted = trail.fitted
-    for place, (given, now) in enumerate(zip(model.effects, fitted.theory.effects, strict=False)):
+    for place, (given, now) in enumerate(zip(model.effects, precise.theory.effects, strict=False)):
         if isinstance(given, Hysteresis | HysteresisMemory):
             if workshop.evidence.reversals < 2:
                 continue  # a loop shows only where the axis turns round
-            found = _law(workshop, fitted, trail, place, given, now, spread)
+            found = _law(workshop, trail, precise, place, given, now, spread)
         elif isinstance(given, Synchronous):
-            found = _orders(workshop, fitted, place, given, now, spread)
+            found = _orders(workshop, precise, place, given, now, spread)
         else:
             found = None
         if found is not None:
@@ -61,13 +62,14 @@ def findings(workshop: Workshop, model: TransmissionModel, trail: Trail, spread:
 
 def _law(
     workshop: Workshop,
-    fitted: Fitted,
     trail: Trail,
+    precise: Fitted,
     place: int,
     given: Effect,
     now: Effect,
     spread: FloatArray,
 ) -> Finding | None:
+    fitted = trail.fitted
     start = fitted.theory.start
 
     def values(effect: Effect) -> FloatArray:
@@ -85,8 +87,8 @@ def _law(
             return None
         gain = held_out(workshop, fitted, old)
         return Finding(
-            "hysteresis_memory", 0.95, (), parameters_of(fitted, place, spread), gain.before_arcsec,
-            gain.after_arcsec, next_experiment("hysteresis_memory", ()),
+            "hysteresis_memory", 0.95, (), parameters_of(workshop, precise, place, spread),
+            gain.before_arcsec, gain.after_arcsec, next_experiment("hysteresis_memory", ()),
             float(np.quantile(np.abs(apart), 0.998)),
             robust=trail.law_gain, effect=now,
         )  # fmt: skip
@@ -104,7 +106,7 @@ def _law(
     residual = fitted.residual / workshop.weight
     old_residual = residual + (after - before) - float(np.mean(after - before))
     return Finding(
-        "hysteresis_parameters", 0.9, (), parameters_of(fitted, place, spread),
+        "hysteresis_parameters", 0.9, (), parameters_of(workshop, precise, place, spread),
         float(np.sqrt(np.mean(old_residual**2))), float(np.sqrt(np.mean(residual**2))),
         next_experiment("hysteresis_parameters", ()), 0.5 * float(np.ptp(after - before)),
         robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
@@ -138,12 +140,8 @@ def _orders(
         changed.append(
             MotorOrder.model_construct(order=old.order, amplitude_arcsec=abs(apart), phase_deg=phase)
         )
-        half = 1.96 * deviation
-        parameters[f"order_{old.order}_amplitude_arcsec"] = Parameter(
-            abs(apart), "arcsec", max(abs(apart) - half, 0.0), abs(apart) + half
-        )
-        parameters[f"order_{old.order}_phase_deg"] = Parameter(
-            phase, "deg", phase - math.degrees(half / abs(apart)), phase + math.degrees(half / abs(apart))
+        parameters |= polar(
+            f"order_{old.order}_", np.array([apart.real, -apart.imag]), spread[np.ix_(pair, pair)]
         )
         weight += abs(apart) ** 2
     if not changed:

@@ -15,6 +15,7 @@ from hdbridge.diagnose.gates import Gate, gate
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
+from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import probability
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import PENALTY, Search, Trail
@@ -92,16 +93,20 @@ class _Judge:
         considered += more
         fitted = wound_up(workshop, inertial(workshop, self.search, fitted), trail.base)
         trail = replace(trail, fitted=fitted)
-        spread = covariance(workshop, fitted)
-        findings = [self._finding(fitted, place, spread) for place in range(base, len(fitted.theory.effects))]
-        findings += changes.findings(workshop, self.model, trail, spread)
+        precise = precisely(workshop, fitted)
+        spread = covariance(workshop, precise)
+        findings = [
+            replace(self._finding(fitted, place), parameters=parameters_of(workshop, precise, place, spread))
+            for place in range(base, len(fitted.theory.effects))
+        ]
+        findings += changes.findings(workshop, self.model, trail, precise, spread)
         if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
         findings.sort(key=lambda each: -each.robust)
         if workshop.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
             workshop.nuisance = workshop.nuisance[:, :0]
             fitted = workshop.fit(fitted.theory)
-            spread = covariance(workshop, fitted)
+        spread = covariance(workshop, fitted)
         left = rest(workshop, fitted)
         findings = self._with_unexplained(findings, left)
         chosen = tuple(range(base, len(fitted.theory.effects)))
@@ -115,7 +120,7 @@ class _Judge:
                 sum(each.predict(workshop.motion, fitted.theory.start) for each in sound)
             )
             fitted = replace(fitted, residual=after * workshop.weight)
-        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
+        extended = extended_model(workshop, self.model, fitted, chosen, spread, reason, base)
         points = workshop.evidence.points
         return Diagnosis(
             baseline=_figures(given),
@@ -170,7 +175,7 @@ class _Judge:
             fitted = does[place][1]
         return fitted, considered
 
-    def _finding(self, fitted: Fitted, place: int, spread: FloatArray) -> Finding:
+    def _finding(self, fitted: Fitted, place: int) -> Finding:
         effect = fitted.theory.effects[place]
         without = self.workshop.fit(fitted.theory.without(place))
         judged = gate(self.workshop, fitted, place)
@@ -182,7 +187,7 @@ class _Judge:
             cause=effect.name,
             probability=sure,
             aliases=aliases,
-            parameters=parameters_of(fitted, place, spread),
+            parameters={},
             before_arcsec=gain.before_arcsec,
             after_arcsec=gain.after_arcsec,
             experiment=next_experiment(effect.name, aliases),

@@ -39,6 +39,7 @@ def supported(workshop: Workshop, fitted: Fitted, given: Sequence[Effect]) -> tu
 
 
 def extended_model(
+    workshop: Workshop,
     model: TransmissionModel,
     fitted: Fitted,
     places: Sequence[int],
@@ -62,7 +63,9 @@ def extended_model(
     for place in chosen:
         effect = fitted.theory.effects[place]
         if effect.name in kept:
-            uncertainty[effect.name] = half_widths(_tidy(effect, ratio), parameters_of(fitted, place, spread))
+            uncertainty[effect.name] = half_widths(
+                _tidy(effect, ratio), parameters_of(workshop, fitted, place, spread)
+            )
     provenance = {**model.provenance, "reason": reason}
     return TransmissionModel(model.ratio, effects, uncertainty, provenance)
 

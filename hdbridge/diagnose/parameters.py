@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+from scipy.stats import t as student
 
+from hdbridge.diagnose.evidence import IntArray
 from hdbridge.diagnose.gates import BLOCKS_S, blocks
 from hdbridge.diagnose.result import Parameter
 from hdbridge.diagnose.theory import Fitted, Workshop, shape_value
@@ -16,6 +18,10 @@ from hdbridge.effects.base import Linear
 from hdbridge.effects.orders import OrderSeries
 
 NORMAL_95: Final = 1.96
+PARTS: Final = (6, 12)
+"""Numbers of equal parts of a record that count as one observation each."""
+STEP_95: Final = 11.03
+"""95 % point of where a Brownian motion with the drift -|t| / 2 to either side is largest."""
 _UNITS: Final = {
     "arcsec_per_kiloturn": "arcsec/kiloturn",
     "arcsec_s_per_deg": "arcsec s/deg",
@@ -39,8 +45,13 @@ _UNITS: Final = {
 
 
 def covariance(workshop: Workshop, fitted: Fitted) -> FloatArray:
-    """Of all parameters, shape (p, p): the sandwich over blocks of time, the more careful of their
-    lengths.
+    """Of all parameters, shape (p, p), so that `NORMAL_95` standard deviations are a 95 % interval.
+
+    The sandwich over blocks of time, and of all lengths of blocks the most careful: seconds for noise that
+    wanders, and `PARTS` of the whole record for what the theory gets wrong from one part of a bench to the
+    next. Few parts tell a variance badly, so Student's quantile stands for the normal one, with as many
+    degrees of freedom as parts carry the parameter, less one (Bester, Conley and Hansen 2011; effective
+    number of clusters as Carter, Schnepel and Steigerwald 2017).
     """
     tangent, residual = fitted.tangent, fitted.residual
     gram = tangent.T @ tangent
@@ -52,20 +63,34 @@ def covariance(workshop: Workshop, fitted: Fitted) -> FloatArray:
     inverse[:, np.diag(gram) <= 0.0] = 0.0
     best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
     scores = tangent * residual[:, np.newaxis]
-    for length in (*BLOCKS_S, 20.0):
-        number = blocks(workshop.time_s, length)
-        count = int(number[-1]) + 1
-        if count < 20:
-            continue
-        sums = np.stack([np.bincount(number, each) for each in scores.T], axis=1)
+
+    def at_least(number: IntArray, normal: bool) -> FloatArray:
+        sums, count = _sums(scores, number), int(number[-1]) + 1
         spread = inverse @ (sums.T @ sums) @ inverse * (count / (count - 1))
+        if not normal:
+            share = _sums((tangent @ inverse) ** 2, number)
+            carried = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
+            wider = student.ppf(0.975, np.maximum(carried - 1.0, 1.0)) / NORMAL_95
+            spread = spread * np.outer(wider, wider)
         larger = np.sqrt(np.maximum(np.diag(spread), 0.0) / np.maximum(np.diag(best), 1e-300))
         grow = np.maximum(larger, 1.0)
-        best = best * np.outer(grow, grow)
+        return np.asarray(best * np.outer(grow, grow))
+
+    for length in (*BLOCKS_S, 20.0):
+        number = blocks(workshop.time_s, length)
+        if int(number[-1]) + 1 >= 20:
+            best = at_least(number, normal=True)
+    for parts in PARTS:
+        best = at_least(np.arange(len(residual)) * parts // len(residual), normal=False)
     return np.asarray(best)
 
 
-def parameters_of(fitted: Fitted, place: int, spread: FloatArray) -> dict[str, Parameter]:
+def _sums(rows: FloatArray, number: IntArray) -> FloatArray:
+    """Sums of rows by their number, shape (numbers, p)."""
+    return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
+
+
+def parameters_of(workshop: Workshop, fitted: Fitted, place: int, spread: FloatArray) -> dict[str, Parameter]:
     """Those of one effect, by the names of the model file where it has them."""
     effect = fitted.theory.effects[place]
     own = fitted.places(place)
@@ -82,10 +107,12 @@ def parameters_of(fitted: Fitted, place: int, spread: FloatArray) -> dict[str, P
         else:
             low, high = value - half, value + half
         result[parameter.name] = Parameter(value, unit_of(parameter.name), low, high)
-    if isinstance(effect, Vibration):
+    if isinstance(effect, Vibration) and "frequency_hz" not in result:
         result["frequency_hz"] = Parameter(
             effect.frequency_hz, "Hz", effect.frequency_hz, effect.frequency_hz
         )
+    if isinstance(effect, CountLoss):
+        result = _lost(workshop, fitted, effect, linear, spread)
     if isinstance(effect, SubdivisionalError):
         lines = float(effect.lines_per_turn)
         result["lines_per_turn"] = Parameter(lines, "1", lines, lines)
@@ -103,20 +130,14 @@ def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
     if isinstance(effect, OrderSeries | SubdivisionalError):
         result: dict[str, Parameter] = {}
         for i, order in enumerate(effect.orders):
-            result |= _polar(
+            result |= polar(
                 f"order_{order.order}_",
                 values[2 * i : 2 * i + 2],
                 spread[2 * i : 2 * i + 2, 2 * i : 2 * i + 2],
             )
         return result
     if isinstance(effect, Vibration):
-        return _polar("", values[:2], spread[:2, :2])
-    if isinstance(effect, CountLoss):
-        lost: dict[str, Parameter] = {}
-        for i, step in enumerate(effect.steps):
-            lost[f"step_{i + 1}_size_arcsec"] = plain("size_arcsec", i)
-            lost[f"step_{i + 1}_time_s"] = Parameter(step.time_s, "s", step.time_s, step.time_s)
-        return lost
+        return polar("", values[:2], spread[:2, :2])
     if isinstance(effect, Creep):
         return {f"part_{i + 1}_amplitude_arcsec": plain("amplitude_arcsec", i) for i in range(len(values))}
     if isinstance(effect, Linear):
@@ -131,7 +152,37 @@ def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
     return {f"coefficient_{i + 1}_arcsec": plain("arcsec", i) for i in range(len(values))}
 
 
-def _polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parameter]:
+def _lost(
+    workshop: Workshop, fitted: Fitted, effect: CountLoss, columns: list[int], spread: FloatArray
+) -> dict[str, Parameter]:
+    """Sizes and times of steps.
+
+    A step seen first at one sample happened since the one before. How many samples further off noise may
+    have put it is the place of the largest likelihood of a step in white noise, within
+    `STEP_95` (sigma / size)^2 samples (Yao 1987).
+    """
+    result: dict[str, Parameter] = {}
+    time_s = workshop.time_s
+    scatter = math.sqrt(float(np.mean(fitted.residual**2)))
+    for i, (step, column) in enumerate(zip(effect.steps, columns, strict=True)):
+        half = NORMAL_95 * math.sqrt(max(float(spread[column, column]), 0.0))
+        size = step.size_arcsec
+        result[f"step_{i + 1}_size_arcsec"] = Parameter(size, "arcsec", size - half, size + half)
+        first = min(int(np.searchsorted(time_s, step.time_s)), len(time_s) - 1)
+        sigmas = max(abs(size) * float(workshop.weight[first]), 1e-9) / max(scatter, 1.0)
+        beyond = min(math.ceil(STEP_95 / sigmas**2 - 0.5), len(time_s))
+        low, high = (
+            float(time_s[max(first - 1 - beyond, 0)]),
+            float(time_s[min(first + beyond, len(time_s) - 1)]),
+        )
+        result[f"step_{i + 1}_time_s"] = Parameter(
+            step.time_s, "s", min(low, step.time_s), max(high, step.time_s)
+        )
+    return result
+
+
+def polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parameter]:
+    """Amplitude and phase of a cosine and a sine, from their covariance."""
     cosine, sine = map(float, pair)
     amplitude = math.hypot(cosine, sine)
     phase = math.degrees(math.atan2(-sine, cosine))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -191,16 +191,16 @@ class Workshop:
             here = self._at(replace(theory, effects=effects))
             if best is None or here.chi_square < best.chi_square:
                 gain = math.inf if best is None else best.chi_square - here.chi_square
-                best = self._with_shapes(here)
+                best = self.with_shapes(here)
                 if gain < max(CONVERGED, ROUGHLY * here.chi_square):
                     break
                 step = 1.0
-                moves = _solve(best.tangent, best.residual)
+                moves = solve(best.tangent, best.residual)
             else:
                 step *= 0.35
                 if step < 0.02:
                     break
-            effects = _moved(best.theory.effects, moves, best.parameters, step)
+            effects = moved(best.theory.effects, moves, best.parameters, step)
         assert best is not None
         return replace(best, basis=orthonormal(best.tangent))
 
@@ -220,10 +220,10 @@ class Workshop:
         bounded = [
             each.effect >= 0 and isinstance(theory.effects[each.effect], ONE_SIDED) for each in parameters
         ]
-        solution = _solve(linear, observed)
+        solution = solve(linear, observed)
         while np.any(below := np.array(bounded) & (solution < 0.0)):
             linear[:, below] = 0.0
-            solution = _solve(linear, observed)
+            solution = solve(linear, observed)
         effects: list[Effect] = []
         at = self.evidence.zeros + self.nuisance.shape[1]
         for effect in theory.effects:
@@ -240,16 +240,18 @@ class Workshop:
             float(residual @ residual),
         )
 
-    def _with_shapes(self, fitted: Fitted) -> Fitted:
-        """With the tangents of the shapes; the same where there are none."""
+    def with_shapes(self, fitted: Fitted, names: Container[str] | None = None) -> Fitted:
+        """With the tangents of these shapes, or of all but `FIXED_SHAPES`; the same where there are none."""
         theory, parameters = fitted.theory, list(fitted.parameters)
         shapes: list[FloatArray] = []
         for place, effect in enumerate(theory.effects):
             for each in effect.shape:
-                if each.name in FIXED_SHAPES:
+                if each.name in FIXED_SHAPES if names is None else each.name not in names:
                     continue
                 here = shape_value(effect, each.name)
                 delta = 1e-2 * here if each.logarithmic else 2e-3 * (each.upper - each.lower)
+                if each.name == "frequency_hz":  # a small part of a period over the whole record
+                    delta = 0.02 / max(float(np.ptp(self.time_s)), 1e-9)
                 low, high = max(here - delta, each.lower), min(here + delta, each.upper)
                 if high <= low:
                     continue
@@ -286,7 +288,7 @@ def _time(series: Series) -> FloatArray:
     return series.motion.time_s
 
 
-def _solve(columns: FloatArray, right: FloatArray) -> FloatArray:
+def solve(columns: FloatArray, right: FloatArray) -> FloatArray:
     """Least squares through the Gram matrix; directions that the data do not see stay at zero."""
     gram = columns.T @ columns
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -306,7 +308,7 @@ def orthonormal(columns: FloatArray) -> FloatArray:
     return np.asarray(columns @ (vectors[:, kept] / scale[:, np.newaxis] / np.sqrt(values[kept])))
 
 
-def _moved(
+def moved(
     effects: tuple[Effect, ...], moves: FloatArray, parameters: Sequence[Parameter], step: float
 ) -> tuple[Effect, ...]:
     """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""

@@ -25,21 +25,26 @@ from hdbridge.effects.carried import orders_of
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors
 
+STEEPEST = 3.0
+"""Of k shift = 72 deg: from there to 108 deg an order's mean is less than a third of the tooth error's."""
+
 
 class DirectionPhase(Effect):
-    """The part odd in direction of S(theta_M + d shift): d (S(theta_M + shift) - S(theta_M - shift)) / 2.
+    """The part odd in direction of a tooth error T(theta_M + d shift), S being the mean over both flanks.
 
-    The even part, A_k cos(k shift) instead of A_k, is in the model's synchronous part already, because that
-    was fitted over both directions. One angle shifts all orders: a free amplitude per order would be many
-    parameters for one cause.
+    An order A_k of the tooth error is A_k cos(k shift) in the mean, which is what the model's synchronous
+    part has, because that was fitted over both directions; and it is A_k sin(k shift) in the odd part. So the
+    odd part is tan(k shift) times the mean's order, a quarter of its turn ahead. The tangent is held at
+    `STEEPEST`: beyond, hardly anything of an order is left in the mean. One angle shifts all orders: a free
+    amplitude per order would be many parameters for one cause.
     """
 
     name: ClassVar[str] = "direction_phase"
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.DIRECTION})
     about: ClassVar[Cause] = Cause(
         title="synchronous part shifted with the direction",
-        equation="d (S(theta_M + shift) - S(theta_M - shift)) / 2, S the synchronous part, d the direction "
-        "held at rest",
+        equation="d times the sum over k of -A_k tan(k shift) sin(k theta_M + phi_k), A_k and phi_k the "
+        "synchronous part's, d the direction held at rest",
         signature="the ripple within a motor turn is displaced between the two directions, by one angle "
         "for all orders",
         consequence="a compensation without it leaves the ripple's difference, with opposite signs in the "
@@ -85,11 +90,11 @@ class DirectionPhase(Effect):
         return self.model_copy(update={"shift_deg": float(coefficients[0])})
 
     def bound_arcsec(self) -> float:
-        """Sum of A_k |sin(k shift)|."""
+        """Sum of A_k |tan(k shift)|."""
         return abs(self.shift_deg) * sum(map(abs, self._odd()))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Sum of k A_k |sin(k shift)|, per degree."""
+        """Sum of k A_k |tan(k shift)|, per degree."""
         steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 
@@ -98,15 +103,16 @@ class DirectionPhase(Effect):
         return {"orders": orders_of(base)}
 
     def _odd(self) -> tuple[complex, ...]:
-        """Phasors of the odd part per degree of shift: j A_k sin(k shift) / shift exp(j phi_k)."""
+        """Phasors of the odd part per degree of shift: j A_k tan(k shift) / shift exp(j phi_k)."""
         given = phasors(self.orders)
         highest = len(given) - 1
-        return tuple(1j * each * self._sine(highest - i) for i, each in enumerate(given))
+        return tuple(1j * each * self._tangent(highest - i) for i, each in enumerate(given))
 
-    def _sine(self, order: int) -> float:
+    def _tangent(self, order: int) -> float:
         if abs(self.shift_deg) < 1e-9:
             return order * RAD_PER_DEG
-        return math.sin(order * RAD_PER_DEG * self.shift_deg) / self.shift_deg
+        tangent = math.tan(order * RAD_PER_DEG * self.shift_deg)
+        return min(max(tangent, -STEEPEST), STEEPEST) / self.shift_deg
 
 
 class _Tracker(Memoryless):

@@ -96,16 +96,17 @@ def test_a_new_motor_order_is_sought_where_the_model_has_none():
     assert found == {3, 5, 6, 7, 8, 9, 10, 11, 12}
 
 
-def test_a_direction_phase_is_the_odd_part_of_a_shifted_ripple():
+def test_a_direction_phase_and_the_mean_of_both_flanks_are_the_shifted_tooth_error():
     angle = np.concatenate([np.linspace(0, 360, 500), np.linspace(360, 0, 500)])
-    ripple = Synchronous(orders=(ORDER_4,))
-    effect = DirectionPhase(orders=(ORDER_4,), shift_deg=2.0)
-    ahead, behind = (ripple.predict(Motion(angle + shift)) for shift in (2.0, -2.0))
     sign = np.where(np.arange(1000) < 500, 1, -1)
     sign[500] = 1  # at rest at the turn: the direction holds
-    np.testing.assert_allclose(
-        effect.predict(Motion(angle), Start.FORWARD), sign * 0.5 * (ahead - behind), atol=1e-9
+    mean = ORDER_4.model_copy(
+        update={"amplitude_arcsec": ORDER_4.amplitude_arcsec * math.cos(math.radians(4 * 5.0))}
     )
+    both = Synchronous(orders=(mean,)).predict(Motion(angle))
+    both += DirectionPhase(orders=(mean,), shift_deg=5.0).predict(Motion(angle), Start.FORWARD)
+    tooth = Synchronous(orders=(ORDER_4,)).predict(Motion(angle + sign * 5.0))
+    np.testing.assert_allclose(both, tooth, atol=1e-9)
 
 
 def test_a_small_direction_phase_is_linear_in_its_shift():

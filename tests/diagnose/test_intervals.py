@@ -1,0 +1,134 @@
+"""The 95 % intervals of parameters hold the truth as often as they say, and are no wider than needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+from hdbridge.diagnose import diagnose
+from hdbridge.diagnose.evidence import gather
+from hdbridge.diagnose.parameters import covariance, parameters_of
+from hdbridge.diagnose.precise import precisely
+from hdbridge.diagnose.result import Parameter
+from hdbridge.diagnose.theory import Theory, Workshop
+from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
+
+Columns = Callable[..., dict[str, Any]]
+SEEDS = range(10, 20)
+LEAST = 0.9
+"""Share of truths that intervals have to hold."""
+
+
+def held(parameter: Parameter, name: str, truth: float) -> bool:
+    if name.endswith("phase_deg"):
+        truth = parameter.value + math.remainder(truth - parameter.value, 360.0)
+    return parameter.low <= truth <= parameter.high
+
+
+def hidden(seed: int) -> tuple[dict[str, Any], Theory, dict[str, float]]:
+    """A wave of the flexspline, a ramp and a load order: for the plant, about right as effects, and as they
+    should be told."""
+    rng = np.random.default_rng(seed)
+    order, turn, angle = int(rng.integers(2, 6)), *rng.uniform(-180.0, 180.0, 2)
+    wave, ramp, run_out = rng.uniform(3.0, 6.0), rng.uniform(0.1, 0.2), rng.uniform(3.0, 6.0)
+    effects = {
+        "flexspline_order": {"orders": [(order, wave, turn)]},
+        "ratio_error": {"ramp": ramp},
+        "load_order": {"orders": [(1, run_out, angle)]},
+    }
+    near = {"amplitude_arcsec": 1.0, "phase_deg": 0.0}
+    sought = (
+        FlexsplineOrders(ratio=50.0, orders=(MotorOrder(order=order, **near),)),
+        RatioError(ramp_arcsec_per_turn=0.0),
+        LoadOrders(ratio=50.0, orders=(MotorOrder(order=1, **near),)),
+    )
+    truth = {
+        f"flexspline_order order_{order}_amplitude_arcsec": wave,
+        f"flexspline_order order_{order}_phase_deg": turn,
+        "ratio_error ramp_arcsec_per_turn": ramp,
+        "load_order order_1_amplitude_arcsec": run_out,
+        "load_order order_1_phase_deg": angle,
+    }
+    return effects, Theory(sought, Start.FORWARD), truth
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(
+    columns: Columns, model: TransmissionModel, plant: ModuleType
+) -> None:
+    gear = {
+        "hysteresis offset_arcsec": 40.0,
+        "hysteresis width_deg": 20.0,
+        "hysteresis exponent": 1.6,
+        **{f"synchronous order_{k}_amplitude_arcsec": size for k, size, _ in plant.ORDERS},
+        **{f"synchronous order_{k}_phase_deg": phase for k, _, phase in plant.ORDERS},
+    }
+    inside: list[bool] = []
+    halves: list[float] = []
+    for seed in SEEDS:
+        effects, sought, truth = hidden(seed)
+        workshop = Workshop(gather(Record(columns(effects, seed)), 50.0))
+        theory = Theory((*model.effects, *sought.effects), sought.start)
+        precise = precisely(workshop, workshop.fit(theory))
+        spread = covariance(workshop, precise)
+        for place, effect in enumerate(theory.effects):
+            for name, parameter in parameters_of(workshop, precise, place, spread).items():
+                true = (truth | gear)[f"{effect.name} {name}"]
+                inside.append(held(parameter, name, true))
+                if not name.endswith("phase_deg"):
+                    halves.append(0.5 * (parameter.high - parameter.low) / abs(true))
+    assert len(inside) == 20 * len(SEEDS)
+    # So few are inside by chance in one run of a thousand, were the share as low as LEAST.
+    assert sum(inside) >= binom.ppf(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+    assert np.median(halves) < 0.02
+
+
+def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:
+    """The load on a spring, which swings beyond the waves of the motor angle that shake it."""
+    motor = columns["motor_target_deg"]
+    rate = np.radians(np.gradient(motor, columns["time_s"]))
+    beyond = sum(
+        (k * rate / (2.0 * np.pi * frequency_hz)) ** 2 * size * np.cos(np.radians(k * motor + phase))
+        for k, size, phase in orders
+    )
+    return {**columns, "load_position_deg": columns["load_position_deg"] + beyond / 3600.0}
+
+
+def test_an_order_is_told_as_it_is_at_rest_though_the_load_swings(
+    columns: Columns, model: TransmissionModel, plant: ModuleType
+) -> None:
+    order = (7, 5.0, 40.0)
+    record = swinging(columns({"motor_order": {"orders": [order]}}), (*plant.ORDERS, order), 40.0)
+    found = diagnose(Record(record), model).findings[0].parameters["order_7_amplitude_arcsec"]
+    # At the quicker speed, 1.7 turns a second, the load shows 9 % more of this order.
+    assert found.low < 5.0 < found.high
+    assert found.high - found.low < 0.2
+
+
+def test_flanks_a_shift_apart_are_told_by_the_shift_of_either(
+    columns: Columns, model: TransmissionModel
+) -> None:
+    found = diagnose(Record(columns({"direction_phase": {"shift": 7.0}})), model).findings[0]
+    assert found.cause == "direction_phase"
+    shift = found.parameters["shift_deg"]
+    assert shift.low < 7.0 < shift.high
+    assert shift.high - shift.low < 0.7
+
+
+def test_the_time_of_a_lost_count_is_known_to_a_few_samples(
+    columns: Columns, model: TransmissionModel
+) -> None:
+    record = columns({"count_loss": {"size": 5.0, "at": 0.3}})
+    true, step_s = 0.3 * record["time_s"][-1], record["time_s"][1] - record["time_s"][0]
+    found = diagnose(Record(record), model).findings[0].parameters
+    times = [each for name, each in found.items() if name.endswith("time_s")]
+    time = min(times, key=lambda each: abs(each.value - true))
+    assert time.low <= true <= time.high
+    assert 0.5 * step_s < time.high - time.low < 10.0 * step_s
