@@ -200,15 +200,65 @@ def test_several_causes_are_met_once_each(tools: Any) -> None:
 
 
 def test_parameters_are_compared_where_both_have_them(tools: Any) -> None:
+    judged = tools("blindscore").judged
     hidden = secret("channel_skew", delay_ms=-0.5)  # the age of the load's sample
     late = {"value": 0.55, "unit": "ms", "ci95": [0.45, 0.65]}
-    verdict = tools("blindscore").judged(hidden, answer(finding("channel_skew", delay_ms=late)), 1.0)
-    assert [(each.true, each.covered) for each in verdict.compared] == [(-0.5, True)]
+    verdict = judged(hidden, answer(finding("channel_skew", delay_ms=late)), 1.0)
+    assert [(each.true, each.covered) for each in verdict.compared] == [(0.5, True)]
     assert verdict.compared[0].error == pytest.approx(0.1)
     early = {"value": -0.7, "unit": "ms", "ci95": [-0.8, -0.6]}
-    verdict = tools("blindscore").judged(hidden, answer(finding("channel_skew", delay_ms=early)), 1.0)
+    verdict = judged(hidden, answer(finding("channel_skew", delay_ms=early)), 1.0)
     assert [each.covered for each in verdict.compared] == [False]
-    assert verdict.compared[0].found == pytest.approx(0.7)
+    verdict = judged(hidden, answer(finding("velocity_windup", delay_ms=late)), 1.0)
+    assert verdict.compared == ()
+
+
+def value(value: float, half: float = 0.1) -> dict[str, Any]:
+    return {"value": value, "ci95": [value - half, value + half]}
+
+
+def test_a_change_of_a_motor_order_is_that_against_the_given_model(tools: Any) -> None:
+    hidden = secret("motor_encoder_eccentricity", amplitude_arcsec=2.0, second_arcsec=0.0)
+    disc = {"radius_mm": 20.0, "eccentricity_um": 20e3 * 2.0 * 50 / 206264.8, "eccentric_at_deg": 30.0}
+    truth = {
+        "gear": {"ratio": 50.0, "motor_orders": [{"order": 1, "amplitude_arcsec": 3.0, "phase_deg": 60.0}]},
+        "motor": {"encoder": {"disc": disc}},
+    }
+    given = {"orders": [{"order": 1, "amplitude_arcsec": 1.0, "phase_deg": 60.0}]}
+    model = {"effects": [{"effect": "synchronous", "parameters": given}]}
+    found = finding("motor_order", order_1_amplitude_arcsec=value(4.05), order_1_phase_deg=value(420.05))
+    verdict = tools("blindscore").judged(hidden, answer(found), 1.0, "", truth, model)
+    # The disc's -2 sin(a - 30) is 2 cos(a + 60), in phase with the 3 - 1 that the model is short of.
+    assert [each.true for each in verdict.compared] == pytest.approx([4.0, 420.0], abs=1e-3)
+    assert all(each.covered for each in verdict.compared)
+
+
+def test_growths_are_compared_in_per_cent_and_springs_as_compliances(tools: Any) -> None:
+    judged = tools("blindscore").judged
+    hidden = secret("torque_modulation", also=("compliance",), growth_per_nm=0.03)
+    truth = {"gear": {"stiffness_nm_per_rad": 206264.8}}
+    found = [
+        finding("torque_modulation", growth_percent_per_nm=value(3.05)),
+        finding("compliance", c1_arcsec_per_nm=value(1.2)),
+    ]
+    compared = judged(hidden, answer(*found), 1.0, "", truth, {}).compared
+    assert {each.name: (pytest.approx(each.true), each.covered) for each in compared} == {
+        "growth_percent_per_nm": (3.0, True),
+        "c1_arcsec_per_nm": (1.0, False),
+    }
+
+
+def test_of_several_lost_counts_the_one_nearest_in_time_is_compared(tools: Any) -> None:
+    hidden = secret("count_loss", time_s=100.0, step_arcsec=5.0)
+    steps = {
+        "step_1_time_s": value(30.0),
+        "step_1_size_arcsec": value(0.5),
+        "step_2_time_s": value(100.05),
+        "step_2_size_arcsec": value(5.02),
+    }
+    compared = tools("blindscore").judged(hidden, answer(finding("count_loss", **steps)), 1.0).compared
+    assert {each.name for each in compared} == {"step_2_time_s", "step_2_size_arcsec"}
+    assert all(each.covered for each in compared)
 
 
 def test_the_share_recovered_is_that_of_what_the_noise_leaves(tools: Any) -> None:

@@ -8,12 +8,16 @@ wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from blindtruth import true_parameters
+
 Data = Mapping[str, Any]
 UNEXPLAINED = "unexplained"
+ANGLES = ("phase_deg", "centre_deg")
+"""Parameters that are angles, full turns apart the same."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,9 @@ class Compared:
 
     @property
     def error(self) -> float:
-        """Relative error."""
+        """Relative error; of an angle, radians."""
+        if self.name.endswith(ANGLES):
+            return math.radians(abs(self.found - self.true))
         return abs(self.found - self.true) / max(abs(self.true), 1e-12)
 
     @property
@@ -68,8 +74,18 @@ class Verdict:
     law: str = ""
 
 
-def judged(hidden: Data, diagnosis: Data | None, seconds: float, failed: str = "") -> Verdict:
-    """The verdict on a case; ``diagnosis`` is None where the command failed."""
+def judged(
+    hidden: Data,
+    diagnosis: Data | None,
+    seconds: float,
+    failed: str = "",
+    truth: Data | None = None,
+    model: Data | None = None,
+) -> Verdict:
+    """The verdict on a case; ``diagnosis`` is None where the command failed.
+
+    ``truth`` and ``model`` are truth.yaml and model.yaml; without them fewer parameters are compared.
+    """
     causes = tuple(each["cause"] for each in hidden["hidden"])
     known = tuple(each for each in causes if each != UNEXPLAINED)
     also = set(hidden["also"])
@@ -103,7 +119,7 @@ def judged(hidden: Data, diagnosis: Data | None, seconds: float, failed: str = "
         probabilities=tuple(
             (float(each["probability"]), hit) for each, hit in zip(named, right, strict=True)
         ),
-        compared=tuple(_compared(hidden, named)),
+        compared=tuple(_compared(hidden, findings, truth or {}, model or {})),
         recovered=_recovered(hidden, named, known, _floor(hidden, diagnosis)),
         rms_over_noise=_left(diagnosis, _floor(hidden, diagnosis)),
         failed=failed,
@@ -142,72 +158,17 @@ def _left(diagnosis: Data | None, floor_arcsec: float) -> float | None:
     return None if left is None else float(left) / floor_arcsec
 
 
-Conversion = tuple[str, str, Callable[[float], float]]
-
-
-def _same(value: float) -> float:
-    return value
-
-
-def _negative(value: float) -> float:
-    return -value
-
-
-# By cause: a parameter's name in a finding (in braces a number of the secret), its name in hidden.yaml, and
-# what makes the finding's number one of the same unit. Names that are not in a finding are passed over, so
-# spellings may stand side by side.
-COMPARABLE: Mapping[str, tuple[Conversion, ...]] = {
-    "motor_order": (("order_{order:.0f}_amplitude_arcsec", "amplitude_arcsec", _same),),
-    "flexspline_order": (("order_{order:.0f}_amplitude_arcsec", "amplitude_arcsec", _same),),
-    "motor_encoder_eccentricity": (("order_1_amplitude_arcsec", "amplitude_arcsec", _same),),
-    "load_order": (
-        ("order_1_amplitude_arcsec", "amplitude_arcsec", _same),
-        ("order_2_amplitude_arcsec", "second_arcsec", _same),
-    ),
-    "direction_phase": (("shift_deg", "shift_deg", _same),),
-    "torque_modulation": (("growth_per_nm", "growth_per_nm", _same),),
-    "compliance": (
-        ("c1_arcsec_per_nm", "compliance_arcsec_per_nm", _same),
-        ("compliance_arcsec_per_nm", "compliance_arcsec_per_nm", _same),
-        ("stiffness_nm_per_rad", "stiffness_nm_per_rad", _same),
-    ),
-    "inertial_windup": (("frequency_hz", "frequency_hz", _same), ("resonance_hz", "frequency_hz", _same)),
-    # hidden.yaml counts the age of the load's sample, the finding how much later it is taken.
-    "channel_skew": (("delay_ms", "delay_ms", _negative),),
-    "backlash": (("gap_arcsec", "gap_arcsec", _same), ("width_arcsec", "gap_arcsec", _same)),
-    "hysteresis_parameters": (
-        ("offset_arcsec", "offset_arcsec", _same),
-        ("width_deg", "width_deg", _same),
-        ("exponent", "exponent", _same),
-    ),
-    "rate_dependence": (("growth_per_decade", "growth_per_decade", _same),),
-    "subdivisional_error": (("lines_per_turn", "lines_per_turn", _same), ("lines", "lines_per_turn", _same)),
-    "zero_drift": (("arcsec_per_k", "arcsec_per_k", _same),),
-    "amplitude_drift": (("growth_per_k", "growth_per_k", _same),),
-    "wear": (("end_arcsec", "end_arcsec", _same),),
-    "creep": (
-        ("time_constant_s", "time_constant_s", _same),
-        ("tau_s", "time_constant_s", _same),
-    ),
-    "ratio_error": (
-        ("ratio", "ratio", _same),
-        ("ramp_arcsec_per_turn", "arcsec_per_motor_turn", _same),
-    ),
-    "count_loss": (("time_s", "time_s", _same), ("step_arcsec", "step_arcsec", _same)),
-    "vibration": (("frequency_hz", "frequency_hz", _same), ("amplitude_arcsec", "amplitude_arcsec", _same)),
-    "local_defect": (("at_deg", "at_deg", _same), ("height_arcsec", "height_arcsec", _same)),
-}
-
-
-def _compared(hidden: Data, named: list[Data]) -> Iterable[Compared]:
-    truths = {each["cause"]: each["parameters"] for each in hidden["hidden"]}
-    for finding in named:
-        cause = finding["cause"]
-        for name, true_name, convert in COMPARABLE.get(cause, ()):
-            known = truths.get(cause, {})
-            there = (finding.get("parameters") or {}).get(name.format(**known) if known else name)
-            if there is None or not known.get(true_name):
+def _compared(hidden: Data, findings: list[Data], truth: Data, model: Data) -> Iterable[Compared]:
+    """Every parameter of which the truth is known, in the first finding of each cause; angles to a turn."""
+    first = {each["cause"]: each.get("parameters") or {} for each in reversed(findings)}
+    for cause, parameters in first.items():
+        values = {name: float(there["value"]) for name, there in parameters.items()}
+        true = true_parameters(cause, values, hidden, truth, model)
+        for name, there in parameters.items():
+            if name not in true:
                 continue
-            low, high = sorted(convert(float(each)) for each in there.get("ci95") or (math.nan, math.nan))
-            true = float(known[true_name])
-            yield Compared(cause, name, convert(float(there["value"])), low, high, true)
+            low, high = (float(each) for each in there.get("ci95") or (math.nan, math.nan))
+            found, known = float(there["value"]), true[name]
+            if name.endswith(ANGLES):
+                known = found + math.remainder(known - found, 360.0)
+            yield Compared(cause, name, found, low, high, known)

@@ -43,6 +43,10 @@ def summary(verdicts: Sequence[Verdict]) -> list[tuple[str, str]]:
         ("two or three at once: recall", _recall(several)),
         ("two or three at once: precision", _precision(several)),
         ("two or three at once: all found", percent(len(v.met) == len(v.hidden) for v in several)),
+        (
+            "two or three at once: truth within the 95 % interval",
+            percent(c.covered for v in several for c in v.compared),
+        ),
         ("share recovered on held-out data, median", _median([v.recovered for v in single])),
         ("left over after extension / noise, median", _median([v.rms_over_noise for v in single])),
         ("parameters: relative error, median", _median([c.error for v in single for c in v.compared])),
@@ -164,6 +168,21 @@ def page(verdicts: Sequence[Verdict]) -> str:
     chances = calibration(verdicts)
     if chances:
         parts.append(table(("probability", "mean", "right"), chances))
+    outside = [
+        (
+            each.case,
+            f"`{one.cause}` {one.name}",
+            f"{one.true:.5g}",
+            f"{one.found:.5g}",
+            f"{one.low:.5g} to {one.high:.5g}",
+        )
+        for each in verdicts
+        for one in each.compared
+        if not one.covered
+    ]
+    if outside:
+        head = ("case", "parameter outside its interval", "truth", "value", "interval")
+        parts.append(table(head, outside))
     wrong = [
         (each.case, ", ".join(each.hidden) or "-", ", ".join(each.named) or "-", each.failed or _missed(each))
         for each in verdicts

@@ -56,7 +56,13 @@ def verdict_of(case: Path) -> Verdict:
         diagnosis = json.loads((case / "diagnosis.json").read_text(encoding="utf-8"))
         if diagnosis is None or diagnosis.get("schema") != "hdbridge.diagnosis/1":
             failed, diagnosis = "another schema", None
-    return judged(hidden, diagnosis, float(report["seconds"]), failed)
+    truth, model = (_yaml(case / name) for name in ("truth.yaml", "model.yaml"))
+    return judged(hidden, diagnosis, float(report["seconds"]), failed, truth, model)
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    """A file of a case; empty where it is not there."""
+    return dict(yaml.safe_load(path.read_text(encoding="utf-8"))) if path.exists() else {}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,0 +1,300 @@
+"""What the parameters of a finding would be if it were right: the secret in its units and conventions.
+
+hidden.yaml says what was hidden, truth.yaml what the plant is, model.yaml what the diagnosis compared it
+with. `true_parameters` converts: a name is missing where the two do not mean the same, for the reasons that
+stand beside each cause.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+Data = Mapping[str, Any]
+Values = dict[str, float]
+ARCSEC_PER_RAD = 180.0 * 3600.0 / math.pi
+TWINS = {"motor_order": "motor_encoder_eccentricity", "motor_encoder_eccentricity": "motor_order"}
+"""Orders of the motor have the same amplitudes and phases under either name."""
+ALWAYS_THERE = ("inertial_windup", "compliance")
+"""Causes that need not have been hidden: truth.yaml says how large they are, where they are named."""
+
+
+@dataclass(frozen=True)
+class Secret:
+    """What is known of a case."""
+
+    parameters: Data
+    """Those of the cause in hidden.yaml; empty where it is there without having been hidden."""
+    found: Data = field(default_factory=dict)
+    """Values of the finding, by name."""
+    truth: Data = field(default_factory=dict)
+    """truth.yaml; empty where there is none."""
+    model: Data = field(default_factory=dict)
+    """model.yaml."""
+
+    @property
+    def gear(self) -> Data:
+        """Section ``gear`` of truth.yaml."""
+        return self.truth.get("gear", {})
+
+    @property
+    def load(self) -> Data:
+        """Section ``load`` of truth.yaml."""
+        return self.truth.get("load", {})
+
+    @property
+    def stiffness(self) -> float | None:
+        """Stiffness at the load, Nm/rad."""
+        value = self.gear.get("stiffness_nm_per_rad")
+        return None if value is None else float(value)
+
+
+def _phasor(amplitude: float, phase_deg: float) -> complex:
+    return amplitude * cmath.exp(1j * math.radians(phase_deg))
+
+
+def _polar(order: float, value: complex) -> Values:
+    """By the names of a finding; no phase where there is nothing."""
+    if abs(value) < 1e-9:
+        return {}
+    name = f"order_{order:.0f}"
+    return {f"{name}_amplitude_arcsec": abs(value), f"{name}_phase_deg": math.degrees(cmath.phase(value))}
+
+
+def _sum_of(rows: Any) -> dict[float, complex]:
+    total: dict[float, complex] = {}
+    for each in rows or ():
+        order = float(each["order"])
+        total[order] = total.get(order, 0j) + _phasor(each["amplitude_arcsec"], each.get("phase_deg", 0.0))
+    return total
+
+
+def _disc(disc: Data, arcsec_per_rad: float) -> dict[float, complex]:
+    """Orders 1 and 2 of what a disc adds to a reading: (e / R) sin(a - at), (d / R) sin 2 (a - at)."""
+    scale = arcsec_per_rad / float(disc["radius_mm"]) * 1e-3
+    first = _phasor(scale * disc.get("eccentricity_um", 0.0), -disc.get("eccentric_at_deg", 0.0) - 90.0)
+    second = _phasor(scale * disc.get("ovality_um", 0.0), -2.0 * disc.get("oval_at_deg", 0.0) - 90.0)
+    return {1.0: first, 2.0: second}
+
+
+def _motor_orders(secret: Secret) -> Values:
+    """The change against model.yaml: what was hidden, and what its calibration had wrong of the same order.
+
+    The drive keeps the *reading* of a motor disc where it is commanded, so the load moves the other way:
+    minus the disc's error, divided by the ratio.
+    """
+    if not secret.truth:
+        order = secret.parameters.get("order", 1.0)
+        return {f"order_{order:.0f}_amplitude_arcsec": float(secret.parameters["amplitude_arcsec"])}
+    total = _sum_of(secret.gear.get("motor_orders"))
+    disc = secret.truth["motor"]["encoder"].get("disc")
+    ratio = float(secret.gear["ratio"])
+    if disc:
+        for order, value in _disc(disc, ARCSEC_PER_RAD / ratio).items():
+            total[order] = total.get(order, 0j) - value
+    given = _sum_of(
+        row
+        for each in secret.model.get("effects", ())
+        if each["effect"] == "synchronous"
+        for row in each["parameters"]["orders"]
+    )
+    hidden = {float(secret.parameters.get("order", 1.0))}
+    if secret.parameters.get("second_arcsec"):
+        hidden.add(2.0)
+    result: Values = {}
+    for order in hidden:
+        result |= _polar(order, total.get(order, 0j) - given.get(order, 0j))
+    return result
+
+
+def _flexspline(secret: Secret) -> Values:
+    known = secret.parameters
+    return _polar(known["order"], _phasor(known["amplitude_arcsec"], known["phase_deg"]))
+
+
+def _load_orders(secret: Secret) -> Values:
+    total = _sum_of(secret.gear.get("load_orders"))
+    disc = secret.load.get("encoder", {}).get("disc")
+    if disc:
+        for order, value in _disc(disc, ARCSEC_PER_RAD).items():
+            total[order] = total.get(order, 0j) + value
+    if not total:
+        pairs = zip((1, 2), ("amplitude_arcsec", "second_arcsec"), strict=True)
+        sizes = {order: float(secret.parameters.get(name, 0.0)) for order, name in pairs}
+        return {f"order_{order}_amplitude_arcsec": size for order, size in sizes.items() if size}
+    return {name: value for order, each in total.items() for name, value in _polar(order, each).items()}
+
+
+def _compliance(secret: Secret) -> Values:
+    """The softness from no torque on. A spring in stages is compared in its first alone: the finding's own
+    stages may begin elsewhere.
+    """
+    stiffness = secret.stiffness or secret.parameters.get("stiffness_nm_per_rad")
+    return {} if stiffness is None else {"c1_arcsec_per_nm": ARCSEC_PER_RAD / float(stiffness)}
+
+
+def _inertial(secret: Secret) -> Values:
+    """J / K of the load on the gear, and of the encoder on its coupling: it lags behind the load too."""
+    if secret.stiffness is None:
+        value = secret.parameters.get("seconds_squared")
+        return {} if value is None else {"inertia_over_stiffness_s2": float(value)}
+    gravity = secret.load.get("gravity") or {}
+    inertia = secret.load["inertia_kg_m2"] + gravity.get("mass_kg", 0.0) * gravity.get("arm_m", 0.0) ** 2
+    coupling = secret.load.get("encoder", {}).get("coupling")
+    lag = (math.tau * coupling["frequency_hz"]) ** -2 if coupling else 0.0
+    return {"inertia_over_stiffness_s2": float(inertia) / secret.stiffness + lag}
+
+
+def _velocity(secret: Secret) -> Values:
+    """The dry part. The viscous slope at rest is an extrapolation by a law of thinning that is not the
+    finding's.
+    """
+    stiffness, dry = secret.stiffness, secret.parameters.get("coulomb_nm")
+    if stiffness is None or not dry:
+        return {}
+    return {"coulomb_arcsec": float(dry) / stiffness * ARCSEC_PER_RAD}
+
+
+def _loop_height(secret: Secret) -> Values:
+    """Half the height of both laws together. Width and exponent are those of a law that the plant, with
+    memory in a share of its loop, does not have.
+    """
+    height = 0.0
+    for name in ("hysteresis", "second_hysteresis"):
+        law = secret.gear.get(name) or {}
+        height += float(law.get("offset_arcsec", 0.0))
+        height += sum(float(each["limit_arcsec"]) for each in law.get("elements", ()))
+    return {"offset_arcsec": height} if height else {}
+
+
+def _interpolation(secret: Secret) -> Values:
+    """The line count, and the first harmonic: an offset o of unit signals is o / (2 pi) of a line."""
+    result = {"lines_per_turn": float(secret.parameters["lines_per_turn"])}
+    signals = secret.load.get("encoder", {}).get("signals")
+    if signals:
+        offset = math.hypot(signals.get("sine_offset", 0.0), signals.get("cosine_offset", 0.0))
+        result["order_1_amplitude_arcsec"] = offset * ARCSEC_PER_RAD / float(signals["lines_per_turn"])
+    return result
+
+
+def _zero_drift(secret: Secret) -> Values:
+    """Per kelvin of the temperature channel; the time constant where the plant has one."""
+    result = {"drift_arcsec_per_k": float(secret.parameters["arcsec_per_k"])}
+    tau_s = secret.truth.get("temperature", {}).get("zero_time_constant_s")
+    return result | ({"tau_s": float(tau_s)} if tau_s else {})
+
+
+def _amplitude_drift(secret: Secret) -> Values:
+    """Per cent of the part as it is at the finding's reference, 20 C; truth.yaml has another reference."""
+    warmth = secret.truth.get("temperature", {})
+    growths = {
+        "ripple_percent_per_k": warmth.get("tooth_growth_per_k", secret.parameters.get("growth_per_k")),
+        "friction_percent_per_k": warmth.get("friction_growth_per_k"),
+    }
+    away_k = 20.0 - float(warmth.get("reference_c", warmth.get("ambient_c", 20.0)))
+    return {
+        name: 100.0 * float(growth) / (1.0 + float(growth) * away_k)
+        for name, growth in growths.items()
+        if growth
+    }
+
+
+def _wear(secret: Secret) -> Values:
+    """Growth of the lost motion from side to side, lagging: minus twice that of either way.
+
+    A finding that has no exponent grows in proportion to the way, the plant with a power p of it: compared is
+    the straight line nearest to r^p over a way r run evenly, whose slope is 6 p / ((p + 1) (p + 2)) of the
+    mean growth.
+    """
+    known = secret.parameters
+    if "exponent" in secret.found:
+        growth = -2.0 * float(known["arcsec_per_1000_turns"])
+        return {"growth_arcsec_per_kiloturn": growth, "exponent": float(known["exponent"])}
+    power, end = float(known.get("exponent", 1.0)), float(known["end_arcsec"])
+    kiloturns = (end / float(known["arcsec_per_1000_turns"])) ** (1.0 / power)
+    slope = 6.0 * power / ((power + 1.0) * (power + 2.0))
+    return {"growth_arcsec_per_kiloturn": -2.0 * end / kiloturns * slope}
+
+
+def _count_loss(secret: Secret) -> Values:
+    """The step that is nearest in time, of those that the finding has."""
+    known = secret.parameters
+    times = {name: value for name, value in secret.found.items() if name.endswith("_time_s")}
+    nearest = min(times, key=lambda name: abs(times[name] - known["time_s"]), default="step_1_time_s")
+    sizes = nearest.replace("_time_s", "_size_arcsec")
+    return {nearest: float(known["time_s"]), sizes: float(known["step_arcsec"])}
+
+
+def _local_defect(secret: Secret) -> Values:
+    known = secret.parameters
+    return {
+        "centre_deg": float(known["at_deg"]),
+        "half_width_deg": 0.5 * float(known["width_deg"]),
+        "height_arcsec": float(known["height_arcsec"]),
+    }
+
+
+def _named(**names: str) -> Callable[[Secret], Values]:
+    """Parameters that differ by their name alone: finding's name = hidden.yaml's."""
+    return lambda secret: {
+        mine: float(secret.parameters[theirs])
+        for mine, theirs in names.items()
+        if theirs in secret.parameters
+    }
+
+
+def _scaled(factor: float, **names: str) -> Callable[[Secret], Values]:
+    plain = _named(**names)
+    return lambda secret: {name: factor * value for name, value in plain(secret).items()}
+
+
+TRUE: Mapping[str, Callable[[Secret], Values]] = {
+    "motor_order": _motor_orders,
+    "motor_encoder_eccentricity": _motor_orders,
+    "flexspline_order": _flexspline,
+    "load_order": _load_orders,
+    # Both: half of the angle between the two flanks, forward ahead.
+    "direction_phase": _named(shift_deg="shift_deg"),
+    "torque_modulation": _scaled(100.0, growth_percent_per_nm="growth_per_nm"),
+    "compliance": _compliance,
+    "inertial_windup": _inertial,
+    "velocity_windup": _velocity,
+    # hidden.yaml counts the age of the load's sample, the finding how much later it is taken.
+    "channel_skew": _scaled(-1.0, delay_ms="delay_ms"),
+    "backlash": _named(gap_arcsec="gap_arcsec"),
+    "hysteresis_parameters": _named(
+        offset_arcsec="offset_arcsec", width_deg="width_deg", exponent="exponent"
+    ),
+    "hysteresis_memory": _loop_height,
+    "rate_dependence": lambda secret: {
+        **_scaled(100.0, growth_percent="growth_per_decade")(secret),
+        **_named(reference_deg_s="from_deg_s")(secret),
+    },
+    "subdivisional_error": _interpolation,
+    "zero_drift": _zero_drift,
+    "amplitude_drift": _amplitude_drift,
+    "wear": _wear,
+    "ratio_error": _named(ramp_arcsec_per_turn="arcsec_per_motor_turn"),
+    "count_loss": _count_loss,
+    # Not the amplitude: hidden.yaml has that of the load on its spring, and where the motor rests the
+    # vibration shakes the loop as well, by more than that.
+    "vibration": _named(frequency_hz="frequency_hz"),
+    "local_defect": _local_defect,
+}
+"""By the finding's cause. `creep` is not there: its finding is a sum of exponentials on a fixed grid of time
+constants, not the plant's elements.
+"""
+
+
+def true_parameters(cause: str, found: Data, hidden: Data, truth: Data, model: Data) -> Values:
+    """What a finding of this cause with these values should say; empty where the cause is not there."""
+    known = {each["cause"]: each["parameters"] for each in hidden["hidden"]}
+    parameters = known.get(cause) or known.get(TWINS.get(cause, ""))
+    if parameters is None and truth and cause in ALWAYS_THERE and cause in hidden["also"]:
+        parameters = {}
+    if parameters is None or cause not in TRUE:
+        return {}
+    return TRUE[cause](Secret(parameters, found, truth, model))
