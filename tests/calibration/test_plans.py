@@ -4,8 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.diagnose.planned import plan_report
+from hdbridge.effects import Hysteresis
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import document_from_text
+from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, MoveTo, Sample
 from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
@@ -23,6 +26,10 @@ def sweeps(tasks):
     return [part for task in tasks.tasks for part in task.procedure.parts if isinstance(part, Sweep)]
 
 
+def beyond(entry):
+    return getattr(entry, "beyond", False)
+
+
 @pytest.mark.parametrize("name", ["quick", "full"])
 @pytest.mark.parametrize("ratio", [30.0, 50.0, 160.0])
 def test_the_bundled_plans_have_what_a_calibration_needs(name, ratio):
@@ -33,6 +40,16 @@ def test_the_bundled_plans_have_what_a_calibration_needs(name, ratio):
     words = " ".join(task.name for task in tasks.tasks)
     for procedure in ("standstill", "sweep", "sines", "reversals", "stepping", "reference"):
         assert procedure in words
+
+
+def test_the_quick_plan_shows_whether_the_gear_remembers_where_it_turned():
+    plan = Plan.load("quick")
+    model = TransmissionModel(50.0, (Hysteresis(offset_arcsec=30, width_deg=20, exponent=1.6),))
+    only = plan.model_copy(update={"procedures": tuple(each for each in plan.procedures if not beyond(each))})
+    seen, unseen = (plan_report(each, model)["identifiability"]["hysteresis_memory"] for each in (plan, only))
+    assert seen["detectable"] is True
+    assert seen["detection_limit_arcsec"] < 5.0
+    assert unseen["detectable"] is False
 
 
 def test_quick_takes_minutes_and_full_does_not():
