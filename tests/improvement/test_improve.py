@@ -127,6 +127,16 @@ def test_what_can_be_compensated_brings_stepping_back_to_the_floor(cell, cause):
     )
 
 
+def test_a_wrong_ratio_is_named_and_made_up_for(cell):
+    """A little more than a load turn tells a ramp from what comes back with the load."""
+    cell.hide("ratio_error", 12.0)
+    result, *_ = cell.improve()
+    assert causes(result) == ["ratio_error"]
+    assert result["offered"] is True
+    assert result["compensated"] == ["ratio_error"]
+    assert result["stepping"]["of_floor"] < 1.3
+
+
 @pytest.mark.parametrize("cause", ["load_order", "count_loss"])
 def test_what_cannot_be_compensated_is_said_and_nothing_is_proposed(cell, cause):
     profile = cell.files()
