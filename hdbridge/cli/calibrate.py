@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from hdbridge.axis import AxisConfig
-from hdbridge.calibration import Calibration, Journal, calibrate, start_journal
-from hdbridge.calibration.measure import identity_of, outlook
+from hdbridge.calibration import Calibration, calibrate
 from hdbridge.calibration.validation import validation_s
-from hdbridge.cli.findings import print_calibration, write_calibration_page
-from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.measuring import kept_in, phases
+from hdbridge.cli.booted import booted
+from hdbridge.cli.findings import print_calibration, print_next, write_calibration_page
+from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -26,15 +23,11 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
     console,
     load_axis,
     notes,
     write_json,
 )
-from hdbridge.drive.drive import Drive
-from hdbridge.errors import InputError
-from hdbridge.procedures.plan import Plan
 
 
 def register(app: typer.Typer) -> None:
@@ -44,25 +37,10 @@ def register(app: typer.Typer) -> None:
 
 def command(
     profile: ProfileArgument,
-    plan: Annotated[
-        str,
-        typer.Option(
-            "--plan", metavar="quick|full|FILE", help="What is measured: a bundled plan, or a file."
-        ),
-    ] = "quick",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", metavar="FOLDER", help="Where the recording goes; else recordings/AXIS-DATE-TIME."
-        ),
-    ] = None,
+    plan: PlanOption = "quick",
+    out: Annotated[Path | None, out_option("Where the recording goes")] = None,
     resume: Annotated[
-        Path | None,
-        typer.Option(
-            "--resume",
-            metavar="FOLDER",
-            help="Go on with an interrupted calibration: what its plan still lacks.",
-        ),
+        Path | None, resume_option("Go on with an interrupted calibration: what its plan still lacks.")
     ] = None,
     simulate: SimulateOption = False,
     truth: TruthOption = None,
@@ -80,37 +58,22 @@ def command(
     """
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
-    date = datetime.now().astimezone()
-    if resume is not None and out is not None:
-        raise InputError("--resume goes on in its own folder: leave out --out")
-    journal = Journal.open(resume) if resume is not None else None
-    if journal is not None:
-        journal.check_is_of(axis)
-    chosen = journal.plan if journal is not None else Plan.load(plan)
-    _announce(chosen, axis, journal)
-    folder = resume or out or Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
-    with (
-        deferred_interrupt() as interrupted,
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
-        kept_in(folder),
-    ):
-        drive.boot()
-        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
-        if journal is None:
-            about = {"simulated": True, "seed": seed} if simulate else {}
-            journal = start_journal(folder, axis, chosen, date, identity_of(drive), about)
+    work = Measurement.asked(axis, plan, out, resume)
+    work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
+    kept = kept_in(work.folder)
+    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, around=kept) as (drive, interrupted):
+        journal = work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = calibrate(
                 drive,
                 journal,
                 files.axis.parent,
-                date,
+                work.date,
                 progress=progress,
                 interrupted=interrupted,
                 tell=lambda line: notes.print(escape(line)),
             )
-    report(result, folder, files, json_file, html_file)
+    report(result, work.folder, files, json_file, html_file)
 
 
 def report(
@@ -122,21 +85,4 @@ def report(
     write_json(json_file, result.as_dict())
     page = html_file or folder / "report.html"
     write_calibration_page(page, result)
-    if result.offer and result.offer.made:
-        console.print(
-            f"pending: {result.offer.pending}\nreview it: hdbridge model diff {files.axis.parent}\n"
-            f"use it: hdbridge model commit {files.axis.parent}",
-            soft_wrap=True,
-        )
-
-
-def _announce(plan: Plan, axis: AxisConfig, journal: Journal | None) -> None:
-    left = outlook(plan, axis, journal.done if journal else ())
-    for each in left.notes:
-        notes.print(escape(f"plan '{plan.name}': {each}"))
-    done = f" ({len(journal.done)} tasks are there already)" if journal else ""
-    notes.print(
-        f"plan '{plan.name}': {len(left.tasks)} tasks{done}, {left.duration_s / 60:.1f} min of the axis, and "
-        f"{validation_s(plan, axis) / 60:.1f} min to test the model",
-        soft_wrap=True,
-    )
+    print_next(result.offer, files)

@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.calibration import Calibration, Stepped, Validation
-from hdbridge.calibration.result import unit_of
-from hdbridge.cli.options import console, print_table
+from hdbridge.calibration.result import Offer, unit_of
+from hdbridge.cli.options import Profile, console, print_table
 from hdbridge.files.atomic import write_atomically
 from hdbridge.modeldiff import diff
 from hdbridge.report.calibration import calibration_page
@@ -69,6 +69,16 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
     """The result as a self-contained page."""
     write_atomically(path, render(calibration_page(result)))
     console.print(f"report: {path}", soft_wrap=True)
+
+
+def print_next(offer: Offer | None, profile: Profile) -> None:
+    """What a person does with a pending model."""
+    if offer is not None and offer.made:
+        console.print(
+            f"pending: {offer.pending}\nreview it: hdbridge model diff {profile.axis.parent}\n"
+            f"use it: hdbridge model commit {profile.axis.parent}",
+            soft_wrap=True,
+        )
 
 
 def _title(result: Calibration) -> str:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from hdbridge.axis import AxisConfig
-from hdbridge.calibration import Journal, start_journal
-from hdbridge.calibration.measure import identity_of, outlook
+from hdbridge.cli.booted import booted
 from hdbridge.cli.diagnose import print_diagnosis
-from hdbridge.cli.findings import print_stepping, print_steps
-from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.measuring import kept_in, phases
+from hdbridge.cli.findings import print_next, print_stepping, print_steps
+from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -26,19 +22,16 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
     console,
     load_axis,
     notes,
     write_json,
 )
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.improvement import Improvement, Source, improve
 from hdbridge.improvement.trial import trial_s
 from hdbridge.model import TransmissionModel
-from hdbridge.procedures.plan import Plan
 from hdbridge.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
@@ -54,12 +47,7 @@ def register(app: typer.Typer) -> None:
 
 def command(
     profile: ProfileArgument,
-    plan: Annotated[
-        str,
-        typer.Option(
-            "--plan", metavar="quick|full|FILE", help="What is measured: a bundled plan, or a file."
-        ),
-    ] = "quick",
+    plan: PlanOption = "quick",
     given: Annotated[
         list[Path] | None,
         typer.Option(
@@ -79,17 +67,9 @@ def command(
     rounds: Annotated[
         int, typer.Option("--rounds", min=1, max=20, help="With --auto: so many experiments at most.")
     ] = 3,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."
-        ),
-    ] = None,
+    out: Annotated[Path | None, out_option("Where the recordings go")] = None,
     resume: Annotated[
-        Path | None,
-        typer.Option(
-            "--resume", metavar="FOLDER", help="Go on with an interrupted improvement: what it still lacks."
-        ),
+        Path | None, resume_option("Go on with an interrupted improvement: what it still lacks.")
     ] = None,
     simulate: SimulateOption = False,
     truth: TruthOption = None,
@@ -110,42 +90,31 @@ def command(
     active = _active(files)
     if given and resume is not None:
         raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
-    if resume is not None and out is not None:
-        raise InputError("--resume goes on in its own folder: leave out --out")
-    date = datetime.now().astimezone()
-    journal = Journal.open(resume) if resume is not None else None
-    if journal is not None:
-        journal.check_is_of(axis)
-    chosen = journal.plan if journal is not None else Plan.load(plan)
+    work = Measurement.asked(axis, plan, out, resume)
     recordings = tuple(given or ())
     for each in recordings:
         Recording.load(each)  # refused before anything is connected
-    _announce(chosen, axis, active, journal, measures=not recordings)
-    folder = resume or out or Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
-    with (
-        deferred_interrupt() as interrupted,
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
-        kept_in(folder),
-    ):
-        drive.boot()
-        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
-        if journal is None and not recordings:
-            about = {"simulated": True, "seed": seed} if simulate else {}
-            journal = start_journal(folder, axis, chosen, date, identity_of(drive), about)
+    trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"
+    if recordings:
+        notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
+    else:
+        work.announce(trial)
+    kept = kept_in(work.folder)
+    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, around=kept) as (drive, interrupted):
+        journal = None if recordings else work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = improve(
                 drive,
-                Source(chosen, folder, journal, recordings, independent_zeros),
+                Source(work.plan, work.folder, journal, recordings, independent_zeros),
                 files.axis.parent,
                 active,
-                date,
+                work.date,
                 rounds=rounds if auto else 0,
                 progress=progress,
                 interrupted=interrupted,
                 tell=lambda line: notes.print(escape(line), soft_wrap=True),
             )
-    report(result, folder, files, json_file, html_file)
+    report(result, work.folder, files, json_file, html_file)
 
 
 def report(
@@ -176,12 +145,7 @@ def report(
     write_json(json_file, result.as_dict())
     if html_file is not None or folder.is_dir():
         write_page(html_file or folder / "report.html", result)
-    if result.offer.made:
-        console.print(
-            f"pending: {result.offer.pending}\nreview it: hdbridge model diff {files.axis.parent}\n"
-            f"use it: hdbridge model commit {files.axis.parent}",
-            soft_wrap=True,
-        )
+    print_next(result.offer, files)
 
 
 def write_page(path: Path, result: Improvement) -> None:
@@ -211,21 +175,3 @@ def _active(files: Profile) -> TransmissionModel:
             f"{files.axis.parent}"
         )
     return TransmissionModel.load(files.model)
-
-
-def _announce(
-    plan: Plan, axis: AxisConfig, active: TransmissionModel, journal: Journal | None, *, measures: bool
-) -> None:
-    trial = f"{trial_s(plan, axis, active) / 60:.1f} min to step with both models, if something is found"
-    if not measures:
-        notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
-        return
-    left = outlook(plan, axis, journal.done if journal else ())
-    for each in left.notes:
-        notes.print(escape(f"plan '{plan.name}': {each}"), soft_wrap=True)
-    done = f" ({len(journal.done)} tasks are there already)" if journal else ""
-    notes.print(
-        f"plan '{plan.name}': {len(left.tasks)} tasks{done}, {left.duration_s / 60:.1f} min of the axis, "
-        f"and {trial}",
-        soft_wrap=True,
-    )

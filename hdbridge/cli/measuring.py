@@ -1,12 +1,84 @@
-"""What the commands that measure by a plan share: where the record is kept, and how far they are."""
+"""What the commands that measure by a plan share: its options, what is asked of it, how far they are."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import Annotated, Any, Self
 
+import typer
+from rich.markup import escape
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import Journal, start_journal
+from hdbridge.calibration.measure import identity_of, outlook
 from hdbridge.cli.options import notes, progress_bar
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.procedures.plan import Plan
+
+PlanOption = Annotated[
+    str,
+    typer.Option("--plan", metavar="quick|full|FILE", help="What is measured: a bundled plan, or a file."),
+]
+
+
+def out_option(help_: str) -> Any:
+    """`--out`: where a new recording goes."""
+    return typer.Option("--out", metavar="FOLDER", help=f"{help_}; else recordings/AXIS-DATE-TIME.")
+
+
+def resume_option(help_: str) -> Any:
+    """`--resume`: which recording goes on."""
+    return typer.Option("--resume", metavar="FOLDER", help=help_)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A plan that is to be measured into a folder, or the rest of one that was begun there."""
+
+    axis: AxisConfig
+    plan: Plan
+    folder: Path
+    date: datetime
+    journal: Journal | None
+    """Of the recording that goes on."""
+
+    @classmethod
+    def asked(cls, axis: AxisConfig, plan: str, out: Path | None, resume: Path | None) -> Self:
+        """As the options say; InputError where they contradict each other, or the recording or the axis."""
+        date = datetime.now().astimezone()
+        if resume is None:
+            folder = out or Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
+            return cls(axis, Plan.load(plan), folder, date, None)
+        if out is not None:
+            raise InputError("--resume goes on in its own folder: leave out --out")
+        journal = Journal.open(resume)
+        journal.check_is_of(axis)
+        return cls(axis, journal.plan, resume, date, journal)
+
+    def announce(self, after: str) -> None:
+        """Tell what is left of the plan and how long that takes; ``after`` says what comes then."""
+        done = self.journal.done if self.journal else ()
+        left = outlook(self.plan, self.axis, done)
+        for each in left.notes:
+            notes.print(escape(f"plan '{self.plan.name}': {each}"), soft_wrap=True)
+        there = f" ({len(done)} tasks are there already)" if self.journal else ""
+        notes.print(
+            f"plan '{self.plan.name}': {len(left.tasks)} tasks{there}, {left.duration_s / 60:.1f} min of the "
+            f"axis, and {after}",
+            soft_wrap=True,
+        )
+
+    def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
+        """The journal that goes on, else a new one of this booted drive."""
+        if self.journal is not None:
+            return self.journal
+        about = {} if simulated_seed is None else {"simulated": True, "seed": simulated_seed}
+        return start_journal(self.folder, self.axis, self.plan, self.date, identity_of(drive), about)
 
 
 @contextmanager

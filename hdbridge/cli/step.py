@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Run
-from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.booted import booted
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -23,7 +23,6 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
     console,
     load_axis,
     notes,
@@ -32,7 +31,6 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.comparison import Comparison, compare_schemes
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.model import TransmissionModel
@@ -123,34 +121,30 @@ def run_comparison(
             run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
 
     with (
-        deferred_interrupt() as interrupted,
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+        progress_bar() as bar,
     ):
-        drive.boot()
-        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
-        with progress_bar() as bar:
-            bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
+        bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
 
-            begun: set[Scheme] = set()
+        begun: set[Scheme] = set()
 
-            def show(scheme: Scheme, share: float) -> None:
-                if scheme not in begun:
-                    begun.add(scheme)
-                    bar.reset(bars[scheme])  # its time begins now
-                    for each in bars.values():  # none is shown of a test that is refused
-                        bar.update(each, visible=True)
-                bar.update(bars[scheme], completed=share)
+        def show(scheme: Scheme, share: float) -> None:
+            if scheme not in begun:
+                begun.add(scheme)
+                bar.reset(bars[scheme])  # its time begins now
+                for each in bars.values():  # none is shown of a test that is refused
+                    bar.update(each, visible=True)
+            bar.update(bars[scheme], completed=share)
 
-            return compare_schemes(
-                drive,
-                model,
-                wanted,
-                stepping,
-                progress=show,
-                interrupted=interrupted,
-                finished=keep,
-            )
+        return compare_schemes(
+            drive,
+            model,
+            wanted,
+            stepping,
+            progress=show,
+            interrupted=interrupted,
+            finished=keep,
+        )
 
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:

@@ -1,0 +1,37 @@
+"""A drive ready to be measured: connected, booted, and stopped in good order at Ctrl-C."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+
+from hdbridge.axis import AxisConfig
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import Profile, connected, notes
+from hdbridge.drive.drive import Drive
+
+
+@contextmanager
+def booted(
+    axis: AxisConfig,
+    profile: Profile,
+    *,
+    simulate: bool,
+    truth: Path | None,
+    seed: int,
+    around: AbstractContextManager[object] | None = None,
+) -> Iterator[tuple[Drive, Callable[[], bool]]]:
+    """The booted drive, and a function that tells whether somebody wishes to end.
+
+    ``around`` is entered on the connected drive before it boots.
+    """
+    with (
+        deferred_interrupt() as interrupted,
+        connected(axis, profile, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
+        Drive(bus, axis, clock) as drive,
+        around or nullcontext(),
+    ):
+        drive.boot()
+        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
+        yield drive, interrupted
