@@ -98,8 +98,8 @@ def parameters_of(workshop: Workshop, fitted: Fitted, place: int, spread: FloatA
     result = _linear(effect, spread[np.ix_(linear, linear)])
     for i in own:
         parameter = fitted.parameters[i]
-        if not parameter.shape:
-            continue
+        if not parameter.shape or spread[i, i] <= 0.0:
+            continue  # nothing in the record depends on it
         value = shape_value(effect, parameter.name)
         half = NORMAL_95 * math.sqrt(max(float(spread[i, i]), 0.0))
         if parameter.logarithmic:

@@ -129,11 +129,23 @@ def _load_orders(secret: Secret) -> Values:
 
 
 def _compliance(secret: Secret) -> Values:
-    """The softness from no torque on. A spring in stages is compared in its first alone: the finding's own
-    stages may begin elsewhere.
+    """The softness and the ends of each stage; of a finding without stages, the wind-up under the highest
+    torque by that torque.
     """
     stiffness = secret.stiffness or secret.parameters.get("stiffness_nm_per_rad")
-    return {} if stiffness is None else {"c1_arcsec_per_nm": ARCSEC_PER_RAD / float(stiffness)}
+    if stiffness is None:
+        return {}
+    first = ARCSEC_PER_RAD / float(stiffness)
+    stages = secret.gear.get("stiffening")
+    if "torque1_nm" not in secret.found or not stages:
+        return {"c1_arcsec_per_nm": float(secret.parameters.get("compliance_arcsec_per_nm", first))}
+    return {
+        "c1_arcsec_per_nm": first,
+        "c2_arcsec_per_nm": ARCSEC_PER_RAD / float(stages["second_stiffness_nm_per_rad"]),
+        "c3_arcsec_per_nm": ARCSEC_PER_RAD / float(stages["third_stiffness_nm_per_rad"]),
+        "torque1_nm": float(stages["first_torque_nm"]),
+        "torque2_nm": float(stages["second_torque_nm"]),
+    }
 
 
 def _inertial(secret: Secret) -> Values:
