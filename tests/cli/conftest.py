@@ -1,11 +1,14 @@
 """The command line as a person uses it: a process, its output and its exit status."""
 
+import io
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from hdbridge.cli import main
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
@@ -23,6 +26,22 @@ def hdbridge(tmp_path):
             timeout=timeout,
             check=False,
         )
+
+    return run
+
+
+@pytest.fixture
+def here(monkeypatch, capsys, tmp_path):
+    """The same in this process, which spares its start; nobody answers its questions."""
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["hdbridge", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+        with pytest.raises(SystemExit) as end:
+            main()
+        out, err = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, end.value.code or 0, out, err)
 
     return run
 

@@ -10,7 +10,6 @@ import time
 
 import pytest
 
-from hdbridge.cli import main
 from hdbridge.model import TransmissionModel
 
 PENDING = """\
@@ -27,21 +26,6 @@ provenance:
   date: "2026-01-02T03:04:05Z"
   reason: offset {offset}
 """
-
-
-@pytest.fixture
-def here(monkeypatch, tmp_path, capsys):
-    """Run `hdbridge ARGS...` in this process, which spares its start."""
-
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["hdbridge", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        out, err = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, end.value.code, out, err)
-
-    return run
 
 
 @pytest.fixture
