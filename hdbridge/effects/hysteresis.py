@@ -15,55 +15,16 @@ encoder count of chatter is several arcseconds. Drive it from the command.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from hdbridge.effects.base import (
-    Cause,
-    Compensable,
-    Effect,
-    FloatArray,
-    Moment,
-    Motion,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.effects.base import Cause, FloatArray, Moment, Start, Tracker
+from hdbridge.effects.elastic_loop import ElasticLoop, rise, rise_at
 
 
-def rise(xi: FloatArray, n: float) -> FloatArray:
-    """The branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
-
-    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; written with expm1 so that it is
-    exact on both sides of n = 2 and through it.
-    """
-    clipped = np.minimum(xi, 1.0)
-    result = np.zeros_like(clipped)
-    inside = clipped > 0.0
-    logs = -np.log(clipped[inside])
-    m = 2.0 - n
-    bulge = logs if m == 0.0 else np.expm1(m * logs) / m
-    result[inside] = clipped[inside] * (1.0 + bulge)
-    return result
-
-
-def rise_at(xi: float, n: float) -> float:
-    """`rise` for one number, in plain floats for the control loop."""
-    if xi <= 0.0:
-        return 0.0
-    if xi >= 1.0:
-        return 1.0
-    log = -math.log(xi)
-    m = 2.0 - n
-    return xi * (1.0 + (log if m == 0.0 else math.expm1(m * log) / m))
-
-
-class Hysteresis(Effect):
+class Hysteresis(ElasticLoop):
     """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, to the offset."""
 
     name: ClassVar[str] = "hysteresis"
@@ -80,49 +41,10 @@ class Hysteresis(Effect):
         source="rolling-friction law with exponent n; the height is twice the offset",
         size="10-80 arcsec from side to side",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, and the command says where it reverses"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("width_deg", 0.5, 120.0, logarithmic=True),
-        Shape("exponent", 1.02, 4.0),
-    )
-    typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
-    """A published gear of ratio 50."""
-
-    offset_arcsec: Annotated[
-        float, Field(ge=0, le=3600, description="half the height of the loop, at the load")
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
-    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
-
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
-        return self.offset_arcsec * self._unit(motion.motor_deg, start)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; its first `advance` only says where the motor stands."""
         return _HysteresisTracker(self.offset_arcsec, self.width_deg, self.exponent, start)
-
-    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The loop of unit offset, shape (n, 1): the law is homogeneous in its offset."""
-        return self._unit(motion.motor_deg, start)[:, np.newaxis]
-
-    def coefficients(self) -> FloatArray:
-        """The offset, arcsec, shape (1,)."""
-        return np.array([self.offset_arcsec])
-
-    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Another offset, and another width and exponent where given."""
-        return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
-
-    def bound_arcsec(self) -> float:
-        """The offset."""
-        return self.offset_arcsec
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: along its path hysteresis only rises."""
-        return 0.0
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
         """The loop for an offset of one: a loop over the reversals, then all samples at once."""

@@ -20,30 +20,20 @@ infinitely steeply where the plain law rises, and would have to repeat the plain
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from hdbridge.effects.base import (
-    Cause,
-    Compensable,
-    Effect,
-    FloatArray,
-    Moment,
-    Motion,
-    Shape,
-    Start,
-    Tracker,
-)
-from hdbridge.effects.hysteresis import Hysteresis, branches, rise, rise_at
+from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Start, Tracker
+from hdbridge.effects.elastic_loop import ElasticLoop, rise, rise_at
+from hdbridge.effects.hysteresis import Hysteresis, branches
 
 _DEPTH = 200
 """Reversals remembered; beyond it the innermost loop is forgotten early (a fraction of its own height)."""
 
 
-class HysteresisMemory(Effect):
+class HysteresisMemory(ElasticLoop):
     """Masing's rules over the branch of `Hysteresis`; stands in its place."""
 
     name: ClassVar[str] = "hysteresis_memory"
@@ -62,44 +52,10 @@ class HysteresisMemory(Effect):
         source="G. Masing 1926; return-point memory of Prandtl-Ishlinskii and Preisach operators",
         size="10-27 arcsec from the plain law, for a loop of 80",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, and the command says where it reverses"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
-
-    offset_arcsec: Annotated[
-        float, Field(ge=0, le=3600, description="half the height of the loop, at the load")
-    ]
-    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
-    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
-
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
-        return self.offset_arcsec * self._unit(motion.motor_deg, start)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; its first `advance` only says where the motor stands."""
         return _MemoryTracker(self.offset_arcsec, self.width_deg, self.exponent, start)
-
-    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The loop of unit offset, shape (n, 1)."""
-        return self._unit(motion.motor_deg, start)[:, np.newaxis]
-
-    def coefficients(self) -> FloatArray:
-        """The offset, arcsec, shape (1,)."""
-        return np.array([self.offset_arcsec])
-
-    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Another offset, and another width and exponent where given."""
-        return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
-
-    def bound_arcsec(self) -> float:
-        """The offset."""
-        return self.offset_arcsec
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: along its path hysteresis only rises."""
-        return 0.0
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
@@ -107,7 +63,7 @@ class HysteresisMemory(Effect):
         for each in base:
             if isinstance(each, Hysteresis):
                 return each.parameters()
-        return {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
+        return {}
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
         """The loop for an offset of one: a loop over reversals, then all samples at once."""

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hdbridge.compensation import Compensation, CompensationLimits, Inverse
 from hdbridge.effects import CATALOGUE, Backlash, Hysteresis, Moment, MotorOrder, Start, Synchronous, Wear
-from hdbridge.effects.hysteresis import rise_at
+from hdbridge.effects.elastic_loop import rise_at
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 
