@@ -36,6 +36,10 @@ LAW_ARCSEC = 0.5
 LOOP_SHARE = 0.12
 LOOP_ARCSEC = 1.5
 """A loop has changed when it differs by this share of itself, root mean square, and by this much."""
+CALIBRATED = 0.04
+CALIBRATIONS = 4.0
+"""... or, since width and exponent show only after a reversal, when its parameters are so many standard
+deviations away: those of a calibration, this share of each, and of the fit together."""
 ORDER_SHARE = 0.15
 ORDER_ARCSEC = 0.8
 """The same for an order of the motor."""
@@ -95,23 +99,45 @@ def _law(
     if type(given) is not type(now):
         return None
     before, after = values(given), values(now)
-    change = float(np.std(after - before))
-    if change < max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after))):
+    change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
+    as_a_whole = change >= max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after)))
+    if not as_a_whole and (peak < LOOP_ARCSEC or _away(precise, place, given, now, spread) < CALIBRATIONS):
         return None
     loop = Loop(**given.parameters(), memory=isinstance(given, HysteresisMemory))
     assert isinstance(now, Hysteresis | HysteresisMemory)
     effect = HysteresisParameters(
         base=loop, offset_arcsec=now.offset_arcsec, width_deg=now.width_deg, exponent=now.exponent
     )
+    # A free-form loop stands beside it where it obeys neither law: whether it has memory is then open.
+    aliases = ("hysteresis_memory",) if workshop.nuisance.shape[1] else ()
     residual = fitted.residual / workshop.weight
     old_residual = residual + (after - before) - float(np.mean(after - before))
     return Finding(
-        "hysteresis_parameters", 0.9, (), parameters_of(workshop, precise, place, spread),
+        "hysteresis_parameters", 0.9, aliases, parameters_of(workshop, precise, place, spread),
         float(np.sqrt(np.mean(old_residual**2))), float(np.sqrt(np.mean(residual**2))),
-        next_experiment("hysteresis_parameters", ()), 0.5 * float(np.ptp(after - before)),
+        next_experiment("hysteresis_parameters", aliases), peak,
         robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
         effect=effect, note="the baseline's own loop takes over the new parameters",
     )  # fmt: skip
+
+
+def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray) -> float:
+    """How far offset, width and exponent - 1 are from the given ones, in standard deviations."""
+    own = fitted.places(place)
+    names = [fitted.parameters[i].name if fitted.parameters[i].shape else "offset_arcsec" for i in own]
+
+    def sizes(effect: Effect) -> FloatArray:
+        values = effect.parameters()
+        return np.array([float(values[name]) - (1.0 if name == "exponent" else 0.0) for name in names])
+
+    here = sizes(now)
+    if np.any(here <= 0.0) or np.any(sizes(given) <= 0.0):
+        return math.inf
+    moved = np.log(here / sizes(given))
+    logarithmic = np.array([fitted.parameters[i].logarithmic for i in own])
+    scale = np.where(logarithmic, 1.0, here)
+    covariance = spread[np.ix_(own, own)] / np.outer(scale, scale) + CALIBRATED**2 * np.eye(len(own))
+    return float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
 
 
 def _orders(
