@@ -99,8 +99,10 @@ PAIRS = (
 LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 
 
-def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], float, dict[str, object]]:
-    """What is there, what was found, the time it took, the whole result."""
+def planted(
+    name: str, seed: int, plan: plant.Plan | None = None
+) -> tuple[set[str], Record, TransmissionModel]:
+    """What is there, the record, and the model that is put to the test."""
     rng = np.random.default_rng(1000 * seed + 17)
     effects: dict[str, dict[str, object]] = {}
     axis: dict[str, object] = {}
@@ -122,10 +124,16 @@ def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], floa
             effects |= effect
             axis |= needs
             there.add(each)
-    columns = plant.record(plant.Truth(effects=effects, **axis), plant.Plan(), seed)  # type: ignore[arg-type]
-    model = TransmissionModel.from_text(plant.model_text(seed, truth=nominal))
+    truth = plant.Truth(effects=effects, **axis)  # type: ignore[arg-type]
+    columns = plant.record(truth, plan or plant.Plan(), seed)
+    return there, Record(columns), TransmissionModel.from_text(plant.model_text(seed, truth=nominal))
+
+
+def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], float, dict[str, object]]:
+    """What is there, what was found, the time it took, the whole result."""
+    there, record, model = planted(name, seed)
     begin = time.process_time()
-    result = diagnose(Record(columns), model).as_dict()
+    result = diagnose(record, model).as_dict()
     return there, result["findings"], time.process_time() - begin, result
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdbridge.diagnose import changes
+from hdbridge.diagnose.afterthought import reconsidered
 from hdbridge.diagnose.evidence import Leg, gather
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import extended_model, supported
@@ -16,12 +17,12 @@ from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.probability import probability
+from hdbridge.diagnose.probability import Beside, Signs, weighed
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.twins import inertial, wound_up
-from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, many_of_one, rest
+from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, is_unexplained, many_of_one, rest
 from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
@@ -33,8 +34,6 @@ ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 SHADOW = 2.0
 """A name stands beside something unexplained when it takes away so many times its variance."""
-FAST_ARCSEC = 0.75
-"""The same for what is faster, where it is also more than the noise."""
 LEADS = 3.5
 """A name comes before what is unexplained when its peak is so many times its root mean square."""
 LINES = frozenset({"subdivisional_error", "vibration"})
@@ -42,9 +41,6 @@ LINES = frozenset({"subdivisional_error", "vibration"})
 LOOP_EXPLAINS = 0.3
 """A loop of another shape accounts for what is left when the way since the reversal foretells this share
 of it."""
-PLAIN_ARCSEC = 1.0
-"""More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
-particular."""
 LOW_SHARE = 0.8
 """Orders 1 and 2 that make up more than this share of the squares may be the motor encoder's own."""
 
@@ -73,7 +69,7 @@ def diagnose(
     workshop = Workshop(evidence)
     search = Search(workshop, model.effects)
     progress("searching for causes")
-    trail = search.run()
+    trail = reconsidered(search, search.run())
     progress("judging what was found")
     return _Judge(workshop, search, trail, model, record).diagnosis()
 
@@ -100,14 +96,18 @@ class _Judge:
             for place in range(base, len(fitted.theory.effects))
         ]
         findings += changes.findings(workshop, self.model, trail, precise, spread)
-        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
-            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
         findings.sort(key=lambda each: -each.robust)
+        excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
+        free_loop = bool(workshop.nuisance.shape[1])
         if workshop.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
             workshop.nuisance = workshop.nuisance[:, :0]
             fitted = workshop.fit(fitted.theory)
         spread = covariance(workshop, fitted)
         left = rest(workshop, fitted)
+        unknown = is_unexplained(self.workshop, left) or many_of_one(findings) is not None
+        findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
+        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
         findings = self._with_unexplained(findings, left)
         chosen = tuple(range(base, len(fitted.theory.effects)))
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
@@ -159,7 +159,9 @@ class _Judge:
         considered: list[str] = []
         while len(fitted.theory.effects) > self.trail.base:
             left = rest(self.workshop, fitted)
-            if not self._is_unexplained(replace(left, fast_arcsec=0.0)):  # what is fast casts no shadow
+            if not is_unexplained(
+                self.workshop, replace(left, fast_arcsec=0.0)
+            ):  # what is fast casts no shadow
                 break
             does = {}
             for place in range(self.trail.base, len(fitted.theory.effects)):
@@ -182,10 +184,9 @@ class _Judge:
         gain = held_out(self.workshop, fitted, without)
         aliases, margin = self._aliases(fitted, without, place)
         own = without.chi_square - fitted.chi_square
-        sure = probability(judged.robust, judged.needed, gain.recovered, margin, own)
         return Finding(
             cause=effect.name,
-            probability=sure,
+            probability=0.5,
             aliases=aliases,
             parameters={},
             before_arcsec=gain.before_arcsec,
@@ -194,6 +195,7 @@ class _Judge:
             peak_arcsec=self.search.peak(fitted, place),
             robust=own,
             effect=effect,
+            signs=Signs(judged.robust, judged.needed, margin / max(own, 1e-9), gain.recovered),
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[tuple[str, ...], float]:
@@ -223,7 +225,7 @@ class _Judge:
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings)
-        if many is None and not self._is_unexplained(left):
+        if many is None and not is_unexplained(self.workshop, left):
             return findings
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
         lives = left.lives_in
@@ -265,21 +267,6 @@ class _Judge:
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > LEADS * size else [unknown, *findings]
-
-    def _is_unexplained(self, left: Rest) -> bool:
-        evidence = self.workshop.evidence
-        # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
-        # that.
-        counts = evidence.motor_count_arcsec / np.sqrt(12.0)
-        limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
-        if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
-            return True
-        # Where command and standstill tell noise and following error apart from the gear, fast things count.
-        if evidence.commanded and evidence.standstill:
-            floor = float(np.sqrt(np.mean(1.0 / self.workshop.weight**2)))
-            if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
-                return True
-        return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
 
     def _as_given(self) -> FloatArray:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.diagnose.theory import Fitted, Workshop, orthonormal
-from hdbridge.effects import Backlash, FloatArray, LocalDefect, RatioError, Wear
+from hdbridge.effects import Backlash, Creep, FloatArray, LocalDefect, RatioError, Wear
 from hdbridge.effects.hysteresis import branches
 
 BLOCKS_S = (1.0, 5.0)
@@ -26,6 +26,10 @@ SHARE_LEFT = 1e-5
 TURN_DEG = 60.0
 """Motor angle after a reversal within which an elastic loop is felt."""
 LEAST_GAP_ARCSEC = 2.0
+SETTLED_S = 0.5
+LEAST_CREEP_ARCSEC = 0.25
+"""A gear that creeps does so for seconds: what is over so soon after a stop, or is smaller then, is the
+settling of load and servo, or the end of a loop that depends on speed."""
 BEND = 0.6
 """A ramp of which the slope in some third of the way differs by more than this share is none."""
 
@@ -105,6 +109,11 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
+    if isinstance(effect, Creep):
+        late = _standing_s(workshop)[workshop.index] > SETTLED_S
+        robust = min(robust, robust_chi_square(workshop, fitted, place, rows=late))
+        if robust < needed or _span(workshop, fitted, place, late) < LEAST_CREEP_ARCSEC:
+            return Gate(robust, needed, passed=False, reason="over as soon as the axis has come to rest")
     if isinstance(effect, RatioError) and _bends(workshop, fitted, place):
         return Gate(robust, needed, passed=False, reason="not the same slope everywhere")
     if isinstance(effect, Backlash) and workshop.evidence.reversals < 2:
@@ -133,6 +142,26 @@ def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:
     step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
     slopes = slope + np.cumsum(step[:3])
     return bool(np.ptp(slopes) > BEND * np.max(np.abs(slopes)) and float(moment @ bend) > ROBUST)
+
+
+def _span(workshop: Workshop, fitted: Fitted, place: int, rows: NDArray[np.bool_]) -> float:
+    """Half the span of an effect over some of the usable points, arcsec."""
+    effect = fitted.theory.effects[place]
+    if not np.any(rows):
+        return 0.0
+    values = (workshop.columns(effect, fitted.theory.start) @ effect.coefficients())[rows]
+    low, high = np.quantile(values, [0.002, 0.998])
+    return 0.5 * float(high - low)
+
+
+def _standing_s(workshop: Workshop) -> FloatArray:
+    """Time since the axis came to rest, seconds, shape (n,); 0 in motion."""
+    motion = workshop.motion
+    if motion.motor_speed_deg_s is None or motion.time_s is None:
+        return np.zeros(len(motion))
+    moving = motion.motor_speed_deg_s != 0.0
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(motion)), 0))
+    return np.asarray(np.where(moving, 0.0, motion.time_s - motion.time_s[last]))
 
 
 def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:

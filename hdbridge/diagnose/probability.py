@@ -1,20 +1,97 @@
-"""How sure a name is: from the block-robust evidence, the held-out gain and the margin over the next
-rival.
+"""How sure a name is: a logistic formula of what speaks for it and against it.
+
+The coefficients are fitted, with a ridge and each with the sign that it must have, by
+tools/fit_probabilities.py on the findings of two blind suites and of records from formulas, whose causes are
+known; what came of it in cross-validation stands in docs/diagnosis.md.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from hdbridge.diagnose.result import Finding
+
+LEAST, MOST = 0.02, 0.99
+"""Nothing is ruled out, and nothing that has been seen a few hundred times is surer than this."""
+PLAIN: Final = 25.0
+"""Block-robust chi square of what is barely seen."""
+SMALL_ARCSEC: Final = 0.5
+CAP = 0.6
+COEFFICIENTS: Final = {
+    "constant": 1.2,
+    "strength": 0.3,
+    "ahead": 3.0,
+    "rank": 0.5,
+    "size": 0.5,
+    "excess": -1.0,
+    "others": -0.2,
+    "free_loop": -0.5,
+    "unexplained": -1.5,
+    "not_recovered": -2.5,
+    "within": 0.5,
+}
 
 
-def probability(robust: float, needed: float, recovered: float, margin: float, gain: float) -> float:
-    """Probability that a named cause (or one of its aliases) is there.
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """What speaks for one finding."""
 
-    ``margin`` is the chi square by which the best rival outside the aliases is worse, ``gain`` the cause's
-    own. The
-    form is a logistic one; its coefficients are set on records of known causes (tools/diagnose_trials.py).
-    """
-    strength = math.log(max(robust, 1e-9) / needed)
-    ahead = margin / max(gain, 1e-9)
-    score = 1.2 + 1.6 * strength + 3.0 * min(ahead, 0.6) + (0.0 if recovered > 0.0 else -2.5)
-    return min(max(1.0 / (1.0 + math.exp(-score)), 0.02), 0.995)
+    robust: float
+    """Block-robust chi square."""
+    needed: float
+    ahead: float
+    """Chi square by which the best rival outside the aliases is worse, as a share of the finding's own."""
+    recovered: float
+    """Share of the variance that it takes away on held-out data."""
+    within: bool = False
+    """A change of a part that the model has, which has no rivals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What speaks against all findings of a record."""
+
+    left_arcsec: float
+    """Root mean square that is left beyond the noise."""
+    excess: float
+    """Chi square per point of the whole fit."""
+    free_loop: bool
+    """Whether a loop of free form had to stand beside the law."""
+    unexplained: bool
+
+
+def features(finding: Finding, all_of_them: Sequence[Finding], beside: Beside) -> dict[str, float]:
+    """The terms of the formula, by their names."""
+    signs = finding.signs or Signs(finding.robust, PLAIN, 0.0, 1.0, within=True)
+    largest = max(each.robust for each in all_of_them)
+    return {
+        "constant": 1.0,
+        "strength": min(math.log(max(signs.robust, 1e-9) / signs.needed), 4.0),
+        "ahead": 0.0 if signs.within else min(max(signs.ahead, 0.0), CAP),
+        "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
+        "size": math.log(max(finding.peak_arcsec, 1e-3) / max(SMALL_ARCSEC, beside.left_arcsec)),
+        "excess": math.log(max(beside.excess, 1.0)),
+        "others": float(min(len(all_of_them) - 1, 4)),
+        "free_loop": float(beside.free_loop),
+        "unexplained": float(beside.unexplained),
+        "not_recovered": float(signs.recovered <= 0.0),
+        "within": float(signs.within),
+    }
+
+
+def weighed(findings: Sequence[Finding], beside: Beside) -> list[Finding]:
+    """The findings with the probability that each (or one of its aliases) is there."""
+    terms = [features(each, findings, beside) for each in findings]
+    return [
+        replace(each, probability=_logistic(own), terms=own)
+        for each, own in zip(findings, terms, strict=True)
+    ]
+
+
+def _logistic(terms: dict[str, float]) -> float:
+    score = sum(COEFFICIENTS[name] * value for name, value in terms.items())
+    return min(max(1.0 / (1.0 + math.exp(-score)), LEAST), MOST)

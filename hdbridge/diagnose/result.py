@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.diagnose.probability import Signs
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.model import TransmissionModel
 
@@ -67,6 +68,10 @@ class Finding:
     note: str = ""
     effect: Effect | None = field(default=None, repr=False)
     """As it goes into the model."""
+    signs: Signs | None = field(default=None, repr=False)
+    """What speaks for it."""
+    terms: Mapping[str, float] = field(default_factory=dict, repr=False)
+    """The terms of the formula of its probability."""
     place: FloatArray | None = field(default=None, repr=False)
     """Abscissa of a picture of it, shape (b,); in the unit of ``axis``."""
     curve_arcsec: FloatArray | None = field(default=None, repr=False)

@@ -1,9 +1,7 @@
 """The search for causes: screen everything, fit the best few with everything, take the best, look again.
 
 Penalty per parameter and to enter as in `PENALTY`, `ENTER`; the elastic law is chosen again after each of
-the first
-picks; a swap at the end takes each finding out and puts the best one in its place, which cures most wrong
-first picks.
+the first picks. What was picked is looked at again in `afterthought.py`.
 """
 
 from __future__ import annotations
@@ -18,7 +16,16 @@ from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
 from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
-from hdbridge.effects import ChannelSkew, Compliance, CountLoss, Creep, Effect, FloatArray, Start
+from hdbridge.effects import (
+    AmplitudeDrift,
+    ChannelSkew,
+    Compliance,
+    CountLoss,
+    Creep,
+    Effect,
+    FloatArray,
+    Start,
+)
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.local_defect import LocalDefect
@@ -31,18 +38,9 @@ ENTER = 30.0
 MOST = 6
 BEST = 3
 FEW = 3
-"""Swaps are for so many findings at most; more of them mean something that is none of them."""
+"""So many findings are looked at again; more of them mean something that is none of them."""
 FREE_LOOP_ARCSEC = 0.2
 """Root mean square that a free-form loop has to take away to stand beside the law."""
-KIN = (
-    {"velocity_windup", "channel_skew", "rate_dependence"},
-    {"channel_skew", "inertial_windup"},
-    {"zero_drift", "count_loss"},
-    {"local_defect", "load_order"},
-    {"backlash", "wear"},
-    {"wear", "amplitude_drift"},
-)
-"""Causes of which one's wrong form leaves a rest that looks like the other."""
 SLOW = 0.8
 """A third pick that leaves more than this of a large rest is the last."""
 EXTRAPOLATED = 2.0
@@ -64,8 +62,6 @@ REPEATED = frozenset(
     }
 )
 """Causes of which there may be more than one."""
-KIN_SHARE = 0.15
-"""... so that the second needs this share of the first one's evidence."""
 FLOOR_ARCSEC = 0.5
 """Findings whose peak is smaller than this are of no use to anybody, however certain."""
 FLOORS_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
@@ -74,8 +70,6 @@ a finding when it is more than that."""
 LATE_MS2, LATE_SHARE = 30.0, 4.0
 """A late sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz and
 more) it is at most so many ms^2 and so many times the delay squared."""
-LEFTOVER = 2e-5
-"""Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,13 +95,13 @@ class Search:
 
     def run(self) -> Trail:
         """Find causes, best first."""
-        fitted, law_gain = self._with_best_law(self._begin())
+        fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
-            found = self._best_addition(fitted)
+            found = self.best_addition(fitted)
             if number < 3 and not self.workshop.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
-                    fitted, law_gain = self._with_best_law(loose)
+                    fitted, law_gain = self.with_best_law(loose)
                     continue
             if found is None:
                 break
@@ -117,19 +111,14 @@ class Search:
             if number >= FEW - 1 and slow:
                 break  # piece by piece at something that is none of them
             if number < 3:
-                fitted, law_gain = self._with_best_law(fitted)
-        if len(fitted.theory.effects) - self.base <= FEW:
-            fitted = self._swapped(fitted)
-        fitted = self._pruned(fitted)
-        fitted, law_gain = self._with_best_law(fitted)
-        fitted = self._pruned(fitted)
+                fitted, law_gain = self.with_best_law(fitted)
         return Trail(fitted, self.base, law_gain)
 
     def _begin(self) -> Fitted:
         fits = [self.workshop.fit(Theory(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
-    def _with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
+    def with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
         """The article's law or the one with return-point memory, whichever fits better with all the rest."""
         for place, effect in enumerate(fitted.theory.effects[: self.base]):
             if isinstance(effect, Hysteresis | HysteresisMemory):
@@ -155,10 +144,17 @@ class Search:
 
     # --- one more cause
 
-    def _best_addition(self, fitted: Fitted) -> Fitted | None:
+    def forget(self) -> None:
+        """Candidates that were refused beside other findings are looked at again."""
+        self._refused.clear()
+
+    def best_addition(self, fitted: Fitted) -> Fitted | None:
+        """With the best cause more, refitted; None where none earns its keep."""
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
             trial = self.workshop.fit(joined(fitted.theory, score.candidate.effect, self.base))
+            if isinstance(score.candidate.effect, AmplitudeDrift):
+                trial = self._at_home(trial)
             added = trial.free() - fitted.free()
             net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
             if score.candidate.cause == "flexspline_order" and self._travel_turns() < 1.0:
@@ -170,6 +166,23 @@ class Search:
             if best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
+
+    def _at_home(self, trial: Fitted) -> Fitted:
+        """A drift of amplitudes told at a temperature of this record, where it makes no sense at its own.
+
+        At a reference that is far away the line may have no amplitude left of which to tell a share.
+        """
+        place = next(i for i, each in enumerate(trial.theory.effects) if isinstance(each, AmplitudeDrift))
+        temperature = self.workshop.motion.temperature_c
+        effect = trial.theory.effects[place]
+        if not effect.violations() or temperature is None:
+            return trial
+        for reference in (float(np.max(temperature)), float(np.min(temperature))):
+            other = effect.model_copy(update={"reference_c": round(reference, 1)})
+            again = self.workshop.fit(trial.theory.instead(place, other))
+            if not again.theory.effects[place].violations():
+                return again
+        return trial
 
     def _travel_turns(self) -> float:
         """Turns of the load that the record covers."""
@@ -253,7 +266,7 @@ class Search:
 
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
         """Other causes in the place of one that was taken out, fitted; best first."""
-        self._refused.clear()
+        self.forget()
         result = []
         for score in self._shortlist(without, BEST + 1):
             if score.candidate.cause != cause:
@@ -261,58 +274,6 @@ class Search:
                 if self._counts(trial, score.candidate):
                     result.append((score.candidate.cause, trial))
         return sorted(result, key=lambda each: each[1].chi_square)
-
-    # --- second thoughts
-
-    def _swapped(self, fitted: Fitted) -> Fitted:
-        """Each finding taken out, the law chosen anew, the best one put in its place."""
-        for _ in range(2):
-            changed = False
-            for place in range(self.base, len(fitted.theory.effects)):
-                self._refused.clear()
-                without, _ = self._with_best_law(self.workshop.fit(fitted.theory.without(place)))
-                other = self._best_addition(without)
-                if other is None:
-                    continue
-                before = fitted.chi_square + PENALTY * fitted.free()
-                after = other.chi_square + PENALTY * other.free()
-                if after < before - 5.0:
-                    fitted, changed = other, True
-                    break
-            if not changed:
-                break
-        self._refused.clear()
-        return fitted
-
-    def _pruned(self, fitted: Fitted) -> Fitted:
-        """Without what no longer earns its keep beside the others."""
-        while len(fitted.theory.effects) > self.base:
-            gains = {}
-            for place in range(self.base, len(fitted.theory.effects)):
-                without = self.workshop.fit(fitted.theory.without(place))
-                gains[place] = (without.chi_square - fitted.chi_square, without)
-            largest = max(gain for gain, _ in gains.values())
-            place = min(gains, key=lambda each: gains[each][0] - self._toll(fitted, each))
-            gain, without = gains[place]
-            name = fitted.theory.effects[place].name
-            small = self.peak(fitted, place) < FLOORS_ARCSEC.get(name, FLOOR_ARCSEC)
-            kin = [
-                gains[other][0]
-                for other in gains
-                if any(
-                    {name, fitted.theory.effects[other].name} == each
-                    or (other != place and {name, fitted.theory.effects[other].name} <= each)
-                    for each in KIN
-                )
-            ]
-            share = KIN_SHARE * max(kin, default=0.0)
-            if gain > max(self._toll(fitted, place), LEFTOVER * largest, share) and not small:
-                break
-            fitted = without
-        return fitted
-
-    def _toll(self, fitted: Fitted, place: int) -> float:
-        return PENALTY * len(fitted.places(place)) + ENTER
 
 
 def joined(theory: Theory, effect: Effect, base: int) -> Theory:

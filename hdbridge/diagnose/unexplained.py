@@ -27,6 +27,11 @@ from hdbridge.units import DEG_PER_TURN
 
 LEFT_ARCSEC = 0.5
 """More than this left in means over `BLOCK_S` is too much."""
+FAST_ARCSEC = 0.75
+"""The same for what is faster, where it is also more than the noise."""
+PLAIN_ARCSEC = 1.0
+"""More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
+particular."""
 BLOCK_S = 0.2
 SERIAL = REPEATED - {"creep"}
 SAME_FAMILY = 3
@@ -80,6 +85,23 @@ def rest(workshop: Workshop, fitted: Fitted) -> Rest:
     )
 
 
+def is_unexplained(workshop: Workshop, left: Rest) -> bool:
+    """Whether more is left than nobody need explain."""
+    evidence = workshop.evidence
+    # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
+    # that.
+    counts = evidence.motor_count_arcsec / np.sqrt(12.0)
+    limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
+    if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
+        return True
+    # Where command and standstill tell noise and following error apart from the gear, fast things count.
+    if evidence.commanded and evidence.standstill:
+        floor = float(np.sqrt(np.mean(1.0 / workshop.weight**2)))
+        if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
+            return True
+    return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
+
+
 def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
     """Several near-equal picks of one family: sidebands of something that is none of them."""
     for family in {each.cause for each in findings}:
@@ -89,7 +111,9 @@ def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
             for each in same
             for name, value in each.parameters.items()
             if name.endswith("amplitude_arcsec") or name.endswith("size_arcsec")
-        ] or [each.peak_arcsec for each in same]
+        ]
+        if not sizes or family == "subdivisional_error":  # whose lines have several orders each
+            sizes = [each.peak_arcsec for each in same]
         if family in SERIAL:
             sizes.sort(key=abs, reverse=True)
             near = [each for each in sizes if abs(each) > 0.4 * abs(sizes[0])]

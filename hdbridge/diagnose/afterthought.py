@@ -1,0 +1,149 @@
+"""Second thoughts on what a search has picked: swap, merge, prune.
+
+A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. A merge
+does so with two findings that are kin: one cause that explains what they do is more likely than both.
+Pruning takes out what no longer earns its keep beside the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+from hdbridge.diagnose.search import (
+    ENTER,
+    FEW,
+    FLOOR_ARCSEC,
+    FLOORS_ARCSEC,
+    PENALTY,
+    Search,
+    Trail,
+)
+from hdbridge.diagnose.theory import Fitted
+
+TWO_WAYS = frozenset(
+    {
+        "backlash",
+        "wear",
+        "amplitude_drift",
+        "rate_dependence",
+        "velocity_windup",
+        "channel_skew",
+        "inertial_windup",
+        "creep",
+    }
+)
+"""Causes that lie between the two directions of motion, or where one goes over to the other: what the form of
+one gets wrong lies there too, and looks like another of them."""
+TWO_WAYS_SHARE = 0.05
+"""... so that the second needs this share of the first one's evidence."""
+KIN = (
+    {"velocity_windup", "channel_skew", "rate_dependence"},
+    {"channel_skew", "inertial_windup"},
+    {"zero_drift", "count_loss"},
+    {"local_defect", "load_order"},
+    {"backlash", "wear"},
+    {"wear", "amplitude_drift"},
+)
+"""Causes that are nearer to each other than that."""
+KIN_SHARE = 0.15
+SIDELINE_SHARE = 0.03
+"""A vibration of less than this share of another one's evidence is that one: no source keeps its frequency
+and amplitude exactly, and the gear's loop answers it with other frequencies."""
+MERGED_SHARE = 0.03
+"""One cause in place of two kin may miss this share of what both explain: laws are not exact."""
+LEFTOVER = 2e-5
+"""Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
+
+
+def reconsidered(search: Search, trail: Trail) -> Trail:
+    """What is left of a trail, and what stands in for the rest."""
+    fitted = trail.fitted
+    if len(fitted.theory.effects) - search.base <= FEW:
+        fitted = _swapped(search, fitted)
+    fitted = _pruned(search, fitted)
+    fitted = _merged(search, fitted)
+    fitted, _ = search.with_best_law(fitted)
+    fitted = _pruned(search, fitted)
+    fitted, law_gain = search.with_best_law(fitted)
+    return replace(trail, fitted=fitted, law_gain=law_gain)
+
+
+def kinship(one: str, other: str) -> float:
+    """Share of the other's evidence that a finding needs, because it may look like what that leaves."""
+    if one == other:
+        return {"vibration": SIDELINE_SHARE, "local_defect": KIN_SHARE}.get(one, 0.0)
+    if any({one, other} <= each for each in KIN):
+        return KIN_SHARE
+    return TWO_WAYS_SHARE if {one, other} <= TWO_WAYS else 0.0
+
+
+def _swapped(search: Search, fitted: Fitted) -> Fitted:
+    """Each finding taken out, the law chosen anew, the best one put in its place."""
+    for _ in range(2):
+        changed = False
+        for place in range(search.base, len(fitted.theory.effects)):
+            search.forget()
+            without, _ = search.with_best_law(search.workshop.fit(fitted.theory.without(place)))
+            other = search.best_addition(without)
+            if other is not None and _cost(other) < _cost(fitted) - 5.0:
+                fitted, changed = other, True
+                break
+        if not changed:
+            break
+    search.forget()
+    return fitted
+
+
+def _merged(search: Search, fitted: Fitted) -> Fitted:
+    """Two kin taken out together, and the best one cause put in the place of both."""
+    places = range(search.base, len(fitted.theory.effects))
+    for one, other in combinations(places, 2):
+        names = (fitted.theory.effects[one].name, fitted.theory.effects[other].name)
+        if names[0] == names[1] or not kinship(*names):
+            continue
+        search.forget()
+        without = search.workshop.fit(fitted.theory.without(other).without(one))
+        trial = search.best_addition(without)
+        if trial is None:
+            continue
+        both = without.chi_square - fitted.chi_square
+        if _cost(trial) < _cost(fitted) + ENTER + MERGED_SHARE * both:
+            search.forget()
+            return _merged(search, trial)
+    search.forget()
+    return fitted
+
+
+def _cost(fitted: Fitted) -> float:
+    return fitted.chi_square + PENALTY * fitted.free()
+
+
+def _pruned(search: Search, fitted: Fitted) -> Fitted:
+    """Without what no longer earns its keep beside the others."""
+    while len(fitted.theory.effects) > search.base:
+        gains = {}
+        for place in range(search.base, len(fitted.theory.effects)):
+            without = search.workshop.fit(fitted.theory.without(place))
+            gains[place] = (without.chi_square - fitted.chi_square, without)
+        largest = max(gain for gain, _ in gains.values())
+        place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
+        gain, without = gains[place]
+        name = fitted.theory.effects[place].name
+        small = search.peak(fitted, place) < FLOORS_ARCSEC.get(name, FLOOR_ARCSEC)
+        share = max(
+            (
+                kinship(name, fitted.theory.effects[other].name) * gains[other][0]
+                for other in gains
+                if other != place
+            ),
+            default=0.0,
+        )
+        if gain > max(_toll(fitted, place), LEFTOVER * largest, share) and not small:
+            break
+        fitted = without
+    return fitted
+
+
+def _toll(fitted: Fitted, place: int) -> float:
+    return PENALTY * len(fitted.places(place)) + ENTER

@@ -1,0 +1,65 @@
+"""What separates causes that look alike, and how sure a name is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from hdbridge.diagnose import Diagnosis, Finding
+from hdbridge.diagnose.probability import Beside, Signs, weighed
+
+Diagnosed = Callable[..., Diagnosis]
+
+
+def names(diagnosis: Diagnosis) -> list[str]:
+    return [each.cause for each in diagnosis.findings]
+
+
+def test_a_ripple_that_trebles_with_warmth_is_a_drift_of_amplitudes(diagnosed: Diagnosed) -> None:
+    """So far from what it is at 20 degrees that a share of that means nothing."""
+    result = diagnosed({"amplitude_drift": {"ripple": 0.15}}, temperature_rise_k=14.0)
+    assert names(result) == ["amplitude_drift"]
+
+
+def test_what_is_over_half_a_second_after_a_stop_is_no_creep(diagnosed: Diagnosed) -> None:
+    assert "creep" not in names(diagnosed({"creep": {"size": 4.0, "tau": 0.1}}))
+
+
+def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> None:
+    assert names(diagnosed(width=26.0)) == ["hysteresis_parameters"]
+
+
+def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagnosed) -> None:
+    orders = [(1, 4.0, 30.0), (2, 3.0, 80.0), (4, 2.5, 10.0)]
+    result = diagnosed({"subdivisional_error": {"lines": 5000, "orders": orders}})
+    assert names(result) == ["subdivisional_error"]
+
+
+def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
+    signs = Signs(robust=robust / 10.0, needed=25.0, ahead=0.3, recovered=0.2)
+    return Finding(cause, 0.5, (), {}, 1.0, 0.8, "", peak_arcsec, robust=robust, signs=signs)
+
+
+ALONE = Beside(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        Beside(left_arcsec=2.0, excess=1.0, free_loop=False, unexplained=False),
+        replace(ALONE, excess=4.0),
+        replace(ALONE, unexplained=True),
+    ],
+)
+def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Beside) -> None:
+    (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE)
+    (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside)
+    assert doubtful.probability < alone.probability
+
+
+def test_better_seen_is_surer() -> None:
+    (weak,) = weighed([finding("creep", 400.0, 1.0)], ALONE)
+    (strong,) = weighed([finding("creep", 40000.0, 4.0)], ALONE)
+    assert weak.probability < strong.probability < 1.0

@@ -1,0 +1,156 @@
+"""Fit the formula of the probabilities: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
+[--keep TABLE.json]`.
+
+Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
+formulas of tests/diagnose/plant.py, N seeds of each cause. Each finding gives the terms of the formula
+(hdbridge/diagnose/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
+every term with the sign that it must have; how well it fares is told by cross-validation that leaves whole
+records out. The table that is kept is read again where it is there. Prints the coefficients for
+`COEFFICIENTS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from diagnose_trials import CAUSES, NONE, PAIRS, SPECIAL, SYNONYMS, UNKNOWN, plant, planted
+from scipy.optimize import minimize
+
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.diagnose.probability import COEFFICIENTS, LEAST, MOST
+from hdbridge.model import TransmissionModel
+from hdbridge.recording import Recording
+
+RIDGE = 1.0
+FOLDS = 10
+FREE = frozenset({"constant", "within"})
+AGAINST = frozenset({"excess", "others", "free_loop", "unexplained", "not_recovered"})
+LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
+SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
+BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
+Row = dict[str, Any]
+
+
+def judged(
+    source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
+) -> Iterator[Row]:
+    """One row for each name; what is there besides (``also``) is neither right nor wrong."""
+    met: set[str] = set()
+    for each in result.findings:
+        names = {each.cause, *each.aliases}
+        hits = {one for one in there if names & {one, *SYNONYMS.get(one, ())}} - met
+        if each.cause == "unexplained" or (each.cause in also and not hits):
+            continue
+        met |= set(sorted(hits)[:1])
+        right = bool(hits) or (loop and bool(names & LOOPS))
+        yield {
+            "source": source, "record": name, "cause": each.cause, "right": right,
+            "terms": dict(each.terms), "given": each.probability,
+        }  # fmt: skip
+
+
+def from_suite(folder: Path) -> Iterator[Row]:
+    """The findings in the cases of a blind suite."""
+    for path in sorted(folder.glob("*/hidden.yaml")):
+        hidden = yaml.safe_load(path.read_text(encoding="utf-8"))
+        recording = Recording.load(path.parent / "record.csv")
+        model = TransmissionModel.load(path.parent / "model.yaml")
+        result = diagnose(recording.record, model, recording.segments)
+        there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
+        loop = hidden["kind"] == "other_law"
+        yield from judged(
+            folder.name, f"{folder.name}/{path.parent.name}", result, there, set(hidden["also"]), loop
+        )
+
+
+def from_trials(seeds: int) -> Iterator[Row]:
+    """The findings in short records from formulas."""
+    for seed in range(seeds):
+        for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
+            there, record, model = planted(name, seed + 100, SHORT)
+            loop = name.startswith("none:") or bool(there & LOOPS)
+            result = diagnose(record, model)
+            yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
+
+
+def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
+    """Coefficients of the logistic formula, shape (terms,)."""
+    bounds = [
+        (None, None) if each in FREE else ((None, 0) if each in AGAINST else (0, None)) for each in names
+    ]
+    ridge = np.array([0.0 if each == "constant" else RIDGE for each in names])
+
+    def cost(values: np.ndarray) -> tuple[float, np.ndarray]:
+        score = terms @ values
+        loss = float(np.sum(np.logaddexp(0.0, -np.where(right, score, -score))))
+        slope = terms.T @ (1.0 / (1.0 + np.exp(-score)) - right)
+        return loss + 0.5 * float(ridge @ values**2), slope + ridge * values
+
+    begin = np.zeros(len(names))
+    return np.asarray(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds).x)
+
+
+def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.clip(1.0 / (1.0 + np.exp(-terms @ values)), LEAST, MOST))
+
+
+def reliability(title: str, given: np.ndarray, right: np.ndarray) -> None:
+    """The share of right names by the probability that was given, and the Brier score."""
+    print(
+        f"{title}: {len(right)} names, {int(np.sum(right))} right; Brier {np.mean((given - right) ** 2):.4f}"
+    )
+    for low, high in pairwise(BINS):
+        rows = (given >= low) & (given < high)
+        if np.any(rows):
+            print(
+                f"  {low:.2f} to {min(high, 1):.2f}: mean {np.mean(given[rows]):.3f}, "
+                f"right {int(np.sum(right[rows]))} / {int(np.sum(rows))}"
+            )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--suite", type=Path, action="append", default=[], help="folder of a blind suite")
+    parser.add_argument("--trials", type=int, default=0, help="seeds of records from formulas")
+    parser.add_argument("--keep", type=Path, help="JSON table of the findings")
+    options = parser.parse_args()
+    if options.keep and options.keep.exists():
+        rows: list[Row] = json.loads(options.keep.read_text(encoding="utf-8"))
+    else:
+        rows = [row for each in options.suite for row in from_suite(each)]
+        rows += from_trials(options.trials)
+        if options.keep:
+            options.keep.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    if not rows:
+        print("no findings; give --suite or --trials", file=sys.stderr)
+        return 2
+    names = list(COEFFICIENTS)
+    terms = np.array([[row["terms"][name] for name in names] for row in rows])
+    right = np.array([bool(row["right"]) for row in rows])
+    records = sorted({row["record"] for row in rows})
+    fold = np.array([records.index(row["record"]) * 7919 % FOLDS for row in rows])
+    left_out = np.empty(len(rows))
+    for number in range(FOLDS):
+        held = fold == number
+        left_out[held] = probabilities(terms[held], fitted(terms[~held], right[~held], names))
+    reliability("as given", np.array([float(row["given"]) for row in rows]), right)
+    for source in [*dict.fromkeys(row["source"] for row in rows), ""]:
+        chosen = np.array([source in ("", row["source"]) for row in rows])
+        reliability(f"cross-validated {source or 'all'}", left_out[chosen], right[chosen])
+    for name, value in zip(names, fitted(terms, right, names), strict=True):
+        print(f'    "{name}": {value:.2f},')
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
