@@ -19,7 +19,7 @@ from typing import Any
 
 from typer.models import ArgumentInfo, OptionInfo
 
-from hdbridge.cli import PANELS, app
+from hdbridge.cli import PANELS, load
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "commands.md"
 
@@ -86,22 +86,23 @@ class Command:
 
 def commands() -> Iterator[Command]:
     """All commands, those of groups with the group's name before them, in the order of the overview."""
-    groups = {group.name: group.typer_instance for group in app.registered_groups}
-    for registered in app.registered_commands:
-        yield _command("", registered)
-    for name, group in groups.items():
-        assert group is not None
-        for registered in group.registered_commands:
-            yield _command(f"{name} ", registered)
+    for panel in PANELS.values():
+        for name in panel:
+            loaded = load(name)
+            for registered in loaded.registered_commands:
+                yield _command("", registered)
+            for group in loaded.registered_groups:
+                assert group.typer_instance is not None
+                for registered in group.typer_instance.registered_commands:
+                    yield _command(f"{name} ", registered)
 
 
 def page() -> str:
     """The whole page."""
     known = list(commands())
     parts = [_INTRODUCTION]
-    for panel, modules in PANELS.items():
+    for panel, names in PANELS.items():
         parts.append(f"## {panel}\n")
-        names = [module.__name__.rpartition(".")[2] for module in modules]
         for name in names:
             parts += (_section(each) for each in known if each.name.split()[0] == name)
     return "\n".join(parts)

@@ -8,38 +8,70 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, Final
+from importlib import import_module
+from typing import Annotated, Any, Final
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_group
 
 from hdbridge import __version__
-from hdbridge.cli import (
-    calibrate,
-    check,
-    demo,
-    diagnose,
-    doctor,
-    fit,
-    improve,
-    latency,
-    model,
-    report,
-    scan,
-    simulate,
-    step,
-)
 from hdbridge.errors import HdbridgeError
 
 PANELS: Final = {
-    "Without hardware": (demo, simulate),
-    "Before the first move": (check, scan, doctor, latency),
-    "The model of an axis": (calibrate, fit, report, diagnose, improve, model),
-    "Positioning": (step,),
+    "Without hardware": {
+        "demo": "Step a simulated axis 240 times each way under four compensation schemes.",
+        "simulate": "Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.",
+    },
+    "Before the first move": {
+        "check": "Read an axis file, its EDS and its model; say what they mean, or what is wrong and where.",
+        "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
+        "axis file.",
+        "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
+        "ratio, stops.",
+        "latency": "Measure how late this machine wakes up; print the histogram and the cycle time that it "
+        "carries.",
+    },
+    "The model of an axis": {
+        "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
+        "fit": "Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.",
+        "report": "Fit a recording again and tell its result; no axis is needed, nothing moves.",
+        "diagnose": "Compare records with a model; name what the model lacks, or say what cannot be told.",
+        "improve": "Say what the active model lacks, extend it, step with both, and keep the better one as "
+        "pending.",
+        "model": "The models of an axis: the active one, one that waits, and every one that there was.",
+    },
+    "Positioning": {
+        "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
+        "measured.",
+    },
 }
-"""Every command, under the heading that `hdbridge --help` gives it."""
+"""Every command, under the heading that `hdbridge --help` gives it, and what it says of it there.
+
+The command itself is the file of that name in this folder. It says the same; it is only imported to be run,
+because some need a second or two for that.
+"""
+
+
+def load(name: str) -> typer.Typer:
+    """Import a command: an app with nothing but what its file registers."""
+    loaded = typer.Typer(rich_markup_mode="markdown")
+    import_module(f"{__name__}.{name}").register(loaded)
+    return loaded
+
+
+class _LoadedToRun(TyperGroup):
+    """Puts the real command in the place of what only stands in the overview."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, _, rest = super().resolve_command(ctx, args)
+        assert name is not None
+        return name, get_group(load(name)).commands[name], rest
+
 
 app = typer.Typer(
     name="hdbridge",
+    cls=_LoadedToRun,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -50,12 +82,15 @@ app = typer.Typer(
         "5 stopped by supervision, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
+
+
+def _in_overview() -> None:
+    """What stands there for a command that is not imported."""
+
+
 for _panel, _commands in PANELS.items():
-    for _command in _commands:
-        _command.register(app)
-        # A module registers a command or a group of them; the heading is given here, where the others are.
-        _registered = app.registered_groups[-1] if _command is model else app.registered_commands[-1]
-        _registered.rich_help_panel = _panel
+    for _name, _summary in _commands.items():
+        app.command(_name, help=_summary, rich_help_panel=_panel)(_in_overview)
 
 
 def _tell_version(asked: bool) -> None:

@@ -123,7 +123,7 @@ def test_a_commit_killed_at_any_moment_leaves_the_old_model_or_the_new_one(hdbri
     folder = propose(40.0)
     hdbridge("model", "commit", folder)
     worker = (
-        "import sys\nfrom hdbridge.cli import app\n"
+        "import sys\nfrom hdbridge.cli import app, load\nload('model')\n"
         "print('ready', flush=True)\nsys.stdin.readline()\n"
         "app(['model', 'commit', sys.argv[1]])\n"
     )

@@ -91,11 +91,12 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
     assert "Exception" not in done.stderr
 
 
-def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path):
+@pytest.mark.parametrize(("slow", "arguments"), [("typer", ("--help",)), ("scipy", ("fit", "--help"))])
+def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path, slow, arguments):
     """An import that never ends stands for a slow one."""
-    (tmp_path / "typer.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
+    (tmp_path / f"{slow}.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
     with subprocess.Popen(
-        [sys.executable, "-m", "hdbridge", "--help"],
+        [sys.executable, "-m", "hdbridge", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

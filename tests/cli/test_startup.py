@@ -1,0 +1,54 @@
+"""What starts quickly does not load what fits and diagnoses, and the overview says what the commands say."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from hdbridge.cli import PANELS, load
+
+ASK = """
+import sys
+from hdbridge.cli import main
+sys.argv = ["hdbridge", *sys.argv[1:]]
+try:
+    main()
+except SystemExit as end:
+    status = end.code or 0
+print("scipy" in sys.modules, status)
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (("--help",), 0),
+        (("model", "log", "article"), 0),
+        (("scan", "--interface", "socketcan"), 2),
+        (("doctor", "--help"), 0),
+    ],
+)
+def test_scipy_is_not_loaded_where_nothing_is_fitted(arguments, status, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", ASK, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+        cwd=tmp_path,
+    )
+    assert done.stdout.splitlines()[-1] == f"False {status}"
+
+
+@pytest.mark.parametrize(
+    ("name", "summary"),
+    [row for panel in PANELS.values() for row in panel.items()],
+    ids=lambda each: each[:9],
+)
+def test_the_overview_says_what_the_command_says(name, summary):
+    loaded = load(name)
+    said = [each.callback.__doc__ for each in loaded.registered_commands]
+    said += [each.typer_instance.info.help for each in loaded.registered_groups]
+    (words,) = said
+    assert " ".join(inspect.cleandoc(words).split("\n\n")[0].split()) == summary
