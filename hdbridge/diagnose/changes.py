@@ -13,7 +13,7 @@ from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
-from hdbridge.diagnose.search import EXTRAPOLATED, Trail
+from hdbridge.diagnose.search import EXTRAPOLATED, PENALTY, Trail
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
     DirectionPhase,
@@ -101,24 +101,42 @@ def _law(
     before, after = values(given), values(now)
     change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
     as_a_whole = change >= max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after)))
-    if not as_a_whole and (peak < LOOP_ARCSEC or _away(precise, place, given, now, spread) < CALIBRATIONS):
+    lawless = _lawless_arcsec(workshop, fitted)
+    if (
+        not as_a_whole
+        and not lawless
+        and (peak < LOOP_ARCSEC or _away(precise, place, given, now, spread) < CALIBRATIONS)
+    ):
         return None
     loop = Loop(**given.parameters(), memory=isinstance(given, HysteresisMemory))
     assert isinstance(now, Hysteresis | HysteresisMemory)
     effect = HysteresisParameters(
         base=loop, offset_arcsec=now.offset_arcsec, width_deg=now.width_deg, exponent=now.exponent
     )
-    # A free-form loop stands beside it where it obeys neither law: whether it has memory is then open.
-    aliases = ("hysteresis_memory",) if workshop.nuisance.shape[1] else ()
+    # A loop that obeys neither law may have memory in part of it, or in none.
+    aliases = ("hysteresis_memory",) if lawless else ()
     residual = fitted.residual / workshop.weight
     old_residual = residual + (after - before) - float(np.mean(after - before))
     return Finding(
         "hysteresis_parameters", 0.9, aliases, parameters_of(workshop, precise, place, spread),
         float(np.sqrt(np.mean(old_residual**2))), float(np.sqrt(np.mean(residual**2))),
-        next_experiment("hysteresis_parameters", aliases), peak,
+        next_experiment("hysteresis_parameters", aliases), max(peak, lawless),
         robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
         effect=effect, note="the baseline's own loop takes over the new parameters",
     )  # fmt: skip
+
+
+def _lawless_arcsec(workshop: Workshop, fitted: Fitted) -> float:
+    """What a loop of free form does beside the law, peak; 0 where the law does as well."""
+    searched = workshop.nuisance
+    if not searched.shape[1]:
+        return 0.0
+    workshop.nuisance = searched[:, :0]
+    plain = workshop.fit(fitted.theory)
+    workshop.nuisance = searched
+    apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / workshop.weight, 0.998))
+    gained = plain.chi_square - fitted.chi_square > LAW_GAIN + PENALTY * searched.shape[1]
+    return apart if gained and apart > 2.0 * LAW_ARCSEC else 0.0
 
 
 def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray) -> float:
