@@ -16,8 +16,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
+from hdbridge.diagnose.driven import kinematics
 from hdbridge.diagnose.noise import noise_arcsec, third_deviation
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
@@ -29,10 +29,8 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 MOST_POINTS = 100_000
-CHATTER_COUNTS = 1.6
-"""Turns of the driving angle smaller than this are no turns: a servo that settles, not a move."""
 CHATTER_SIGMAS = 8.0
-"""... and those smaller than so many standard deviations of the noise of the measured angle."""
+"""Turns of the driving angle smaller than so many standard deviations of the measured angle's noise are noise."""
 LEAST_SAMPLES = 60
 SPEED_WINDOW_S = 0.03
 SETTLE_S = 0.15
@@ -183,7 +181,7 @@ def _series(
         target = None  # a command that never moves while the motor does is no command
     edges = [*record.starts, len(time)]
     pieces = [
-        _kinematics(
+        kinematics(
             record.motor_position_deg[rows],
             None if target is None else target[rows],
             time[rows],
@@ -230,84 +228,6 @@ def _series(
         ),
     )
     return series, names, facts
-
-
-def _kinematics(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Driving angle, speed and acceleration of one record."""
-    if len(time) < 4 * window:
-        window = 1
-    driving = _driving(position, target, time, window, count)
-    smooth = _smooth(driving, window)
-    speed = _slope(smooth, time, window)
-    acceleration = _curvature(smooth, time, window)
-    resting = _resting(driving if target is None else target, window)
-    if count and target is None:
-        # Counts that come and go are no motion: less than half a count over eight windows is rest.
-        span = 4 * window + 1
-        resting |= np.abs(_slope(driving, time, span)) * span * np.median(np.diff(time)) < 0.5 * count
-    speed[resting] = acceleration[resting] = 0.0
-    return driving, speed, acceleration
-
-
-def _driving(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
-) -> FloatArray:
-    """The command and a smooth line for the lag behind it; without a command the angle freed of chatter."""
-    if target is None:
-        return steadied(position, position, 1.6 * count)
-    lag = position - target
-    smooth = _smooth(target, window)
-    speed = _slope(target, time, window)
-    speed[_resting(target, window)] = 0.0
-    columns = np.column_stack([np.ones(len(lag)), speed, _curvature(smooth, time, window)])
-    scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
-    solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
-    line = columns @ solution
-    rest = lag - line
-    if float(np.std(rest)) > 0.45 * count + 1e-6:
-        line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    return steadied(target + line, target + line, CHATTER_COUNTS * count)
-
-
-def _smooth(values: FloatArray, window: int) -> FloatArray:
-    return np.asarray(uniform_filter1d(values, window, mode="nearest"))
-
-
-def _resting(angle: FloatArray, window: int) -> BoolArray:
-    moved = np.abs(np.diff(angle, prepend=angle[:1])) > 1e-9
-    near = np.convolve(moved.astype(np.float64), np.ones(2 * window + 1))
-    return np.asarray(near[window : window + len(angle)] < 0.5)
-
-
-def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Central differences."""
-    half = max(1, window // 2)
-    count = len(values)
-    ahead = np.minimum(np.arange(count) + half, count - 1)
-    back = np.maximum(np.arange(count) - half, 0)
-    span = time[ahead] - time[back]
-    result = np.zeros(count)
-    np.divide(values[ahead] - values[back], span, out=result, where=span > 0.0)
-    return result
-
-
-def _curvature(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Second differences, as near to the sample as the window allows."""
-    half = max(1, window // 2)
-    count = len(values)
-    result = np.zeros(count)
-    if count <= 2 * half:
-        return result
-    middle = slice(half, count - half)
-    ahead, back = values[2 * half :] - values[middle], values[middle] - values[: count - 2 * half]
-    after, before = time[2 * half :] - time[middle], time[middle] - time[: count - 2 * half]
-    good = (after > 0.0) & (before > 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bend = (ahead / after - back / before) / (0.5 * (after + before))
-    result[middle] = np.where(good, bend, 0.0)
-    return result
 
 
 def _kinds(

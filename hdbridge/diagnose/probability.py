@@ -21,6 +21,8 @@ PLAIN: Final = 25.0
 """Block-robust chi square of what is barely seen."""
 SMALL_ARCSEC: Final = 0.5
 CAP = 0.6
+MOST_EXCESS = 1.5
+"""Beyond this, what counts is how much is left beside a finding and not how quiet the record is."""
 COEFFICIENTS: Final = {
     "constant": 1.2,
     "strength": 0.3,
@@ -74,7 +76,7 @@ def features(finding: Finding, all_of_them: Sequence[Finding], beside: Beside) -
         "ahead": 0.0 if signs.within else min(max(signs.ahead, 0.0), CAP),
         "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
         "size": math.log(max(finding.peak_arcsec, 1e-3) / max(SMALL_ARCSEC, beside.left_arcsec)),
-        "excess": math.log(max(beside.excess, 1.0)),
+        "excess": min(math.log(max(beside.excess, 1.0)), MOST_EXCESS),
         "others": float(min(len(all_of_them) - 1, 4)),
         "free_loop": float(beside.free_loop),
         "unexplained": float(beside.unexplained),
