@@ -11,7 +11,7 @@ from rich.markup import escape
 from hdbridge.calibration import Calibration, calibrate
 from hdbridge.calibration.validation import validation_s
 from hdbridge.cli.booted import booted
-from hdbridge.cli.findings import print_calibration, print_next, write_calibration_page
+from hdbridge.cli.findings import print_calibration, print_next, print_page, write_calibration_page
 from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
@@ -80,9 +80,10 @@ def report(
     result: Calibration, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Tell the result, and what comes next."""
+    page = html_file or folder / "report.html"
+    write_json(json_file, result.as_dict())
+    write_calibration_page(page, result)
     print_calibration(result)
     console.print(f"\nrecording: {folder}", soft_wrap=True)
-    write_json(json_file, result.as_dict())
-    page = html_file or folder / "report.html"
-    write_calibration_page(page, result)
+    print_page(page)
     print_next(result.offer, files)

@@ -40,7 +40,7 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
         loaded.check_ratio(axis)
         compensation_for(axis, loaded)
         facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
+    write_json(json_file, {"schema": "hdbridge.check/1", **facts})
     for name, value in facts.items():
         console.print(f"{name:>20}  {value}")
-    write_json(json_file, {"schema": "hdbridge.check/1", **facts})
     console.print("all right")

@@ -45,9 +45,9 @@ def demo(
         seed=seed,
         record=out,
     )
-    print_result(axis, comparison)
     write_json(out / "stepping.json", comparison.as_dict())
     write_page(out / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
+    print_result(axis, comparison)
     console.print(
         f"\nopen {out / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md", soft_wrap=True
     )

@@ -69,8 +69,8 @@ def run(
         if records:
             raise InputError("--plan looks at a plan before anything is measured; leave the records out")
         report = plan_report(Plan.load(plan), known)
-        _print_plan(report)
         write_json(json_file, report)
+        _print_plan(report)
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
@@ -99,10 +99,8 @@ def run(
         independent_zeros=independent_zeros,
         progress=lambda words: notes.print(f"{words} ..."),
     )
-    print_diagnosis(result)
     shares = seen_over(result)
-    _print_figures(result)
-    _print_shares(shares)
+    # Files first: who reads the tables may have had enough of them (`| head`).
     write_json(json_file, result.as_dict() | {"seen_over": shares})
     if html_file is not None:
         page = diagnosis_page(
@@ -113,6 +111,9 @@ def run(
     if extend is not None:
         result.model.save(extend)
         notes.print(f"wrote {extend}")
+    print_diagnosis(result)
+    _print_figures(result)
+    _print_shares(shares)
 
 
 def print_diagnosis(result: Diagnosis) -> None:

@@ -68,6 +68,10 @@ def print_calibration(result: Calibration) -> None:
 def write_calibration_page(path: Path, result: Calibration) -> None:
     """The result as a self-contained page."""
     write_atomically(path, render(calibration_page(result)))
+
+
+def print_page(path: Path) -> None:
+    """Where the page is."""
     console.print(f"report: {path}", soft_wrap=True)
 
 

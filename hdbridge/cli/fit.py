@@ -10,7 +10,7 @@ import typer
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import conclude
-from hdbridge.cli.findings import print_calibration, write_calibration_page
+from hdbridge.cli.findings import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
 from hdbridge.errors import InputError
 from hdbridge.foreign import check_records
@@ -64,13 +64,16 @@ def command(
     if compared and config:
         compared.check_ratio(config)
     found = conclude(recordings, known, compared, axis=config, independent_zeros=independent_zeros)
-    print_calibration(found)
     if out is not None:
         found.model.save(out)
-        console.print(f"model: {out}", soft_wrap=True)
     write_json(json_file, found.as_dict())
     if html_file is not None:
         write_calibration_page(html_file, found)
+    print_calibration(found)
+    if out is not None:
+        console.print(f"model: {out}", soft_wrap=True)
+    if html_file is not None:
+        print_page(html_file)
 
 
 def _ratio(given: float | None, axis: AxisConfig | None, recordings: Mapping[Path, Recording]) -> float:

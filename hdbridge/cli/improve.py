@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from hdbridge.cli.booted import booted
 from hdbridge.cli.diagnose import print_diagnosis
-from hdbridge.cli.findings import print_next, print_stepping, print_steps
+from hdbridge.cli.findings import print_next, print_page, print_stepping, print_steps
 from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
@@ -121,6 +121,10 @@ def report(
     result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Tell the result, and what comes next."""
+    page = html_file or (folder / "report.html" if folder.is_dir() else None)
+    write_json(json_file, result.as_dict())
+    if page is not None:
+        write_page(page, result)
     print_diagnosis(result.diagnosis)
     for line in result.extension.left:
         console.print(escape(line), soft_wrap=True)
@@ -142,9 +146,8 @@ def report(
             )
     console.print(escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True)
     console.print(f"\nrecordings: {', '.join(result.recordings)}", soft_wrap=True)
-    write_json(json_file, result.as_dict())
-    if html_file is not None or folder.is_dir():
-        write_page(html_file or folder / "report.html", result)
+    if page is not None:
+        print_page(page)
     print_next(result.offer, files)
 
 
@@ -165,7 +168,6 @@ def write_page(path: Path, result: Improvement) -> None:
         stepping=result.trial.stepping if result.trial else None,
     )
     write_atomically(path, render(page))
-    console.print(f"report: {path}", soft_wrap=True)
 
 
 def _active(files: Profile) -> TransmissionModel:

@@ -42,5 +42,5 @@ def latency(
 
     with prepare_realtime() if realtime else nullcontext("ordinary priority") as conditions:
         report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=tell)
-    console.print(report.table())
     write_json(json_file, report.as_dict())
+    console.print(report.table())

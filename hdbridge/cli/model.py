@@ -36,6 +36,7 @@ def register(app: typer.Typer) -> None:
 def log(profile: ProfileArgument, json_file: JsonOption = None) -> None:
     """List every model of the profile, newest first, with dates and reasons."""
     versions = modelstore.log(_folder(profile))
+    write_json(json_file, {"schema": "hdbridge.model-log/1", "models": [_version(each) for each in versions]})
     if not versions:
         console.print("no model yet: calibrate first")
     for each in versions:
@@ -46,7 +47,6 @@ def log(profile: ProfileArgument, json_file: JsonOption = None) -> None:
             console.print(
                 f"                {step.date}  {step.action}  {escape(step.reason)}", soft_wrap=True
             )
-    write_json(json_file, {"schema": "hdbridge.model-log/1", "models": [_version(each) for each in versions]})
 
 
 def compare(
@@ -74,7 +74,6 @@ def compare(
         earlier_name, model = earlier.name, earlier.model
         later = modelstore.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
     rows = diff(model, later.model)
-    _print_diff(f"{earlier_name} → {later.name}", rows)
     write_json(
         json_file,
         {
@@ -84,6 +83,7 @@ def compare(
             "parameters": [{**row._asdict(), "changed": row.changed} for row in rows],
         },
     )
+    _print_diff(f"{earlier_name} → {later.name}", rows)
 
 
 def commit(profile: ProfileArgument) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hdbridge.calibration import concluded
-from hdbridge.cli.findings import print_calibration, write_calibration_page
+from hdbridge.cli.findings import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
@@ -26,6 +26,8 @@ def command(
 ) -> None:
     """Fit a recording again and tell its result; no axis is needed, nothing moves."""
     result = concluded(recording)
-    print_calibration(result)
+    page = html_file or recording / "report.html"
     write_json(json_file, result.as_dict())
-    write_calibration_page(html_file or recording / "report.html", result)
+    write_calibration_page(page, result)
+    print_calibration(result)
+    print_page(page)

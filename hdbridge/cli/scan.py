@@ -88,13 +88,13 @@ def scan(
             progress=lambda share: bar.update(task, completed=share),
         )
     matches, lines = (False, []) if axis is None else compare(axis, found)
-    _print(link.name, found)
-    if axis is not None:
-        _print_match(axis, matches, lines)
     result = _as_dict(link.name, found)
     if axis is not None:
         result["axis"] = {"name": axis.name, "matches": matches, "differences": lines}
     write_json(json_file, result)
+    _print(link.name, found)
+    if axis is not None:
+        _print_match(axis, matches, lines)
     _judge(link.name, found, axis, matches)
 
 

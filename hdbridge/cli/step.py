@@ -90,10 +90,10 @@ def step(
         seed=seed,
         record=record,
     )
-    print_result(axis, comparison)
     write_json(json_file, comparison.as_dict())
     if html_file is not None:
         write_page(html_file, axis, chosen, comparison, stepping, simulated_seed=seed if simulate else None)
+    print_result(axis, comparison)
 
 
 def run_comparison(

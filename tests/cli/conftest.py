@@ -1,6 +1,7 @@
 """The command line as a person uses it: a process, its output and its exit status."""
 
 import io
+import os
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,27 @@ def hdbridge(tmp_path):
             timeout=timeout,
             check=False,
         )
+
+    return run
+
+
+@pytest.fixture
+def unread(tmp_path):
+    """Run `hdbridge ARGS... | true`, where nobody reads what it prints: its standard error."""
+
+    def run(*arguments: object) -> str:
+        reader, writer = os.pipe()
+        os.close(reader)
+        with os.fdopen(writer, "w") as broken:
+            return subprocess.run(
+                [sys.executable, "-m", "hdbridge", *map(str, arguments)],
+                cwd=tmp_path,
+                stdout=broken,
+                stderr=subprocess.PIPE,
+                text=True,
+                timeout=120,
+                check=False,
+            ).stderr
 
     return run
 

@@ -1,5 +1,6 @@
 """What every command has in common: results that can be written, tables that are whole, a way out."""
 
+import json
 import os
 import signal
 import subprocess
@@ -75,20 +76,21 @@ def test_the_version_and_the_short_help(hdbridge):
     assert hdbridge("step", "-h").stdout == hdbridge("step", "--help").stdout
 
 
-def test_a_reader_that_goes_away_is_no_error(tmp_path):
-    reader, writer = os.pipe()
-    os.close(reader)
-    with os.fdopen(writer, "w") as broken:
-        done = subprocess.run(
-            [sys.executable, "-m", "hdbridge", "check", "article"],
-            stdout=broken,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=tmp_path,
-            check=False,
-        )
-    assert "Traceback" not in done.stderr
-    assert "Exception" not in done.stderr
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("check", "article"),
+        ("model", "log", "article"),
+        ("step", "article", "--simulate", "--count", 2, "--scheme", "none"),
+        ("scan", "article", "--simulate", "--listen", 0),
+    ],
+    ids=lambda each: each[0],
+)
+def test_a_reader_that_goes_away_is_no_error_and_the_result_is_whole(unread, tmp_path, arguments):
+    errors = unread(*arguments, "--json", "out.json")
+    assert "Traceback" not in errors
+    assert "Exception" not in errors
+    assert json.loads((tmp_path / "out.json").read_text())["schema"].startswith("hdbridge.")
 
 
 @pytest.mark.parametrize(("slow", "arguments"), [("typer", ("--help",)), ("scipy", ("fit", "--help"))])

@@ -15,7 +15,6 @@ from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 RUN = CliRunner()
 
 
@@ -71,21 +70,3 @@ def test_a_plan_is_judged_before_anything_moves(files: tuple[Path, Path], tmp_pa
     assert found["motor_order"]["detectable"]
     # Six motor turns are an eighth of a load turn: nothing tells these apart.
     assert set(found["load_order"]["aliases"]) & {"ratio_error", "compliance"}
-
-
-@pytest.mark.skipif(not (DATA / "cobot").is_dir(), reason="no ../shared/data/cobot beside the repository")
-@pytest.mark.parametrize(("joint", "expected"), [(4, {"motor_order"}), (5, {"compliance"})])
-def test_a_real_robot_joint(joint: int, expected: set[str], tmp_path: Path) -> None:
-    """Four short one-way moves, no command: useful, but nothing is certain."""
-    model = tmp_path / "model.yaml"
-    model.write_text("schema: hdbridge.model/1\nratio: 100\neffects: []\n")
-    records = sorted(str(each) for each in (DATA / "cobot").glob(f"joint{joint}-*.csv"))
-    out = tmp_path / "out.json"
-    command = ["diagnose", *records, "--model", str(model), "--independent-zeros", "--json", str(out)]
-    assert RUN.invoke(app, command, catch_exceptions=False).exit_code == 0
-    data = json.loads(out.read_text())
-    found = {each["cause"]: each for each in data["findings"]}
-    assert expected <= set(found)
-    assert not set(found) & {"local_defect", "count_loss", "vibration", "backlash", "load_order"}
-    assert all(each["probability"] <= 0.6 for name, each in found.items() if name != "unexplained")
-    assert data["extended"]["rms_arcsec"] < 0.4 * data["baseline"]["rms_arcsec"]
