@@ -30,7 +30,7 @@ IntArray = NDArray[np.intp]
 
 MOST_POINTS = 100_000
 CHATTER_SIGMAS = 8.0
-"""Turns of the driving angle smaller than so many standard deviations of the measured angle's noise are noise."""
+"""Turns smaller than so many standard deviations of the noise of the measured angle are no turns."""
 LEAST_SAMPLES = 60
 SPEED_WINDOW_S = 0.03
 SETTLE_S = 0.15
