@@ -22,18 +22,24 @@ from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.twins import inertial, wound_up
-from hdbridge.diagnose.unexplained import LEFT_ARCSEC, Rest, is_unexplained, many_of_one, rest
+from hdbridge.diagnose.unexplained import (
+    LEFT_ARCSEC,
+    LOOPS,
+    SHADOW,
+    Rest,
+    is_unexplained,
+    many_of_one,
+    rest,
+    without_doubtful_loops,
+)
 from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
-LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
-SHADOW = 2.0
-"""A name stands beside something unexplained when it takes away so many times its variance."""
 LEADS = 3.5
 """A name comes before what is unexplained when its peak is so many times its root mean square."""
 LINES = frozenset({"subdivisional_error", "vibration"})
@@ -105,6 +111,9 @@ class _Judge:
         spread = covariance(workshop, fitted)
         left = rest(workshop, fitted)
         unknown = is_unexplained(self.workshop, left) or many_of_one(findings) is not None
+        if unknown:
+            findings, more = without_doubtful_loops(findings, left)
+            considered += more
         findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
         if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
