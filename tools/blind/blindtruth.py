@@ -13,9 +13,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 Data = Mapping[str, Any]
 Values = dict[str, float]
 ARCSEC_PER_RAD = 180.0 * 3600.0 / math.pi
+FINE = 1024
+"""Motor angles of a turn at which orders are taken apart."""
 TWINS = {"motor_order": "motor_encoder_eccentricity", "motor_encoder_eccentricity": "motor_order"}
 """Orders of the motor have the same amplitudes and phases under either name."""
 ALWAYS_THERE = ("inertial_windup", "compliance")
@@ -80,21 +84,36 @@ def _disc(disc: Data, arcsec_per_rad: float) -> dict[float, complex]:
     return {1.0: first, 2.0: second}
 
 
-def _motor_orders(secret: Secret) -> Values:
-    """The change against model.yaml: what was hidden, and what its calibration had wrong of the same order.
+def _read_by(disc: Data, teeth: dict[float, complex], ratio: float) -> dict[float, complex]:
+    """Orders of the whole error by the *reading* of a motor disc, arcsec at the load.
 
-    The drive keeps the *reading* of a motor disc where it is commanded, so the load moves the other way:
-    minus the disc's error, divided by the ratio.
+    The drive keeps the reading where it is commanded, so the motor stands off by the disc's error: the load
+    by that over the ratio, and the tooth error is that of another motor angle, which gives orders 2 and 4 a
+    share in order 1.
     """
+    reading = math.tau * np.arange(FINE) / FINE
+    off = np.zeros(FINE)
+    for _ in range(20):
+        at = reading - off
+        off = sum(
+            (value * np.exp(1j * order * at)).real for order, value in _disc(disc, 1.0).items()
+        ) + np.zeros(FINE)
+    error = -off * ARCSEC_PER_RAD / ratio
+    for order, value in teeth.items():
+        error = error + (value * np.exp(1j * order * (reading - off))).real
+    waves = 2.0 * np.fft.fft(error) / FINE
+    return {float(order): complex(waves[order]) for order in range(1, FINE // 4)}
+
+
+def _motor_orders(secret: Secret) -> Values:
+    """The change against model.yaml: what was hidden, and what its calibration had wrong of that order."""
     if not secret.truth:
         order = secret.parameters.get("order", 1.0)
         return {f"order_{order:.0f}_amplitude_arcsec": float(secret.parameters["amplitude_arcsec"])}
     total = _sum_of(secret.gear.get("motor_orders"))
     disc = secret.truth["motor"]["encoder"].get("disc")
-    ratio = float(secret.gear["ratio"])
     if disc:
-        for order, value in _disc(disc, ARCSEC_PER_RAD / ratio).items():
-            total[order] = total.get(order, 0j) - value
+        total = _read_by(disc, total, float(secret.gear["ratio"]))
     given = _sum_of(
         row
         for each in secret.model.get("effects", ())
