@@ -60,6 +60,13 @@ def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
     return frozenset(each for each in Channel if KEYS.get(each, "") in {"", *axis.channels})
 
 
+def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
+    """The axis file's keys of the channels that a record of `Bench` does without."""
+    return tuple(
+        key for channel, key in KEYS.items() if key in axis.channels and channel.value not in record.columns
+    )
+
+
 def axis_view(axis: AxisConfig) -> AxisView:
     """What a procedure may know of its axis."""
     limits = axis.limits

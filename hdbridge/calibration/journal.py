@@ -39,6 +39,9 @@ class TaskEntry(BaseModel):
     complete: bool = Field(description="false: it was interrupted")
     start_s: float = Field(description="time of its first sample")
     end_s: float = Field(description="time of its last sample")
+    lost: tuple[str, ...] = Field(
+        (), description="channels of the axis file that were lost on the way: the samples do without them"
+    )
 
 
 class _Notes(BaseModel):
@@ -141,7 +144,15 @@ class Journal:
         """Nothing is known of what happened since the last task: the encoders may have lost their zeros."""
         self._session += 1
 
-    def add(self, task: str, record: Record, legs: Sequence[Leg], *, complete: bool) -> None:
+    def add(
+        self,
+        task: str,
+        record: Record,
+        legs: Sequence[Leg],
+        *,
+        complete: bool,
+        lost: tuple[str, ...] = (),
+    ) -> None:
         """Keep what a task has measured; nothing where it has measured nothing."""
         if not len(record):
             return
@@ -161,6 +172,7 @@ class Journal:
             complete=complete,
             start_s=float(record.time_s[0]),
             end_s=float(record.time_s[-1]),
+            lost=lost,
         )
         self._tasks.append(entry)
         segments = [
@@ -177,6 +189,7 @@ class Journal:
     def _write(self, file: dict[str, Any], segments: list[dict[str, Any]]) -> None:
         before = self._about
         drive = before.drive.model_dump(exclude_none=True) if before.drive else {}
+        tasks = [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks]
         data = {
             "schema": "hdbridge.recording/1",
             "axis": before.axis,
@@ -184,7 +197,7 @@ class Journal:
             "drive": {name: Hex(value) for name, value in drive.items()},
             "date": before.date,
             "versions": before.versions,
-            "notes": {**before.notes, "tasks": [each.model_dump() for each in self._tasks]},
+            "notes": {**before.notes, "tasks": tasks},
             "files": [*(each.model_dump() for each in before.files), file],
             "segments": [*(each.model_dump(exclude={"notes"}) for each in before.segments), *segments],
         }

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.bench import Bench, axis_view
+from hdbridge.bench import Bench, axis_view, lost_channels
 from hdbridge.calibration.journal import Journal
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError
@@ -128,9 +128,14 @@ def measure(
             raise  # refused before anything moved
         except (HdbridgeError, KeyboardInterrupt):
             with suppress(OSError):
-                journal.add(task.name, bench.record(), bench.legs, complete=False)
+                record = bench.record()
+                journal.add(
+                    task.name, record, bench.legs, complete=False, lost=lost_channels(drive.axis, record)
+                )
             raise
-        journal.add(task.name, run.record, run.legs, complete=True)
+        journal.add(
+            task.name, run.record, run.legs, complete=True, lost=lost_channels(drive.axis, run.record)
+        )
 
 
 def identity_of(drive: Drive) -> Identity:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
-from hdbridge.calibration.journal import Journal
+from hdbridge.calibration.journal import Journal, tasks_of
 from hdbridge.calibration.measure import identity_of, measure
 from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
@@ -91,6 +91,7 @@ def conclude(
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
+    fit = replace(fit, warnings=(*_lost(recordings), *fit.warnings))
     held_out = {
         "over": fit.held_out.over,
         "before_arcsec": fit.held_out.before_arcsec,
@@ -109,6 +110,14 @@ def conclude(
         shortened=tuple(first.notes.get("shortened", ())),
         drift=tuple(standings(first, ratio)) if len(measured) == 1 else (),
     )
+
+
+def _lost(recordings: Mapping[Path, Recording]) -> Iterator[str]:
+    """A line for each channel that was lost while it was measured."""
+    tasks = [(task, path) for path, each in recordings.items() for task in tasks_of(each)]
+    for key in dict.fromkeys(key for task, _ in tasks for key in task.lost):
+        places = ", ".join(f"{path.name}/{task.file}" for task, path in tasks if key in task.lost)
+        yield f"the {key.replace('_', ' ')} was lost on the way ({places}); the fit does without it"
 
 
 def concluded(folder: Path) -> Calibration:

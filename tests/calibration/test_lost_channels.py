@@ -1,0 +1,63 @@
+"""A channel of the axis file that is lost while the axis is calibrated."""
+
+from datetime import UTC, datetime
+
+import yaml
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import measure, start_journal
+from hdbridge.calibration.measure import identity_of
+from hdbridge.drive.drive import Drive
+from hdbridge.procedures.plan import Plan
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+
+CHANNELS = """
+load_torque:
+  source: {index: 0x2101, type: int32}
+  newton_metres_per_count: 0.001
+  maximum_nm: 100
+temperature:
+  source: {index: 0x2100, type: int16}
+  celsius_per_count: 0.1
+"""
+TPDO3, OFF = 0x381, 0x8000_0000
+
+
+def measured(cell, silent_cycles):
+    """`rec/`, measured by the short plan; the load torque stays away in some cycles."""
+    path = cell.axis / "axis.yaml"
+    path.write_text(path.read_text() + CHANNELS)
+    axis, truth = AxisConfig.load(path), Truth.load(cell.axis / "truth.yaml")
+    cycles = 0
+    with (
+        simulated_bench(truth, axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        date = datetime(2026, 1, 2, tzinfo=UTC)
+        plan = Plan.load(str(cell.folder / "short.yaml"))
+        journal = start_journal(cell.folder / "rec", axis, plan, date, identity_of(drive))
+
+        def each_cycle():
+            nonlocal cycles
+            cycles += 1
+            if cycles in silent_cycles:
+                node.dictionary[0x1802, 1].put(TPDO3 | OFF)
+            elif cycles - 1 in silent_cycles:
+                node.dictionary[0x1802, 1].put(TPDO3)
+            return False
+
+        measure(drive, journal, interrupted=each_cycle)
+    about = yaml.safe_load((cell.folder / "rec" / "recording.yaml").read_text())
+    return {each["file"]: each["lost"] for each in about["notes"]["tasks"] if "lost" in each}
+
+
+def test_a_channel_lost_on_the_way_is_told_and_kept_in_mind(cell):
+    lost, channels = measured(cell, silent_cycles=range(1700, 1760)).popitem()
+    assert channels == ["load_torque"]
+    done = cell.run("report", "rec", "--json", "result.json")
+    line = f"the load torque was lost on the way (rec/{lost}); the fit does without it"
+    assert f"note: {line}" in done.stdout.splitlines()
+    assert line in cell.json("result.json")["warnings"]
+    assert line in (cell.folder / "rec" / "report.html").read_text()
