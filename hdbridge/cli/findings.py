@@ -11,6 +11,7 @@ from rich.table import Table
 from hdbridge.calibration import Calibration, Stepped, Validation
 from hdbridge.calibration.result import Offer, unit_of
 from hdbridge.cli.options import Profile, console, print_table
+from hdbridge.cli.scattertable import print_scatter
 from hdbridge.files.atomic import write_atomically
 from hdbridge.modeldiff import diff
 from hdbridge.report.calibration import calibration_page
@@ -104,19 +105,7 @@ def print_stepping(checked: Validation) -> None:
 
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
     """Scatter and mean of stepping tests, a line each."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("with")
-    for direction in ("CW", "CCW", "pooled"):
-        table.add_column(f"{direction} 3σ", justify="right")
-        table.add_column("mean", justify="right")
-    for each in tests:
-        cells = [
-            f"{value:z.2f}"
-            for part in (each.cw, each.ccw, each.pooled)
-            for value in (part.three_sigma_arcsec, part.mean_arcsec)
-        ]
-        table.add_row(each.model, *cells)
-    print_table(table)
+    print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
 
 
 def _print_accuracy(checked: Validation) -> None:

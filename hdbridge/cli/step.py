@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Run
@@ -26,10 +25,10 @@ from hdbridge.cli.options import (
     console,
     load_axis,
     notes,
-    print_table,
     progress_bar,
     write_json,
 )
+from hdbridge.cli.scattertable import print_scatter
 from hdbridge.comparison import Comparison, compare_schemes
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, write_atomically
@@ -149,19 +148,11 @@ def run_comparison(
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
     """The result for a person."""
-    table = Table(title=f"Load error at rest, arcsec: axis '{axis.name}'", title_justify="left")
-    table.add_column("compensation")
-    for direction in ("CW", "CCW", "pooled"):
-        table.add_column(f"{direction} 3σ", justify="right")
-        table.add_column("mean", justify="right")
-    for scheme, result in comparison.results.items():
-        cells = [
-            f"{value:z.2f}"
-            for part in (result.cw, result.ccw, result.pooled)
-            for value in (part.three_sigma_arcsec, part.mean_arcsec)
-        ]
-        table.add_row(scheme.value, *cells)
-    print_table(table)
+    print_scatter(
+        f"Load error at rest, arcsec: axis '{axis.name}'",
+        "compensation",
+        ((scheme.value, (each.cw, each.ccw, each.pooled)) for scheme, each in comparison.results.items()),
+    )
     best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
     floor = comparison.quantisation_floor_arcsec
     console.print(
