@@ -21,7 +21,7 @@ from hdbridge.diagnose.probability import Beside, Signs, weighed
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
-from hdbridge.diagnose.twins import inertial, wound_up
+from hdbridge.diagnose.twins import inertial, late, wound_up
 from hdbridge.diagnose.unexplained import (
     LEFT_ARCSEC,
     LOOPS,
@@ -93,7 +93,8 @@ class _Judge:
         fitted, considered = self._named_only(trail.fitted)
         fitted, more = self._without_doubtful(fitted)
         considered += more
-        fitted = wound_up(workshop, inertial(workshop, self.search, fitted), trail.base)
+        fitted = inertial(workshop, self.search, late(workshop, self.search, fitted))
+        fitted = wound_up(workshop, fitted, trail.base)
         trail = replace(trail, fitted=fitted)
         precise = precisely(workshop, fitted)
         spread = covariance(workshop, precise)

@@ -1,15 +1,19 @@
 """The angle that drives the effects, its speed and its acceleration, of one record.
 
-The command's angle where the record has one, plus what the motor encoder shows against it as a smooth line in
-speed and acceleration: neither encoder counts nor a following error are findings.
+The command's angle where the record has one, plus what the motor encoder shows against it: as a smooth line
+in speed and acceleration, and as it was read where that differs by more than its counts. Neither encoder
+counts nor a following error are findings.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from hdbridge.diagnose.noise import third_deviation
 from hdbridge.effects import FloatArray
 from hdbridge.identify.driving import steadied
 
@@ -41,7 +45,9 @@ def kinematics(
 def _driving(
     position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
 ) -> FloatArray:
-    """The command and a smooth line for the lag behind it; without a command the angle freed of chatter."""
+    """The command and a smooth line for the lag behind it, within the cell that the encoder was read in;
+    without a command the angle freed of chatter.
+    """
     if target is None:
         return steadied(position, position, 1.6 * count)
     lag = position - target
@@ -53,9 +59,21 @@ def _driving(
     solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
     line = columns @ solution
     rest = lag - line
-    if float(np.std(rest)) > 0.45 * count + 1e-6:
+    noise = _noise(lag, count)
+    if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
+    if count:
+        # A motor that sticks where it turns round, or overshoots where it stops, is where its encoder says.
+        cell = max(0.5 * count, 3.0 * noise)
+        line = np.clip(line, lag - cell, lag + cell)
     return steadied(target + line, target + line, CHATTER_COUNTS * count)
+
+
+def _noise(lag: FloatArray, count: float) -> float:
+    """Noise of the motor's reading beside that of its counts, degrees."""
+    if len(lag) < 4:
+        return 0.0
+    return math.sqrt(max(third_deviation(np.diff(lag, 3)) ** 2 - count**2 / 12.0, 0.0))
 
 
 def _smooth(values: FloatArray, window: int) -> FloatArray:

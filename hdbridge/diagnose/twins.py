@@ -1,5 +1,5 @@
-"""Second looks at names whose twin is commoner: a late sample that is the load's own wind-up, a load
-order that is the wind-up under the load's torque.
+"""Second looks at names whose twin is commoner: a late sample that is the load's own wind-up, a drag that
+is a late sample, a load order that is the wind-up under the load's torque.
 """
 
 from __future__ import annotations
@@ -8,10 +8,19 @@ import numpy as np
 
 from hdbridge.diagnose.search import FLOORS_ARCSEC, Search
 from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import Channel, ChannelSkew, Compliance, InertialWindup, LoadOrders
+from hdbridge.effects import (
+    Channel,
+    ChannelSkew,
+    Compliance,
+    InertialWindup,
+    LoadOrders,
+    VelocityWindup,
+)
 
 INERTIA_SHARE = 0.15
 """A skew whose part in speed is less than this of its part in acceleration is none."""
+STRAIGHT = 20.0
+"""A drag whose shear speed is so many times the fastest there was has been seen as a straight line."""
 TWIN = 1e-3
 """A spring is a first load order's better where it misses less than this share of its evidence."""
 
@@ -29,6 +38,30 @@ def inertial(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
             small = search.peak(trial, place) < FLOORS_ARCSEC["inertial_windup"]
             if small or trial.theory.effects[place].violations():
                 return workshop.fit(fitted.theory.without(place))
+            return trial
+    return fitted
+
+
+def late(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
+    """A drag that does not bend is a late sample.
+
+    The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed part of
+    one, with the sign of the direction.
+    """
+    speed = workshop.motion.motor_speed_deg_s
+    for place, effect in enumerate(fitted.theory.effects[search.base :], search.base):
+        if not isinstance(effect, VelocityWindup) or speed is None:
+            continue
+        if effect.coulomb_arcsec > 0.5 * workshop.evidence.motor_count_arcsec:
+            continue
+        if effect.shear_deg_s < STRAIGHT * float(np.max(np.abs(speed))):
+            continue
+        skew = ChannelSkew(ratio=workshop.evidence.ratio, delay_ms=1.0, second_order_ms2=1.0)
+        present = {each.name for each in fitted.theory.effects}
+        theory = fitted.theory.without(place)
+        trial = workshop.fit(theory if "channel_skew" in present else fitted.theory.instead(place, skew))
+        own = workshop.fit(theory).chi_square - fitted.chi_square
+        if "channel_skew" in present or trial.chi_square - fitted.chi_square < TWIN * own:
             return trial
     return fitted
 
