@@ -110,7 +110,7 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
     if isinstance(effect, Creep):
-        late = _standing_s(workshop)[workshop.index] > SETTLED_S
+        late = standing_s(workshop)[workshop.index] > SETTLED_S
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=late))
         if robust < needed or _span(workshop, fitted, place, late) < LEAST_CREEP_ARCSEC:
             return Gate(robust, needed, passed=False, reason="over as soon as the axis has come to rest")
@@ -154,7 +154,7 @@ def _span(workshop: Workshop, fitted: Fitted, place: int, rows: NDArray[np.bool_
     return 0.5 * float(high - low)
 
 
-def _standing_s(workshop: Workshop) -> FloatArray:
+def standing_s(workshop: Workshop) -> FloatArray:
     """Time since the axis came to rest, seconds, shape (n,); 0 in motion."""
     motion = workshop.motion
     if motion.motor_speed_deg_s is None or motion.time_s is None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
+from hdbridge.diagnose.gates import standing_s
 from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.effects import (
@@ -44,7 +45,10 @@ FREE_LOOP_ARCSEC = 0.2
 SLOW = 0.8
 """A third pick that leaves more than this of a large rest is the last."""
 EXTRAPOLATED = 2.0
-"""An order is not named on an arc of it whose span is so much smaller than the order itself."""
+"""An order is not named on an arc of it whose span is so much smaller than the order itself, nor creep of
+exponentials that cancel."""
+RESTS = 3.0
+"""A relaxation is known by its bend: its time constant is at most so many times the longest rest."""
 ORDER_SHARE_LEFT = 0.03
 """An order of which the others leave less is a twin of one of them: together they would only cancel."""
 SHORT_TRAVEL = 0.9
@@ -209,6 +213,12 @@ class Search:
         if isinstance(effect, OrderSeries):
             largest = max(each.amplitude_arcsec for each in effect.orders)
             if largest > EXTRAPOLATED * peak:
+                return False
+        if isinstance(effect, Creep):
+            if max(abs(each.amplitude_arcsec) for each in effect.parts) > EXTRAPOLATED * peak:
+                return False
+            rest_s = float(np.max(standing_s(self.workshop)))
+            if max(each.tau_s for each in effect.parts) > RESTS * rest_s:
                 return False
         return peak >= FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC)
 
