@@ -27,6 +27,10 @@ def test_what_is_over_half_a_second_after_a_stop_is_no_creep(diagnosed: Diagnose
     assert "creep" not in names(diagnosed({"creep": {"size": 4.0, "tau": 0.1}}))
 
 
+def test_what_takes_far_longer_than_any_rest_is_no_creep(diagnosed: Diagnosed) -> None:
+    assert "creep" not in names(diagnosed({"creep": {"size": 4.0, "tau": 400.0, "build": 0.02}}))
+
+
 def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> None:
     assert names(diagnosed(width=26.0)) == ["hysteresis_parameters"]
 
