@@ -21,8 +21,9 @@ from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
+from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.effects import Channel, Moment, Observer, compensable, unmet
-from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop, TransitionError
+from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
@@ -32,9 +33,6 @@ Outcome = TypeVar("Outcome")
 KEYS = {Channel.LOAD_TORQUE: "load_torque", Channel.TEMPERATURE: "temperature"}
 """The channels that an axis need not have, and their keys in the axis file."""
 _AT_REST = Moment()
-ENABLE_TIMEOUT_S = 2.0
-STOP_TIMEOUT_S = 2.0
-_STANDING = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,17 +225,8 @@ class Bench:
     def _enable(self) -> None:
         """Enable the drive by PDO, standing still, and begin from where it stands."""
         self._drive.enable(Mode.CSP)
-        power = self._image.power
         self.cycle.restart()
-        for _ in range(math.ceil(ENABLE_TIMEOUT_S / self.cycle.period_s)):
-            feedback = self.cycle.tick()
-            if power.state is State.OPERATION_ENABLED:
-                break
-        else:
-            raise TransitionError(
-                f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
-                f"'{power.state.value}'; look at its enable input, its supply and its fault history"
-            )
+        feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
         feedback = self._await_channels(feedback)
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
@@ -358,6 +347,6 @@ class Bench:
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
             before = self._image.motor_counts
             self.cycle.tick()
-            if power.state in _STANDING and abs(self._image.motor_counts - before) <= 1:
+            if power.state in STANDING and abs(self._image.motor_counts - before) <= 1:
                 break
         self._drive.disable()

@@ -23,7 +23,8 @@ from hdbridge.record import Record, concatenate, time_shifts_s
 
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
-_HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
+HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
+"""How ``recording.yaml`` begins."""
 
 
 class _Part(BaseModel):
@@ -109,7 +110,7 @@ class Recording:
         records = []
         for number, each in enumerate(about.files):
             file = path / each.name
-            if file.is_file() and _sha256(file) != each.sha256:
+            if file.is_file() and sha256_of(file) != each.sha256:
                 raise document.error(
                     ("files", number, "sha256"),
                     f"{file} has changed since it was recorded; restore it, or read it alone as a CSV file",
@@ -153,7 +154,9 @@ class Recording:
         except OSError as problem:
             raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
         self.record.write_csv(folder / RECORD_NAME)
-        write_atomically(folder / ABOUT_NAME, _HEADER + dump_yaml(self._about(_sha256(folder / RECORD_NAME))))
+        write_atomically(
+            folder / ABOUT_NAME, HEADER + dump_yaml(self._about(sha256_of(folder / RECORD_NAME)))
+        )
 
     def _about(self, sha256: str) -> dict[str, Any]:
         drive = self.drive.model_dump(exclude_none=True) if self.drive else {}
@@ -188,6 +191,7 @@ def versions_here() -> dict[str, str]:
     }
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """Checksum of a file's bytes, as ``recording.yaml`` has it."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

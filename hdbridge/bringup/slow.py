@@ -22,8 +22,9 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event, Supervision
+from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.drive.unwrap import wrap_int32
-from hdbridge.errors import HdbridgeError, SafetyStop, TransitionError
+from hdbridge.errors import HdbridgeError, SafetyStop
 from hdbridge.procedures.moves import MotionLimits, MoveTo, Path
 
 if TYPE_CHECKING:
@@ -38,10 +39,7 @@ LEAD_DEG: Final = 45.0
 MARGIN_DEG: Final = 1.0
 """Motor travel that is left to the limits of the axis."""
 LEAST_TRAVEL_DEG: Final = 20.0
-ENABLE_TIMEOUT_S: Final = 2.0
-STOP_TIMEOUT_S: Final = 2.0
 STILL_CYCLES: Final = 3
-_STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.FAULT)
 
 
 class TravelPlan(NamedTuple):
@@ -136,15 +134,7 @@ class SlowAxis:
         drive.enable(Mode.CSP)
         self.cycle.restart()
         try:
-            for _ in range(math.ceil(ENABLE_TIMEOUT_S / self.cycle.period_s)):
-                feedback = self._tick(None)
-                if power.state is State.OPERATION_ENABLED:
-                    break
-            else:
-                raise TransitionError(
-                    f"the drive did not reach 'operation enabled' within {ENABLE_TIMEOUT_S:g} s, it is in "
-                    f"'{power.state.value}'; look at its enable input, its supply and its fault history"
-                )
+            feedback = until_enabled(lambda: self._tick(None), power, self.cycle.period_s)
             self._place_deg = self.image.motor_deg(feedback.motor_counts)
             yield feedback
             self._rest()
@@ -170,7 +160,7 @@ class SlowAxis:
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
             before = self.image.motor_counts
             seen.append(self.cycle.tick())
-            rests = power.state in _STANDING and abs(self.image.motor_counts - before) <= 1
+            rests = power.state in STANDING and abs(self.image.motor_counts - before) <= 1
             still = still + 1 if rests else 0
             if still >= STILL_CYCLES:
                 break

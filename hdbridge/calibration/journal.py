@@ -7,7 +7,6 @@ task also what had been measured, where there was time to write it. `Journal.ope
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -21,9 +20,8 @@ from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 from hdbridge.procedures.plan import Plan
 from hdbridge.record import Record
-from hdbridge.recording import ABOUT_NAME, Recording, RecordingFile, versions_here
+from hdbridge.recording import ABOUT_NAME, HEADER, Recording, RecordingFile, sha256_of, versions_here
 
-_HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
 PAUSE_S = 1.0
 """Between two tasks in the recording's time; the drive is disabled there."""
 
@@ -179,7 +177,7 @@ class Journal:
             {"kind": each.kind, "start_s": each.start_s + shift_s, "end_s": each.end_s + shift_s}
             for each in legs
         ]
-        file = {"name": name, "sha256": _sha256(self.folder / name), "samples": len(record)}
+        file = {"name": name, "sha256": sha256_of(self.folder / name), "samples": len(record)}
         self._write(file, segments)
 
     def recording(self) -> Recording:
@@ -201,15 +199,10 @@ class Journal:
             "files": [*(each.model_dump() for each in before.files), file],
             "segments": [*(each.model_dump(exclude={"notes"}) for each in before.segments), *segments],
         }
-        write_atomically(self.folder / ABOUT_NAME, _HEADER + dump_yaml(data))
+        write_atomically(self.folder / ABOUT_NAME, HEADER + dump_yaml(data))
         self._about = RecordingFile.model_validate({**data, "drive": before.drive})
 
 
 def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
     """The tasks of a calibration's recording; none for any other."""
     return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
