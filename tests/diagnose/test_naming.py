@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from hdbridge.diagnose import Diagnosis, Finding
+from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.probability import Beside, Signs, weighed
+from hdbridge.model import TransmissionModel
+from hdbridge.record import Record
 
 Diagnosed = Callable[..., Diagnosis]
 
@@ -17,9 +20,13 @@ def names(diagnosis: Diagnosis) -> list[str]:
     return [each.cause for each in diagnosis.findings]
 
 
-def test_a_ripple_that_trebles_with_warmth_is_a_drift_of_amplitudes(diagnosed: Diagnosed) -> None:
-    """So far from what it is at 20 degrees that a share of that means nothing."""
-    result = diagnosed({"amplitude_drift": {"ripple": 0.15}}, temperature_rise_k=14.0)
+def test_a_ripple_is_told_at_a_temperature_of_the_record(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """At 20 degrees, far below the coldest that was measured, this one would be next to nothing."""
+    record = columns({"amplitude_drift": {"ripple": 0.08}}, temperature_rise_k=14.0)
+    record["temperature_c"] = record["temperature_c"] + 12.0
+    result = diagnose(Record(record), model)
     assert names(result) == ["amplitude_drift"]
 
 
