@@ -32,7 +32,9 @@ from hdbridge.recording import Recording
 RIDGE = 1.0
 FOLDS = 10
 FREE = frozenset({"constant", "within"})
-AGAINST = frozenset({"excess", "others", "free_loop", "unexplained", "not_recovered"})
+AGAINST = frozenset({"excess", "free_loop", "unexplained", "not_recovered"})
+PRIOR = {"not_recovered": -2.5, "unexplained": -1.0}
+"""What the ridge draws to where these records say little; else to nought."""
 LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
@@ -92,10 +94,11 @@ def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray
         score = terms @ values
         loss = float(np.sum(np.logaddexp(0.0, -np.where(right, score, -score))))
         slope = terms.T @ (1.0 / (1.0 + np.exp(-score)) - right)
-        return loss + 0.5 * float(ridge @ values**2), slope + ridge * values
+        away = values - prior
+        return loss + 0.5 * float(ridge @ away**2), slope + ridge * away
 
-    begin = np.zeros(len(names))
-    return np.asarray(minimize(cost, begin, jac=True, method="L-BFGS-B", bounds=bounds).x)
+    prior = np.array([PRIOR.get(each, 0.0) for each in names])
+    return np.asarray(minimize(cost, prior, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
 
 def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
