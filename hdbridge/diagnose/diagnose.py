@@ -24,7 +24,6 @@ from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.twins import inertial, late, wound_up
 from hdbridge.diagnose.unexplained import (
     LEFT_ARCSEC,
-    LOOPS,
     SHADOW,
     Rest,
     is_unexplained,
@@ -38,6 +37,7 @@ from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
+LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 LEADS = 3.5

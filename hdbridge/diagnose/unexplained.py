@@ -33,7 +33,6 @@ PLAIN_ARCSEC = 1.0
 """More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
 particular."""
 BLOCK_S = 0.2
-LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 SHADOW = 2.0
 """A name stands beside something unexplained when it takes away so many times its variance."""
 SERIAL = REPEATED - {"creep"}
@@ -126,11 +125,13 @@ def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
 
 
 def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Finding], list[str]]:
-    """Without a change of the loop that does less than what is left, unless that is the loop's too."""
+    """Without a change of the loop's parameters that does less than what is left, unless that is the loop's
+    too.
+    """
     doubtful = [
         each
         for each in findings
-        if each.cause in LOOPS
+        if each.cause == "hysteresis_parameters"
         and "last reversal" not in left.lives_in
         and each.before_arcsec**2 - each.after_arcsec**2 < SHADOW * left.arcsec**2
     ]
