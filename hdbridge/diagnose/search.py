@@ -48,7 +48,7 @@ EXTRAPOLATED = 2.0
 """An order is not named on an arc of it whose span is so much smaller than the order itself, nor creep of
 exponentials that cancel."""
 RESTS = 3.0
-"""A relaxation is known by its bend: its time constant is at most so many times the longest rest."""
+"""Creep is known by its bend: its shortest time constant is at most so many times the longest rest."""
 ORDER_SHARE_LEFT = 0.03
 """An order of which the others leave less is a twin of one of them: together they would only cancel."""
 SHORT_TRAVEL = 0.9
@@ -218,7 +218,7 @@ class Search:
             if max(abs(each.amplitude_arcsec) for each in effect.parts) > EXTRAPOLATED * peak:
                 return False
             rest_s = float(np.max(standing_s(self.workshop)))
-            if max(each.tau_s for each in effect.parts) > RESTS * rest_s:
+            if min(each.tau_s for each in effect.parts) > RESTS * rest_s:
                 return False
         return peak >= FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC)
 
