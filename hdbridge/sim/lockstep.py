@@ -12,11 +12,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from queue import Queue
 from typing import Any, Final, Protocol
 from uuid import uuid4
 
 import can
-from can.interfaces.virtual import VirtualBus
+from can.interfaces.virtual import VirtualBus, channels_lock
 
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
@@ -61,7 +62,11 @@ class VirtualClock:
 
         False, and nothing happened but the clock's advance, when no event comes before the deadline.
         """
-        event_s = min([node.next_event_s() for node in self.nodes], default=float("inf"))
+        event_s = float("inf")
+        for node in self.nodes:
+            due_s = node.next_event_s()
+            if due_s < event_s:  # noqa: PLR1730 - min() costs three times as much, several times a cycle
+                event_s = due_s
         if event_s > deadline_s:
             self._now_s = max(self._now_s, deadline_s)
             return False
@@ -71,12 +76,26 @@ class VirtualClock:
         return True
 
 
+class _PolledQueue(Queue[can.Message]):
+    """A queue on which nobody waits: to put something in needs no lock, and wakes nobody."""
+
+    def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:
+        self.queue.append(item)
+
+
 class _PolledBus(VirtualBus):
     """python-can's virtual bus, polled by one thread, with less overhead for each frame.
 
     The general ``recv`` reads the wall clock and takes two locks, though in lockstep most polls find nothing;
-    the general ``send`` makes a deep copy. Ordinary virtual buses on the same channel work with it.
+    the general ``send`` makes a deep copy and takes another. Ordinary virtual buses on the same channel work
+    with it. It never waits, whatever time-out ``recv`` is given.
     """
+
+    def __init__(self, channel: str) -> None:
+        super().__init__(channel)
+        with channels_lock:
+            place = self.channel.index(self.queue)
+            self.channel[place] = self.queue = _PolledQueue()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if not _is_plain(msg):
@@ -91,8 +110,6 @@ class _PolledBus(VirtualBus):
                 waiting.put(copy)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        if timeout != 0:
-            return super().recv(timeout)
         waiting = self.queue.queue
         while waiting:
             message: can.Message = waiting.popleft()
