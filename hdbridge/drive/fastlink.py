@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import can
 from can.interfaces.socketcan import SocketcanBus
-from can.typechecking import Channel
 
+from hdbridge.dataframe import DataFrame
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull, new_tuple
 from hdbridge.errors import BusError
 
@@ -39,26 +39,6 @@ def fast_link(link: Link) -> Link:
     fast = _SocketLink(link) if type(link.bus) is SocketcanBus else _MessageLink(link.bus, link.clock)
     fast.dropped = link.dropped
     return fast
-
-
-class DataFrame(can.Message):
-    """A message that is cheap to make and to copy: a data frame with an 11-bit identifier, nothing else."""
-
-    __slots__ = ()
-
-    def __init__(self, can_id: int, data: bytes | bytearray, channel: Channel | None) -> None:
-        # What the base class makes of the same, without asking for what cannot be.
-        self.arbitration_id = can_id
-        self.data = bytearray(data)
-        self.dlc = len(data)
-        self.channel = channel
-        self.timestamp = 0.0
-        self.is_rx = True
-        self.is_extended_id = self.is_remote_frame = self.is_error_frame = False
-        self.is_fd = self.bitrate_switch = self.error_state_indicator = False
-
-    def __deepcopy__(self, memo: object) -> can.Message:
-        return DataFrame(self.arbitration_id, self.data, self.channel)
 
 
 class _MessageLink(Link):

@@ -19,6 +19,7 @@ from uuid import uuid4
 import can
 from can.interfaces.virtual import VirtualBus, channels_lock
 
+from hdbridge.dataframe import DataFrame
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
 from hdbridge.sim.nameplate import Nameplate
@@ -103,11 +104,7 @@ class _PolledBus(VirtualBus):
             return
         for waiting in self.channel:
             if waiting is not self.queue:
-                copy = can.Message(
-                    arbitration_id=msg.arbitration_id, is_extended_id=False, data=bytes(msg.data)
-                )
-                copy.channel = self.channel_id
-                waiting.put(copy)
+                waiting.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         waiting = self.queue.queue

@@ -15,12 +15,12 @@ from typing import Final
 import can
 
 from hdbridge.clock import Clock
+from hdbridge.dataframe import DataFrame
 from hdbridge.errors import InputError
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults, Outgoing
 from hdbridge.sim.firmware import Firmware
-from hdbridge.sim.frame import frame
 from hdbridge.sim.motion import Machine
 from hdbridge.sim.nameplate import Nameplate
 from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
@@ -212,7 +212,7 @@ class SimulatedDrive:
         if self.faults.silent:
             return
         try:
-            self.bus.send(frame(can_id, data))
+            self.bus.send(DataFrame(can_id, data))
         except can.CanOperationError:
             self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and carries on
 

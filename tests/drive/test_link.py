@@ -12,8 +12,8 @@ import pytest
 
 from hdbridge.axis import BusConfig
 from hdbridge.clock import MonotonicClock
+from hdbridge.dataframe import DataFrame
 from hdbridge.drive import Link, TransmitBufferFull, open_bus
-from hdbridge.drive.fastlink import DataFrame
 from hdbridge.errors import BusError
 
 
