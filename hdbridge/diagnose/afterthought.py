@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
+
 from hdbridge.diagnose.search import (
     ENTER,
     FEW,
@@ -20,6 +22,7 @@ from hdbridge.diagnose.search import (
     Trail,
 )
 from hdbridge.diagnose.theory import Fitted
+from hdbridge.effects import AmplitudeDrift
 
 TWO_WAYS = frozenset(
     {
@@ -99,8 +102,8 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
     """Two kin taken out together, and the best one cause put in the place of both."""
     places = range(search.base, len(fitted.theory.effects))
     for one, other in combinations(places, 2):
-        names = (fitted.theory.effects[one].name, fitted.theory.effects[other].name)
-        if names[0] == names[1] or not kinship(*names):
+        kinds = (_kind(search, fitted, one), _kind(search, fitted, other))
+        if kinds[0] == kinds[1] or not kinship(*kinds):
             continue
         search.forget()
         without = search.workshop.fit(fitted.theory.without(other).without(one))
@@ -130,19 +133,27 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
         gain, without = gains[place]
         name = fitted.theory.effects[place].name
+        kinds = {each: _kind(search, fitted, each) for each in gains}
         small = search.peak(fitted, place) < FLOORS_ARCSEC.get(name, FLOOR_ARCSEC)
         share = max(
-            (
-                kinship(name, fitted.theory.effects[other].name) * gains[other][0]
-                for other in gains
-                if other != place
-            ),
+            (kinship(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
             default=0.0,
         )
         if gain > max(_toll(fitted, place), LEFTOVER * largest, share) and not small:
             break
         fitted = without
     return fitted
+
+
+def _kind(search: Search, fitted: Fitted, place: int) -> str:
+    """The cause, for its kin; a drift of amplitudes that is one of ripple lies in both directions alike."""
+    effect = fitted.theory.effects[place]
+    if isinstance(effect, AmplitudeDrift):
+        parts = search.workshop.columns(effect, fitted.theory.start) * effect.coefficients()
+        ripple, friction = np.std(parts, axis=0)
+        if ripple > friction:
+            return "ripple"
+    return effect.name
 
 
 def _toll(fitted: Fitted, place: int) -> float:

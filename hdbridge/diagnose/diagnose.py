@@ -18,6 +18,7 @@ from hdbridge.diagnose.identifiability import ALWAYS, identifiability
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Beside, Signs, weighed
+from hdbridge.diagnose.reference import as_calibrated
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
@@ -95,6 +96,7 @@ class _Judge:
         considered += more
         fitted = inertial(workshop, self.search, late(workshop, self.search, fitted))
         fitted = wound_up(workshop, fitted, trail.base)
+        fitted = as_calibrated(workshop, fitted, self.model.effects)
         trail = replace(trail, fitted=fitted)
         precise = precisely(workshop, fitted)
         spread = covariance(workshop, precise)

@@ -70,26 +70,39 @@ def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
     """A first load order that follows the load's torque is the torque's wind-up.
 
     An order takes any phase, a spring only that of the torque: where it does as well but for what the noise
-    of the torque channel takes from it, the order would be a coincidence.
+    of the torque channel takes from it, the order would be a coincidence. Beside a spring it makes up for
+    that noise, and takes most of what is the spring's.
     """
-    present = {each.name for each in fitted.theory.effects}
-    if Channel.LOAD_TORQUE not in workshop.motion.available() or "compliance" in present:
+    if Channel.LOAD_TORQUE not in workshop.motion.available():
         return fitted
+    springs = [
+        place
+        for place, effect in enumerate(fitted.theory.effects[base:], base)
+        if isinstance(effect, Compliance)
+    ]
     for place, effect in enumerate(fitted.theory.effects[base:], base):
         if not isinstance(effect, LoadOrders) or all(each.order != 1 for each in effect.orders):
             continue
+        others = tuple(each for each in effect.orders if each.order != 1)
+        without = (
+            fitted.theory.instead(place, effect.model_copy(update={"orders": others}))
+            if others
+            else fitted.theory.without(place)
+        )
         spring = Compliance(
             c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
             torque1_nm=1e4, torque2_nm=2e4, torque=Channel.LOAD_TORQUE.value,
         )  # fmt: skip
-        theory, without = fitted.theory.instead(place, spring), fitted.theory.without(place)
-        others = tuple(each for each in effect.orders if each.order != 1)
-        if others:
-            more = effect.model_copy(update={"orders": others})
-            theory, without = theory.plus(more), without.plus(more)
-        trial = workshop.fit(theory)
-        own = workshop.fit(without).chi_square - fitted.chi_square
+        if springs:
+            trial = workshop.fit(without)
+            at = springs[0] if others or springs[0] < place else springs[0] - 1
+            neither = without.without(at)
+        else:
+            trial, neither = workshop.fit(without.plus(spring)), without
+        own = workshop.fit(neither).chi_square - fitted.chi_square
         worse = trial.chi_square - fitted.chi_square
-        if worse < TWIN * own and not trial.theory.effects[place].violations():
+        if worse < TWIN * own and not any(
+            each.violations() for each in trial.theory.effects if isinstance(each, Compliance)
+        ):
             return trial
     return fitted
