@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
@@ -28,6 +29,35 @@ def test_a_ripple_is_told_at_a_temperature_of_the_record(
     record["temperature_c"] = record["temperature_c"] + 12.0
     result = diagnose(Record(record), model)
     assert names(result) == ["amplitude_drift"]
+
+
+def test_a_drift_is_told_from_the_temperature_of_the_model(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """From any other the amplitudes of the model would have changed beside it."""
+    record = columns({"amplitude_drift": {"ripple": 0.025}}, temperature_rise_k=10.0)
+    record["temperature_c"] = record["temperature_c"] + 14.0
+    result = diagnose(Record(record), model)
+    assert names(result) == ["amplitude_drift"]
+    growth = result.findings[0].parameters["ripple_percent_per_k"]
+    assert growth.value == pytest.approx(2.5, rel=0.15)  # the gear follows the sensor with a lag
+
+
+def test_a_drift_of_ripple_stands_beside_a_much_larger_skew(diagnosed: Diagnosed) -> None:
+    """One lies between the directions, the other in both alike."""
+    effects = {"channel_skew": {"ms": 0.7}, "amplitude_drift": {"ripple": 0.006}}
+    assert set(names(diagnosed(effects, temperature_rise_k=14.0))) == {"channel_skew", "amplitude_drift"}
+
+
+def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    record = columns({"compliance": {"c1": 1.5, "c2": 1.0, "t1": 4.0}}, torque_nm=9.0)
+    noise = np.random.default_rng(3).normal(size=len(record["time_s"]))
+    record["load_torque_nm"] = record["load_torque_nm"] + 0.15 * noise
+    result = diagnose(Record(record), model)
+    assert names(result) == ["compliance"]
+    assert result.findings[0].parameters["c1_arcsec_per_nm"].value == pytest.approx(1.5, rel=0.1)
 
 
 def test_what_is_over_half_a_second_after_a_stop_is_no_creep(diagnosed: Diagnosed) -> None:
