@@ -65,7 +65,7 @@ def from_suite(folder: Path) -> Iterator[Row]:
         hidden = yaml.safe_load(path.read_text(encoding="utf-8"))
         recording = Recording.load(path.parent / "record.csv")
         model = TransmissionModel.load(path.parent / "model.yaml")
-        result = diagnose(recording.record, model, recording.segments)
+        result = diagnose(recording.record, model, recording.segments, named_from=0.0)
         there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
         loop = hidden["kind"] == "other_law"
         yield from judged(
@@ -79,7 +79,7 @@ def from_trials(seeds: int) -> Iterator[Row]:
         for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
             there, record, model = planted(name, seed + 100, SHORT)
             loop = name.startswith("none:") or bool(there & LOOPS)
-            result = diagnose(record, model)
+            result = diagnose(record, model, named_from=0.0)
             yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
 
 

@@ -20,6 +20,7 @@ from hdbridge.diagnose.search import (
     PENALTY,
     Search,
     Trail,
+    cost,
 )
 from hdbridge.diagnose.theory import Fitted
 from hdbridge.effects import AmplitudeDrift
@@ -89,7 +90,7 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
             search.forget()
             without, _ = search.with_best_law(search.workshop.fit(fitted.theory.without(place)))
             other = search.best_addition(without)
-            if other is not None and _cost(other) < _cost(fitted) - 5.0:
+            if other is not None and cost(other) < cost(fitted) - 5.0:
                 fitted, changed = other, True
                 break
         if not changed:
@@ -111,15 +112,11 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
         if trial is None:
             continue
         both = without.chi_square - fitted.chi_square
-        if _cost(trial) < _cost(fitted) + ENTER + MERGED_SHARE * both:
+        if cost(trial) < cost(fitted) + ENTER + MERGED_SHARE * both:
             search.forget()
             return _merged(search, trial)
     search.forget()
     return fitted
-
-
-def _cost(fitted: Fitted) -> float:
-    return fitted.chi_square + PENALTY * fitted.free()
 
 
 def _pruned(search: Search, fitted: Fitted) -> Fitted:

@@ -39,6 +39,8 @@ from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
+NAMED = 0.3
+"""A name that is so improbable helps nobody; of names below it one in eleven was right in a blind suite."""
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 LEADS = 3.5
@@ -59,10 +61,12 @@ def diagnose(
     *,
     independent_zeros: bool = False,
     progress: Callable[[str], None] = lambda _: None,
+    named_from: float = NAMED,
 ) -> Diagnosis:
     """Say how the model differs from the record, and why.
 
-    ``legs`` are the segments of a recording, where it has them. InputError where the record is too short,
+    ``legs`` are the segments of a recording, where it has them. Causes that are less probable than
+    ``named_from`` are not named. InputError where the record is too short,
     contradicts the model's ratio, or lacks a channel that the model needs.
     """
     lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
@@ -78,7 +82,15 @@ def diagnose(
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    return _Judge(workshop, search, trail, model, record).diagnosis()
+    return _Judge(workshop, search, trail, model, record, named_from).diagnosis()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    findings: list[Finding]
+    left: Rest
+    spread: FloatArray
+    considered: list[str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +100,7 @@ class _Judge:
     trail: Trail
     model: TransmissionModel
     record: Record
+    named_from: float
 
     def diagnosis(self) -> Diagnosis:
         workshop, trail, base = self.workshop, self.trail, self.trail.base
@@ -97,29 +110,9 @@ class _Judge:
         fitted = inertial(workshop, self.search, late(workshop, self.search, fitted))
         fitted = wound_up(workshop, fitted, trail.base)
         fitted = as_calibrated(workshop, fitted, self.model.effects)
-        trail = replace(trail, fitted=fitted)
-        precise = precisely(workshop, fitted)
-        spread = covariance(workshop, precise)
-        findings = [
-            replace(self._finding(fitted, place), parameters=parameters_of(workshop, precise, place, spread))
-            for place in range(base, len(fitted.theory.effects))
-        ]
-        findings += changes.findings(workshop, self.model, trail, precise, spread)
-        findings.sort(key=lambda each: -each.robust)
-        excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        free_loop = bool(workshop.nuisance.shape[1])
-        if workshop.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
-            workshop.nuisance = workshop.nuisance[:, :0]
-            fitted = workshop.fit(fitted.theory)
-        spread = covariance(workshop, fitted)
-        left = rest(workshop, fitted)
-        unknown = is_unexplained(self.workshop, left) or many_of_one(findings) is not None
-        if unknown:
-            findings, more = without_doubtful_loops(findings, left)
-            considered += more
-        findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
-        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
-            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
+        fitted, judged, more = self._likely_only(fitted)
+        considered += [*more, *judged.considered]
+        findings, left, spread = judged.findings, judged.left, judged.spread
         findings = self._with_unexplained(findings, left)
         chosen = tuple(range(base, len(fitted.theory.effects)))
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
@@ -147,6 +140,53 @@ class _Judge:
             traces=self._traces(fitted, given),
             considered=tuple(considered),
         )
+
+    def _likely_only(self, fitted: Fitted) -> tuple[Fitted, _Judged, list[str]]:
+        """The findings, without those that are not likely enough to be named; they leave the fit too."""
+        considered: list[str] = []
+        nuisance = self.workshop.nuisance
+        while True:
+            found, judged = self._judged(fitted)
+            doubted = [each for each in judged.findings if each.probability < self.named_from]
+            considered += [f"{each.cause}: more likely something else" for each in doubted]
+            effects = {id(each.effect) for each in doubted}
+            kept = fitted.theory
+            for place in range(len(kept.effects) - 1, self.trail.base - 1, -1):
+                if id(kept.effects[place]) in effects:
+                    kept = kept.without(place)
+            if kept == fitted.theory:  # what is left of them are changes of the baseline, which it keeps
+                likely = [each for each in judged.findings if each not in doubted]
+                return found, replace(judged, findings=likely), considered
+            self.workshop.nuisance = nuisance
+            fitted = self.workshop.fit(kept)
+
+    def _judged(self, fitted: Fitted) -> tuple[Fitted, _Judged]:
+        """What a theory finds, and how sure that is; the theory once more, without a loop of free form."""
+        workshop, base = self.workshop, self.trail.base
+        precise = precisely(workshop, fitted)
+        spread = covariance(workshop, precise)
+        findings = [
+            replace(self._finding(fitted, place), parameters=parameters_of(workshop, precise, place, spread))
+            for place in range(base, len(fitted.theory.effects))
+        ]
+        findings += changes.findings(
+            workshop, self.model, replace(self.trail, fitted=fitted), precise, spread
+        )
+        findings.sort(key=lambda each: -each.robust)
+        excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
+        free_loop = bool(workshop.nuisance.shape[1])
+        if free_loop:  # a model cannot hold a free-form loop: figures are without it
+            workshop.nuisance = workshop.nuisance[:, :0]
+            fitted = workshop.fit(fitted.theory)
+        left = rest(workshop, fitted)
+        unknown = is_unexplained(workshop, left) or many_of_one(findings) is not None
+        considered: list[str] = []
+        if unknown:
+            findings, considered = without_doubtful_loops(findings, left)
+        findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
+        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
+        return fitted, _Judged(findings, left, covariance(workshop, fitted), considered)
 
     def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
         """Take out what a gate stops, weakest first, and fit again."""

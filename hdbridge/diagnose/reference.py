@@ -7,17 +7,21 @@ temperature the drift would look like a change of the model's own orders, or of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import AmplitudeDrift, FloatArray, Synchronous
+from hdbridge.effects import AmplitudeDrift, FloatArray, RateDependence, Synchronous, TorqueModulation
 from hdbridge.effects.base import Effect
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import coefficients_of
 
 REACH_K = 30.0
 """A model was measured at a temperature that is at most so far away from those of the record."""
-SAME = 1.0
-"""Chi square that another temperature may cost: what is lost in linearisation, and no more."""
+SAME = 10.0
+"""Chi square that another temperature may cost: what a fit leaves that has not quite converged."""
 
 
 def as_calibrated(workshop: Workshop, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
@@ -28,31 +32,83 @@ def as_calibrated(workshop: Workshop, fitted: Fitted, given: tuple[Effect, ...])
     temperature = workshop.motion.temperature_c
     if temperature is None:
         return fitted
+    coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K
     for place, effect in enumerate(fitted.theory.effects[len(given) :], len(given)):
         if not isinstance(effect, AmplitudeDrift) or effect.driven_by != "temperature":
             continue
-        growth = 0.01 * np.concatenate(
-            [
-                effect.ripple_percent_per_k * coefficients_of(effect.orders),
-                [effect.friction_percent_per_k * effect.loop.offset_arcsec],
-            ]
-        )
-        change = _amplitudes(given) - _amplitudes(fitted.theory.effects[: len(given)])
-        if len(change) != len(growth) or not np.any(growth):
+        told = _nearest(effect, fitted.theory.effects[: len(given)], given)
+        if told is None or not coldest <= told.reference_c <= hottest:
             continue
-        reference_c = effect.reference_c + float(change @ growth) / float(growth @ growth)
-        near = np.min(temperature) - REACH_K <= reference_c <= np.max(temperature) + REACH_K
-        if not near:
-            continue
-        told = effect.model_copy(update={"reference_c": round(reference_c, 1)})
-        trial = workshop.fit(fitted.theory.instead(place, told))
+        effects = tuple(told.beside(each) for each in fitted.theory.effects)
+        trial = workshop.fit(replace(fitted.theory, effects=effects))
         if trial.chi_square < fitted.chi_square + SAME and not trial.theory.effects[place].violations():
             return trial
     return fitted
 
 
-def _amplitudes(base: tuple[Effect, ...]) -> FloatArray:
-    """Orders, real and imaginary, and the offset of the loop, arcsec."""
-    orders = [coefficients_of(each.orders) for each in base if isinstance(each, Synchronous)]
-    offsets = [[each.offset_arcsec] for each in base if hasattr(each, "offset_arcsec")]
-    return np.concatenate([*orders, *offsets]) if orders or offsets else np.empty(0)
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """A model as it is at another temperature."""
+
+    reference_c: float
+    orders: FloatArray
+    """Cosines and sines, arcsec."""
+    offsets: FloatArray
+    """Of the loops that it has, arcsec."""
+    per_ripple: float
+    per_loop: float
+    """A share of the former ripple, or loop, as a share of this one."""
+
+    def beside(self, effect: Effect) -> Effect:
+        """An effect of the model, or one that is told as a share of it."""
+        if isinstance(effect, Synchronous):
+            return effect.fitted(self.orders)
+        if isinstance(effect, Hysteresis | HysteresisMemory):
+            return effect.model_copy(update={"offset_arcsec": float(self.offsets[0])})
+        if isinstance(effect, AmplitudeDrift):
+            growth = {
+                "ripple_percent_per_k": effect.ripple_percent_per_k * self.per_ripple,
+                "friction_percent_per_k": effect.friction_percent_per_k * self.per_loop,
+            }
+            return effect.model_copy(update=growth | {"reference_c": self.reference_c})
+        if isinstance(effect, TorqueModulation):
+            growth = {"growth_percent_per_nm": effect.growth_percent_per_nm * self.per_ripple}
+            return effect.model_copy(update=growth)
+        if isinstance(effect, RateDependence):
+            return effect.model_copy(update={"growth_percent": effect.growth_percent * self.per_loop})
+        return effect
+
+
+def _nearest(drift: AmplitudeDrift, now: tuple[Effect, ...], given: tuple[Effect, ...]) -> _Told | None:
+    """The model ``now`` at the temperature at which it is nearest to the one ``given``."""
+    numbers = {order.order for each in now if isinstance(each, Synchronous) for order in each.orders}
+    # A fit that has not settled carries other orders than it has: growth is that of what is carried.
+    ripple = coefficients_of(each for each in drift.orders if each.order in numbers)
+    loop = np.full(len(_offsets(now)), drift.loop.offset_arcsec)
+    if len(ripple) != len(_orders(now)):
+        return None
+    growth = 0.01 * np.concatenate(
+        [drift.ripple_percent_per_k * ripple, drift.friction_percent_per_k * loop],
+    )
+    if not np.any(growth):
+        return None
+    change = np.concatenate([_orders(given) - _orders(now), _offsets(given) - _offsets(now)])
+    warmer_k = float(change @ growth) / float(growth @ growth)
+    orders = _orders(now) + warmer_k * growth[: len(ripple)]
+    offsets = _offsets(now) + warmer_k * growth[len(ripple) :]
+    return _Told(
+        round(drift.reference_c + warmer_k, 1), orders, offsets, _ratio(ripple, orders), _ratio(loop, offsets)
+    )
+
+
+def _ratio(former: FloatArray, present: FloatArray) -> float:
+    return float(np.linalg.norm(former)) / max(float(np.linalg.norm(present)), 1e-9) if len(former) else 1.0
+
+
+def _orders(base: tuple[Effect, ...]) -> FloatArray:
+    given = [coefficients_of(each.orders) for each in base if isinstance(each, Synchronous)]
+    return np.concatenate(given) if given else np.empty(0)
+
+
+def _offsets(base: tuple[Effect, ...]) -> FloatArray:
+    return np.array([each.offset_arcsec for each in base if isinstance(each, Hysteresis | HysteresisMemory)])

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
-from hdbridge.diagnose.gates import standing_s
+from hdbridge.diagnose.gates import gate, standing_s
 from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.effects import (
@@ -40,6 +40,11 @@ MOST = 6
 BEST = 3
 FEW = 3
 """So many findings are looked at again; more of them mean something that is none of them."""
+AGAIN = 1.5
+"""Chi square per point beyond which a search is made again."""
+PAIR_SHARE = 0.9
+"""Two causes at once in place of one have to leave less than this share of what it leaves."""
+WITH_SPEED = frozenset({"velocity_windup", "channel_skew", "rate_dependence"})
 FREE_LOOP_ARCSEC = 0.2
 """Root mean square that a free-form loop has to take away to stand beside the law."""
 SLOW = 0.8
@@ -96,12 +101,37 @@ class Search:
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self._refused: set[object] = set()
+        self._left_out: str | None = None
 
     def run(self) -> Trail:
-        """Find causes, best first."""
+        """Find causes, best first; where much is left, again without the cause that was best at first.
+
+        The best of one cause may be one that does a little of the work of each of two.
+        """
+        trail = self._greedily()
+        names = [each.name for each in trail.fitted.theory.effects[self.base :]]
+        if not names or trail.fitted.chi_square < AGAIN * len(trail.fitted.residual):
+            return trail
+        nuisance = self.workshop.nuisance
+        self.workshop.nuisance = nuisance[:, :0]
+        self._left_out = names[0]
+        self.forget()
+        other = self._greedily()
+        self._left_out = None
+        self.forget()
+        if cost(other.fitted) + ENTER < cost(trail.fitted):
+            return other
+        self.workshop.nuisance = nuisance
+        return trail
+
+    def _greedily(self) -> Trail:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
+            if found is None or found.chi_square > AGAIN * len(found.residual):
+                pair = self._best_pair(fitted)
+                if pair is not None and (found is None or cost(pair) < PAIR_SHARE * cost(found)):
+                    found = pair
             if number < 3 and not self.workshop.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
@@ -171,6 +201,23 @@ class Search:
                 best = (net, trial)
         return None if best is None else best[1]
 
+    def _best_pair(self, fitted: Fitted) -> Fitted | None:
+        """With two causes more that grow with speed, each of which may hide the other."""
+        present = {each.name for each in fitted.theory.effects} | {self._left_out}
+        best: dict[str, Score] = {}
+        for each in self._screen(fitted).scores(fitted):
+            cause = each.candidate.cause
+            if cause in WITH_SPEED - present and (cause not in best or each.gain > best[cause].gain):
+                best[cause] = each
+        pairs = []
+        for one, other in combinations(sorted(best), 2):
+            two = (best[one].candidate, best[other].candidate)
+            trial = self.workshop.fit(fitted.theory.plus(two[0].effect).plus(two[1].effect))
+            net = fitted.chi_square - trial.chi_square - PENALTY * (trial.free() - fitted.free())
+            if net > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
+                pairs.append(trial)
+        return min(pairs, key=cost, default=None)
+
     def _at_home(self, trial: Fitted) -> Fitted:
         """A drift of amplitudes told at a temperature of this record, where it makes no sense at its own.
 
@@ -220,6 +267,8 @@ class Search:
             rest_s = float(np.max(standing_s(self.workshop)))
             if min(each.tau_s for each in effect.parts) > RESTS * rest_s:
                 return False
+            if not gate(self.workshop, trial, place).passed:
+                return False  # what is over at once is another cause's, which would not be found beside it
         return peak >= FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC)
 
     def peak(self, fitted: Fitted, place: int) -> float:
@@ -237,6 +286,7 @@ class Search:
             for each in self._scores(fitted)
             if _key(each.candidate.effect) not in self._refused
             and each.candidate.cause not in present
+            and each.candidate.cause != self._left_out
             and not (isinstance(each.candidate.effect, OrderSeries) and each.share < ORDER_SHARE_LEFT)
         ]
         net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
@@ -261,7 +311,7 @@ class Search:
         found = [seek.count_loss(self.workshop, fitted), seek.local_defect(self.workshop, fitted)]
         return [
             *(each for each in found if each is not None),
-            *seek.vibrations(self.workshop, residual),
+            *seek.vibrations(self.workshop, residual, fitted.theory.effects),
             *seek.interpolation_errors(self.workshop, residual, load_deg),
         ]
 
@@ -284,6 +334,11 @@ class Search:
                 if self._counts(trial, score.candidate):
                     result.append((score.candidate.cause, trial))
         return sorted(result, key=lambda each: each[1].chi_square)
+
+
+def cost(fitted: Fitted) -> float:
+    """Chi square and what the parameters have to earn."""
+    return fitted.chi_square + PENALTY * fitted.free()
 
 
 def joined(theory: Theory, effect: Effect, base: int) -> Theory:

@@ -7,14 +7,14 @@ Interpolation errors: a Fourier transform over one load turn at the *predicted* 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hdbridge.diagnose.candidates import HIGHEST_MOTOR_ORDER, Candidate
 from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import CountLoss, FloatArray, LocalDefect, Step, SubdivisionalError, Vibration
+from hdbridge.effects import CountLoss, Effect, FloatArray, LocalDefect, Step, SubdivisionalError, Vibration
 from hdbridge.effects.orders import orders_from
 from hdbridge.units import DEG_PER_TURN
 
@@ -24,6 +24,8 @@ HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
 LEAST_LINES = 256
 LOWEST_HZ = 0.3
 PEAKS = 3
+FOOT_LINES = 50.0
+"""Lines of the record's resolution beside a vibration that are taken for its feet."""
 LINE_OVER_MEAN = 12.0
 """A line is looked at when its power is so many times the mean: noise alone reaches 11 in 65,000 lines."""
 
@@ -120,8 +122,13 @@ def fast_residual(workshop: Workshop, fitted: Fitted) -> tuple[FloatArray, Float
     return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
 
 
-def vibrations(workshop: Workshop, residual: FloatArray) -> Iterator[Candidate]:
-    """The highest lines over absolute time."""
+def vibrations(
+    workshop: Workshop, residual: FloatArray, present: Sequence[Effect] = ()
+) -> Iterator[Candidate]:
+    """The highest lines over absolute time, apart from the feet of those ``present``.
+
+    A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
+    """
     evidence = workshop.evidence
     time_s = evidence.full.motion.time_s
     assert time_s is not None
@@ -136,6 +143,9 @@ def vibrations(workshop: Workshop, residual: FloatArray) -> Iterator[Candidate]:
     # Less than two periods of it are a bend, not a frequency.
     power[frequency < max(LOWEST_HZ, 2.0 / (length * evidence.period_s))] = 0.0
     lobe = max(4, size // length * 4)
+    for each in present:
+        if isinstance(each, Vibration):
+            power[np.abs(frequency - each.frequency_hz) < FOOT_LINES / (length * evidence.period_s)] = 0.0
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= 0.0:

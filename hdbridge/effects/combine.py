@@ -11,6 +11,7 @@ from hdbridge.effects.carried import Loop, loop_of
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.hysteresis_parameters import HysteresisParameters
+from hdbridge.effects.motor_order import MotorOrders
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.effects.synchronous import Synchronous
 
@@ -40,21 +41,26 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """The same effects; those that carry orders or a loop carry what the model now has.
 
-    Which orders an effect carries stays as it is: only their amplitudes and phases follow.
+    The orders are those of the synchronous part and of orders that were added to it: what changes a tooth
+    error changes all of it. Where the model has no synchronous part, the orders stay as they are.
     """
     given = tuple(effects)
     loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
-    orders = {order.order: order for each in given if isinstance(each, Synchronous) for order in each.orders}
+    series = [each for each in given if isinstance(each, Synchronous | MotorOrders)]
+    orders: tuple[MotorOrder, ...] | None = None
+    if any(isinstance(each, Synchronous) for each in series):
+        # Of an order that stands twice, the synchronous part's: a fit tells no shares of it.
+        by_number = {order.order: order for each in reversed(series) for order in each.orders}
+        orders = tuple(by_number[number] for number in sorted(by_number))
     return tuple(_refreshed(each, loop, orders) for each in given)
 
 
-def _refreshed(effect: Effect, loop: Loop | None, orders: dict[int, MotorOrder]) -> Effect:
+def _refreshed(effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None) -> Effect:
     update: dict[str, object] = {}
     if loop is not None and "loop" in type(effect).model_fields:
         update["loop"] = loop
-    carried = getattr(effect, "orders", ())
-    if effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"} and carried:
-        update["orders"] = tuple(orders.get(each.order, each) for each in carried)
+    if orders and effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"}:
+        update["orders"] = orders
     return effect.model_copy(update=update) if update else effect
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,29 @@ def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(
     result = diagnose(Record(record), model)
     assert names(result) == ["compliance"]
     assert result.findings[0].parameters["c1_arcsec_per_nm"].value == pytest.approx(1.5, rel=0.1)
+
+
+def test_flanks_shift_an_order_that_the_model_lacks_as_well(diagnosed: Diagnosed, plant: ModuleType) -> None:
+    orders = (*plant.ORDERS, (9, 4.0, 60.0))
+    found = diagnosed({"direction_phase": {"shift": 6.0}}, orders=orders)
+    assert set(names(found)) == {"direction_phase", "motor_order"}
+
+
+def test_a_vibration_that_swells_and_fades_is_one(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    record = columns()
+    time_s = record["time_s"]
+    swell = 1.0 + 0.3 * np.sign(np.sin(time_s / 6.0))
+    record["load_position_deg"] = (
+        record["load_position_deg"] + swell * 3.0 * np.cos(2 * np.pi * 5.3 * time_s) / 3600
+    )
+    assert names(diagnose(Record(record), model)).count("vibration") == 1
+
+
+def test_two_that_grow_with_speed_are_found_where_each_hides_the_other(diagnosed: Diagnosed) -> None:
+    effects = {"rate_dependence": {"growth": 0.06, "reference": 2.0}, "channel_skew": {"ms": -0.2}}
+    assert set(names(diagnosed(effects))) == {"rate_dependence", "channel_skew"}
 
 
 def test_what_is_over_half_a_second_after_a_stop_is_no_creep(diagnosed: Diagnosed) -> None:

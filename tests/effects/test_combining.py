@@ -19,6 +19,7 @@ from hdbridge.effects import (
     Loop,
     Motion,
     MotorOrder,
+    MotorOrders,
     Observer,
     RateDependence,
     Start,
@@ -70,8 +71,14 @@ def test_what_is_carried_follows_what_it_was_copied_from():
     effects = extended(effects, HysteresisParameters.candidate(RATIO, BASE))
     assert effects[2].loop == Loop(offset_arcsec=48, width_deg=20, exponent=1.6)
     phase = DirectionPhase(orders=(MotorOrder(order=2, amplitude_arcsec=1, phase_deg=0),), shift_deg=1)
-    (order,) = refreshed([*BASE, phase])[2].orders
-    assert order == next(each for each in BASE[0].orders if each.order == 2)
+    assert refreshed([*BASE, phase])[2].orders == BASE[0].orders
+    assert refreshed([BASE[1], phase])[1].orders == phase.orders
+
+
+def test_an_order_that_was_added_changes_with_the_others():
+    new = MotorOrder(order=9, amplitude_arcsec=2.0, phase_deg=30.0)
+    (*_, phase) = refreshed([*BASE, MotorOrders(orders=(new,)), DirectionPhase.candidate(RATIO, BASE)])
+    assert phase.orders == (*BASE[0].orders, new)
 
 
 def test_errors_of_the_measurement_are_left_out_of_the_compensation():

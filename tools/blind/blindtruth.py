@@ -114,6 +114,9 @@ def _motor_orders(secret: Secret) -> Values:
     disc = secret.truth["motor"]["encoder"].get("disc")
     if disc:
         total = _read_by(disc, total, float(secret.gear["ratio"]))
+    shift_deg = float(secret.gear.get("flank", {}).get("shift_deg", 0.0))
+    # What a finding tells is the mean over both flanks.
+    total = {order: each * math.cos(math.radians(order * shift_deg)) for order, each in total.items()}
     given = _sum_of(
         row
         for each in secret.model.get("effects", ())
@@ -219,18 +222,13 @@ def _zero_drift(secret: Secret) -> Values:
 
 
 def _amplitude_drift(secret: Secret) -> Values:
-    """Per cent of the part as it is at the finding's reference, 20 C; truth.yaml has another reference."""
+    """Per cent of the part as it is at the plant's reference, where the given model was measured."""
     warmth = secret.truth.get("temperature", {})
     growths = {
         "ripple_percent_per_k": warmth.get("tooth_growth_per_k", secret.parameters.get("growth_per_k")),
         "friction_percent_per_k": warmth.get("friction_growth_per_k"),
     }
-    away_k = 20.0 - float(warmth.get("reference_c", warmth.get("ambient_c", 20.0)))
-    return {
-        name: 100.0 * float(growth) / (1.0 + float(growth) * away_k)
-        for name, growth in growths.items()
-        if growth
-    }
+    return {name: 100.0 * float(growth) for name, growth in growths.items() if growth}
 
 
 def _wear(secret: Secret) -> Values:
