@@ -87,6 +87,8 @@ def diagnose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
+    fitted: Fitted
+    """Without a loop of free form."""
     findings: list[Finding]
     left: Rest
     spread: FloatArray
@@ -110,9 +112,9 @@ class _Judge:
         fitted = inertial(workshop, self.search, late(workshop, self.search, fitted))
         fitted = wound_up(workshop, fitted, trail.base)
         fitted = as_calibrated(workshop, fitted, self.model.effects)
-        fitted, judged, more = self._likely_only(fitted)
-        considered += [*more, *judged.considered]
-        findings, left, spread = judged.findings, judged.left, judged.spread
+        judged = self._likely_only(fitted)
+        considered += judged.considered
+        fitted, findings, left, spread = judged.fitted, judged.findings, judged.left, judged.spread
         findings = self._with_unexplained(findings, left)
         chosen = tuple(range(base, len(fitted.theory.effects)))
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
@@ -141,12 +143,12 @@ class _Judge:
             considered=tuple(considered),
         )
 
-    def _likely_only(self, fitted: Fitted) -> tuple[Fitted, _Judged, list[str]]:
+    def _likely_only(self, fitted: Fitted) -> _Judged:
         """The findings, without those that are not likely enough to be named; they leave the fit too."""
         considered: list[str] = []
         nuisance = self.workshop.nuisance
         while True:
-            found, judged = self._judged(fitted)
+            judged = self._judged(fitted)
             doubted = [each for each in judged.findings if each.probability < self.named_from]
             considered += [f"{each.cause}: more likely something else" for each in doubted]
             effects = {id(each.effect) for each in doubted}
@@ -156,12 +158,12 @@ class _Judge:
                     kept = kept.without(place)
             if kept == fitted.theory:  # what is left of them are changes of the baseline, which it keeps
                 likely = [each for each in judged.findings if each not in doubted]
-                return found, replace(judged, findings=likely), considered
+                return replace(judged, findings=likely, considered=[*considered, *judged.considered])
             self.workshop.nuisance = nuisance
             fitted = self.workshop.fit(kept)
 
-    def _judged(self, fitted: Fitted) -> tuple[Fitted, _Judged]:
-        """What a theory finds, and how sure that is; the theory once more, without a loop of free form."""
+    def _judged(self, fitted: Fitted) -> _Judged:
+        """What a theory finds, and how sure that is."""
         workshop, base = self.workshop, self.trail.base
         precise = precisely(workshop, fitted)
         spread = covariance(workshop, precise)
@@ -186,7 +188,7 @@ class _Judge:
         findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
         if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
-        return fitted, _Judged(findings, left, covariance(workshop, fitted), considered)
+        return _Judged(fitted, findings, left, covariance(workshop, fitted), considered)
 
     def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
         """Take out what a gate stops, weakest first, and fit again."""

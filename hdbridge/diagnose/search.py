@@ -213,8 +213,7 @@ class Search:
         for one, other in combinations(sorted(best), 2):
             two = (best[one].candidate, best[other].candidate)
             trial = self.workshop.fit(fitted.theory.plus(two[0].effect).plus(two[1].effect))
-            net = fitted.chi_square - trial.chi_square - PENALTY * (trial.free() - fitted.free())
-            if net > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
+            if cost(fitted) - cost(trial) > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
                 pairs.append(trial)
         return min(pairs, key=cost, default=None)
 

@@ -56,12 +56,12 @@ def late(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
             continue
         if effect.shear_deg_s < STRAIGHT * float(np.max(np.abs(speed))):
             continue
+        without = workshop.fit(fitted.theory.without(place))
+        if any(isinstance(each, ChannelSkew) for each in fitted.theory.effects):
+            return without
         skew = ChannelSkew(ratio=workshop.evidence.ratio, delay_ms=1.0, second_order_ms2=1.0)
-        present = {each.name for each in fitted.theory.effects}
-        theory = fitted.theory.without(place)
-        trial = workshop.fit(theory if "channel_skew" in present else fitted.theory.instead(place, skew))
-        own = workshop.fit(theory).chi_square - fitted.chi_square
-        if "channel_skew" in present or trial.chi_square - fitted.chi_square < TWIN * own:
+        trial = workshop.fit(fitted.theory.instead(place, skew))
+        if trial.chi_square - fitted.chi_square < TWIN * (without.chi_square - fitted.chi_square):
             return trial
     return fitted
 
@@ -75,11 +75,7 @@ def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
     """
     if Channel.LOAD_TORQUE not in workshop.motion.available():
         return fitted
-    springs = [
-        place
-        for place, effect in enumerate(fitted.theory.effects[base:], base)
-        if isinstance(effect, Compliance)
-    ]
+    spring = next((each for each in fitted.theory.effects[base:] if isinstance(each, Compliance)), None)
     for place, effect in enumerate(fitted.theory.effects[base:], base):
         if not isinstance(effect, LoadOrders) or all(each.order != 1 for each in effect.orders):
             continue
@@ -89,16 +85,14 @@ def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
             if others
             else fitted.theory.without(place)
         )
-        spring = Compliance(
-            c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
-            torque1_nm=1e4, torque2_nm=2e4, torque=Channel.LOAD_TORQUE.value,
-        )  # fmt: skip
-        if springs:
-            trial = workshop.fit(without)
-            at = springs[0] if others or springs[0] < place else springs[0] - 1
-            neither = without.without(at)
+        if spring is not None:
+            trial, neither = workshop.fit(without), without.without(without.effects.index(spring, base))
         else:
-            trial, neither = workshop.fit(without.plus(spring)), without
+            linear = Compliance(
+                c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
+                torque1_nm=1e4, torque2_nm=2e4, torque=Channel.LOAD_TORQUE.value,
+            )  # fmt: skip
+            trial, neither = workshop.fit(without.plus(linear)), without
         own = workshop.fit(neither).chi_square - fitted.chi_square
         worse = trial.chi_square - fitted.chi_square
         if worse < TWIN * own and not any(

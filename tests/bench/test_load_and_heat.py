@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
 from hdbridge.bench import Bench, compensation_for
@@ -21,19 +22,8 @@ from hdbridge.sim.truth import Truth
 from hdbridge.stepping import SchemeResult, quantisation_floor_arcsec
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
-CHANNELS = """
-load_torque:
-  source: {index: 0x2101, type: int32}
-  newton_metres_per_count: 0.001
-  maximum_nm: 100
-temperature:
-  source: {index: 0x2100, type: int16}
-  celsius_per_count: 0.1
-"""
 MASS = ("  encoder:\n    counts_per_turn: 2880000", "  gravity: {mass_kg: 5, arm_m: 0.15}\n")
 WARM = "\ntemperature: {ambient_c: 40, reference_c: 20, tooth_growth_per_k: 0.01}\n"
-TPDO3 = 0x381
-OFF = 0x8000_0000
 STIFFNESS_NM_PER_RAD = 16000
 
 
@@ -90,15 +80,6 @@ class Script:
         if todo := self._at.get(self._cycle):
             todo()
         return False
-
-
-def stops(node):
-    """Object 2101h stays away from now on."""
-    node.dictionary[0x1802, 1].put(TPDO3 | OFF)
-
-
-def resumes(node):
-    node.dictionary[0x1802, 1].put(TPDO3)
 
 
 def test_with_the_load_torque_a_mass_on_the_axis_is_made_up_for():

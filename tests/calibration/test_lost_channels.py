@@ -3,6 +3,7 @@
 from datetime import UTC, datetime
 
 import yaml
+from two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import measure, start_journal
@@ -11,17 +12,6 @@ from hdbridge.drive.drive import Drive
 from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-
-CHANNELS = """
-load_torque:
-  source: {index: 0x2101, type: int32}
-  newton_metres_per_count: 0.001
-  maximum_nm: 100
-temperature:
-  source: {index: 0x2100, type: int16}
-  celsius_per_count: 0.1
-"""
-TPDO3, OFF = 0x381, 0x8000_0000
 
 
 def measured(cell, silent_cycles):
@@ -43,9 +33,9 @@ def measured(cell, silent_cycles):
             nonlocal cycles
             cycles += 1
             if cycles in silent_cycles:
-                node.dictionary[0x1802, 1].put(TPDO3 | OFF)
+                stops(node)
             elif cycles - 1 in silent_cycles:
-                node.dictionary[0x1802, 1].put(TPDO3)
+                resumes(node)
             return False
 
         measure(drive, journal, interrupted=each_cycle)

@@ -22,23 +22,26 @@ def names(diagnosis: Diagnosis) -> list[str]:
     return [each.cause for each in diagnosis.findings]
 
 
-def test_a_ripple_is_told_at_a_temperature_of_the_record(
-    columns: Callable[..., dict[str, Any]], model: TransmissionModel
-) -> None:
+@pytest.fixture
+def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
+    """A ripple that grows with warmth, on a day that is warmer than the model's reference of 20 degrees."""
+
+    def run(growth_per_k: float, rise_k: float, warmer_k: float) -> Diagnosis:
+        record = columns({"amplitude_drift": {"ripple": growth_per_k}}, temperature_rise_k=rise_k)
+        record["temperature_c"] = record["temperature_c"] + warmer_k
+        return diagnose(Record(record), model)
+
+    return run
+
+
+def test_a_ripple_is_told_at_a_temperature_of_the_record(drifting: Callable[..., Diagnosis]) -> None:
     """At 20 degrees, far below the coldest that was measured, this one would be next to nothing."""
-    record = columns({"amplitude_drift": {"ripple": 0.08}}, temperature_rise_k=14.0)
-    record["temperature_c"] = record["temperature_c"] + 12.0
-    result = diagnose(Record(record), model)
-    assert names(result) == ["amplitude_drift"]
+    assert names(drifting(0.08, rise_k=14.0, warmer_k=12.0)) == ["amplitude_drift"]
 
 
-def test_a_drift_is_told_from_the_temperature_of_the_model(
-    columns: Callable[..., dict[str, Any]], model: TransmissionModel
-) -> None:
+def test_a_drift_is_told_from_the_temperature_of_the_model(drifting: Callable[..., Diagnosis]) -> None:
     """From any other the amplitudes of the model would have changed beside it."""
-    record = columns({"amplitude_drift": {"ripple": 0.025}}, temperature_rise_k=10.0)
-    record["temperature_c"] = record["temperature_c"] + 14.0
-    result = diagnose(Record(record), model)
+    result = drifting(0.025, rise_k=10.0, warmer_k=14.0)
     assert names(result) == ["amplitude_drift"]
     growth = result.findings[0].parameters["ripple_percent_per_k"]
     assert growth.value == pytest.approx(2.5, rel=0.15)  # the gear follows the sensor with a lag

@@ -1,0 +1,23 @@
+"""Load torque and temperature: lines for an axis file, and the TPDO that carries both, off and on."""
+
+CHANNELS = """
+load_torque:
+  source: {index: 0x2101, type: int32}
+  newton_metres_per_count: 0.001
+  maximum_nm: 100
+temperature:
+  source: {index: 0x2100, type: int16}
+  celsius_per_count: 0.1
+"""
+TPDO3 = 0x381
+OFF = 0x8000_0000
+
+
+def stops(node):
+    """Object 2101h stays away from now on."""
+    node.dictionary[0x1802, 1].put(TPDO3 | OFF)
+
+
+def resumes(node):
+    """It comes again."""
+    node.dictionary[0x1802, 1].put(TPDO3)
