@@ -14,8 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.diagnose.theory import Fitted, Workshop, orthonormal
-from hdbridge.effects import Backlash, Creep, FloatArray, LocalDefect, RatioError, Wear
+from hdbridge.effects import (
+    Backlash,
+    CountLoss,
+    Creep,
+    FloatArray,
+    LocalDefect,
+    RatioError,
+    SubdivisionalError,
+    Wear,
+)
 from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.orders import OrderSeries
 
 BLOCKS_S = (1.0, 5.0)
 LEAST_BLOCKS = 30
@@ -103,8 +113,8 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
         robust = min(robust, robust_chi_square(workshop, fitted, place, free))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="an elastic loop of another shape does as well")
-    if isinstance(effect, LocalDefect):
-        # Where it turns, a loop of another shape leaves bumps that lie at one load angle too.
+    if isinstance(effect, LocalDefect | CountLoss | OrderSeries | SubdivisionalError):
+        # Where it turns, a loop of another shape leaves bumps that lie at one load angle too, and steps.
         far = since_reversal(workshop.motion.motor_deg)[workshop.index] > TURN_DEG
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
         if robust < needed:

@@ -253,8 +253,11 @@ class Search:
             return False
         if isinstance(effect, LocalDefect) and not seek.is_met(effect, self.workshop):
             return False
-        if isinstance(effect, CountLoss) and self.workshop.evidence.reversals < 2:
-            return False  # nowhere twice: a step in time may as well be one at a place
+        if isinstance(effect, CountLoss):
+            if self.workshop.evidence.reversals < 2:
+                return False  # nowhere twice: a step in time may as well be one at a place
+            if not gate(self.workshop, trial, place).passed:
+                return False
         peak = self.peak(trial, place)
         if isinstance(effect, OrderSeries):
             largest = max(each.amplitude_arcsec for each in effect.orders)

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.probability import Beside, Signs, weighed
+from hdbridge.effects import Hysteresis
 from hdbridge.model import TransmissionModel
 from hdbridge.record import Record
 
@@ -97,6 +99,28 @@ def test_what_takes_far_longer_than_any_rest_is_no_creep(diagnosed: Diagnosed) -
 
 def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> None:
     assert names(diagnosed(width=26.0)) == ["hysteresis_parameters"]
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_loop_that_sticks_is_no_loss_of_counts_where_it_only_turns_round(
+    plant: ModuleType, seed: int
+) -> None:
+    """A friction that is higher at rest, shaken to and fro within its own width."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
+    shaken = rng.normal(size=len(time_s))
+    for _ in range(3):
+        shaken = lfilter([0.03], [1.0, -0.97], shaken)
+    motor = 10.0 * shaken / np.std(shaken) * np.sin(np.pi * time_s / 28.0)
+    sticks = 1.0 + 0.4 * np.exp(-np.abs(np.gradient(motor, time_s)) / 8.0)
+    error = lfilter([0.2], [1.0, -0.8], sticks * plant.loop(motor, "memory", 95.0, 32.0, 2.2))
+    error = error + 0.2 * rng.normal(size=len(motor))
+    record = Record(
+        {"time_s": time_s, "motor_position_deg": motor, "load_position_deg": motor / 50.0 + error / 3600.0}
+    )
+    law = Hysteresis(offset_arcsec=95.0, width_deg=32.0, exponent=2.2)
+    found = diagnose(record, TransmissionModel(50.0, (law,)))
+    assert set(names(found)) == {"hysteresis_memory", "unexplained"}
 
 
 def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagnosed) -> None:
