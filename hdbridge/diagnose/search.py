@@ -245,33 +245,37 @@ class Search:
             if trial.theory.effects[i].name == candidate.cause
         )  # fmt: skip
         effect = trial.theory.effects[place]
-        if effect.violations() and not isinstance(effect, OrderSeries):
+        if not self._makes_sense(effect):
             return False
-        if isinstance(effect, Compliance) and not _stiffens(effect):
-            return False
-        if isinstance(effect, ChannelSkew) and not _late(effect):
-            return False
-        if isinstance(effect, LocalDefect) and not seek.is_met(effect, self.workshop):
-            return False
-        if isinstance(effect, CountLoss):
-            if self.workshop.evidence.reversals < 2:
-                return False  # nowhere twice: a step in time may as well be one at a place
-            if not gate(self.workshop, trial, place).passed:
-                return False
         peak = self.peak(trial, place)
+        largest = 0.0
         if isinstance(effect, OrderSeries):
             largest = max(each.amplitude_arcsec for each in effect.orders)
-            if largest > EXTRAPOLATED * peak:
-                return False
         if isinstance(effect, Creep):
-            if max(abs(each.amplitude_arcsec) for each in effect.parts) > EXTRAPOLATED * peak:
-                return False
+            largest = max(abs(each.amplitude_arcsec) for each in effect.parts)
+        if peak < FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC) or largest > EXTRAPOLATED * peak:
+            return False
+        # What is over at once, or seen only where the axis turns round, is another cause's, which would not
+        # be found beside it.
+        return not isinstance(effect, Creep | CountLoss) or gate(self.workshop, trial, place).passed
+
+    def _makes_sense(self, effect: Effect) -> bool:
+        """Whether an effect is physical, and this record one in which it can be seen."""
+        if effect.violations() and not isinstance(effect, OrderSeries):
+            return False
+        if isinstance(effect, Compliance):
+            return _stiffens(effect)
+        if isinstance(effect, ChannelSkew):
+            return _late(effect)
+        if isinstance(effect, LocalDefect):
+            return seek.is_met(effect, self.workshop)
+        if isinstance(effect, CountLoss):
+            # Nowhere twice: a step in time may as well be one at a place.
+            return self.workshop.evidence.reversals >= 2
+        if isinstance(effect, Creep):
             rest_s = float(np.max(standing_s(self.workshop)))
-            if min(each.tau_s for each in effect.parts) > RESTS * rest_s:
-                return False
-            if not gate(self.workshop, trial, place).passed:
-                return False  # what is over at once is another cause's, which would not be found beside it
-        return peak >= FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC)
+            return min(each.tau_s for each in effect.parts) <= RESTS * rest_s
+        return True
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
