@@ -16,7 +16,6 @@ from hdbridge.diagnose.search import (
     ENTER,
     FEW,
     FLOOR_ARCSEC,
-    FLOORS_ARCSEC,
     PENALTY,
     Search,
     Trail,
@@ -129,9 +128,8 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         largest = max(gain for gain, _ in gains.values())
         place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
         gain, without = gains[place]
-        name = fitted.theory.effects[place].name
         kinds = {each: _kind(search, fitted, each) for each in gains}
-        small = search.peak(fitted, place) < FLOORS_ARCSEC.get(name, FLOOR_ARCSEC)
+        small = search.peak(fitted, place) < FLOOR_ARCSEC
         share = max(
             (kinship(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
             default=0.0,

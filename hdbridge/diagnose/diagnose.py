@@ -20,13 +20,16 @@ from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Beside, Signs, weighed
 from hdbridge.diagnose.reference import as_calibrated
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import PENALTY, Search, Trail
+from hdbridge.diagnose.search import ORDINARY_ARCSEC, PENALTY, Search, Trail
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.diagnose.twins import inertial, late, wound_up
 from hdbridge.diagnose.unexplained import (
     LEFT_ARCSEC,
     SHADOW,
     Rest,
+    acts,
+    beyond_noise,
+    elsewhere,
     is_unexplained,
     many_of_one,
     rest,
@@ -113,18 +116,26 @@ class _Judge:
         fitted = wound_up(workshop, fitted, trail.base)
         fitted = as_calibrated(workshop, fitted, self.model.effects)
         judged = self._likely_only(fitted)
+        fitted, left, spread = judged.fitted, judged.left, judged.spread
+        findings = [each for each in judged.findings if not _ordinary(each)]
         considered += judged.considered
-        fitted, findings, left, spread = judged.fitted, judged.findings, judged.left, judged.spread
+        considered += [f"{each.cause}: no more than usual" for each in judged.findings if _ordinary(each)]
         findings = self._with_unexplained(findings, left)
-        chosen = tuple(range(base, len(fitted.theory.effects)))
+        usual = {id(each.effect) for each in judged.findings if _ordinary(each)}
+        chosen = tuple(
+            place
+            for place in range(base, len(fitted.theory.effects))
+            if id(fitted.theory.effects[place]) not in usual
+        )
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
         after = fitted.residual / workshop.weight
         sound = supported(workshop, fitted, self.model.effects)
-        if sound != fitted.theory.effects:
+        if sound != fitted.theory.effects or usual:
             fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
+            told = [*sound[:base], *(sound[place] for place in chosen)]
             after = self._about_zeros(
-                sum(each.predict(workshop.motion, fitted.theory.start) for each in sound)
+                sum(each.predict(workshop.motion, fitted.theory.start) for each in told)
             )
             fitted = replace(fitted, residual=after * workshop.weight)
         extended = extended_model(workshop, self.model, fitted, chosen, spread, reason, base)
@@ -217,18 +228,24 @@ class _Judge:
                 self.workshop, replace(left, fast_arcsec=0.0)
             ):  # what is fast casts no shadow
                 break
-            does = {}
-            for place in range(self.trail.base, len(fitted.theory.effects)):
-                if fitted.theory.effects[place].name in LINES:
+            residual = fitted.residual / self.workshop.weight
+            apart = elsewhere(self.workshop, residual)
+            share = {}
+            for place, effect in enumerate(fitted.theory.effects[self.trail.base :], self.trail.base):
+                if effect.name in LINES or effect.name in ORDINARY_ARCSEC:
                     continue  # what is left has no such line, and casts no shadow there
+                where = acts(self.workshop, fitted, place)
+                rows = where & apart if np.any(where & apart) else where
                 without = self.workshop.fit(fitted.theory.without(place))
-                lost = [each.residual / self.workshop.weight for each in (without, fitted)]
-                does[place] = (float(np.mean(lost[0] ** 2) - np.mean(lost[1] ** 2)), without)
-            place = min(does, key=lambda each: does[each][0], default=-1)
-            if place < 0 or does[place][0] > SHADOW * left.arcsec**2:
+                lost = without.residual[rows] / self.workshop.weight[rows]
+                does = float(np.mean(lost**2) - np.mean(residual[rows] ** 2))
+                left_arcsec = beyond_noise(self.workshop, residual, rows)
+                share[place] = (does / max(left_arcsec**2, 1e-12), without)
+            place = min(share, key=lambda each: share[each][0], default=-1)
+            if place < 0 or share[place][0] > SHADOW:
                 break
             considered.append(f"{fitted.theory.effects[place].name}: does less than what is left unexplained")
-            fitted = does[place][1]
+            fitted = share[place][1]
         return fitted, considered
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
@@ -376,6 +393,11 @@ class _Judge:
             rows=workshop.index,
             start=fitted.theory.start,
         )
+
+
+def _ordinary(finding: Finding) -> bool:
+    """Whether any axis has as much of it."""
+    return finding.peak_arcsec < ORDINARY_ARCSEC.get(finding.cause, 0.0)
 
 
 def _low(effect: Effect) -> bool:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from hdbridge.diagnose.driven import kinematics
 from hdbridge.diagnose.noise import noise_arcsec, third_deviation
+from hdbridge.diagnose.unseen import hunting_arcsec
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import quantum_deg, steadied
@@ -66,7 +67,7 @@ class Series:
     """Driving angle, time, speed, acceleration and the channels that were recorded."""
     error_arcsec: FloatArray
     sigma_arcsec: FloatArray
-    """White noise of each point."""
+    """Noise of each point: white, and what a motor may do within a count."""
     usable: BoolArray
     """False in fast moves between the legs of a bench plan, and just after them."""
     zero: IntArray
@@ -137,10 +138,11 @@ def gather(
     if turns < 2:
         remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
     known = expected(motion) if expected is not None else 0.0
+    unseen = 0.0 if expected is None else hunting_arcsec(motion, facts.motor_count_deg, expected)
     sigma = noise_arcsec(
         full.error_arcsec - known, still, facts.motor_count, facts.load_count, facts.commanded
     )
-    full = replace(full, sigma_arcsec=sigma)
+    full = replace(full, sigma_arcsec=np.hypot(sigma, unseen))
     return Evidence(
         ratio=ratio,
         points=_averaged(full, -(-count // MOST_POINTS)),
@@ -160,6 +162,7 @@ def gather(
 @dataclass(frozen=True, slots=True)
 class _Facts:
     commanded: bool
+    motor_count_deg: float
     motor_count: float
     load_count: float
     period_s: float
@@ -219,6 +222,7 @@ def _series(
     )
     facts = _Facts(
         target is not None,
+        count,
         count / ratio * ARCSEC_PER_DEG,
         quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
         period,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import AmplitudeDrift, FloatArray, RateDependence, Synchronous, TorqueModulation
+from hdbridge.effects import AmplitudeDrift, FloatArray, RateDependence, Synchronous
 from hdbridge.effects.base import Effect
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
@@ -71,9 +71,6 @@ class _Told:
                 "friction_percent_per_k": effect.friction_percent_per_k * self.per_loop,
             }
             return effect.model_copy(update=growth | {"reference_c": self.reference_c})
-        if isinstance(effect, TorqueModulation):
-            growth = {"growth_percent_per_nm": effect.growth_percent_per_nm * self.per_ripple}
-            return effect.model_copy(update=growth)
         if isinstance(effect, RateDependence):
             return effect.model_copy(update={"growth_percent": effect.growth_percent * self.per_loop})
         return effect

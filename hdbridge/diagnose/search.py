@@ -73,9 +73,9 @@ REPEATED = frozenset(
 """Causes of which there may be more than one."""
 FLOOR_ARCSEC = 0.5
 """Findings whose peak is smaller than this are of no use to anybody, however certain."""
-FLOORS_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
-"""Every axis winds up a little in its fastest moves, and no two encoders are read at the same instant; it is
-a finding when it is more than that."""
+ORDINARY_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
+"""Every axis winds up a little in its fastest moves, and no two encoders are read at the same instant: it is
+allowed for, and a finding when it is more than that."""
 LATE_MS2, LATE_SHARE = 30.0, 4.0
 """A late sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz and
 more) it is at most so many ms^2 and so many times the delay squared."""
@@ -253,7 +253,7 @@ class Search:
             largest = max(each.amplitude_arcsec for each in effect.orders)
         if isinstance(effect, Creep):
             largest = max(abs(each.amplitude_arcsec) for each in effect.parts)
-        if peak < FLOORS_ARCSEC.get(effect.name, FLOOR_ARCSEC) or largest > EXTRAPOLATED * peak:
+        if peak < FLOOR_ARCSEC or largest > EXTRAPOLATED * peak:
             return False
         # What is over at once, or seen only where the axis turns round, is another cause's, which would not
         # be found beside it.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdbridge.diagnose.search import FLOORS_ARCSEC, Search
+from hdbridge.diagnose.search import FLOOR_ARCSEC, Search
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
     Channel,
@@ -35,7 +35,7 @@ def inertial(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
         if speed < INERTIA_SHARE * acceleration:
             plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
             trial = workshop.fit(fitted.theory.instead(place, plain))
-            small = search.peak(trial, place) < FLOORS_ARCSEC["inertial_windup"]
+            small = search.peak(trial, place) < FLOOR_ARCSEC
             if small or trial.theory.effects[place].violations():
                 return workshop.fit(fitted.theory.without(place))
             return trial

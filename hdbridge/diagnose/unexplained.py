@@ -35,6 +35,10 @@ particular."""
 BLOCK_S = 0.2
 SHADOW = 2.0
 """A name stands beside something unexplained when it takes away so many times its variance."""
+EPISODES = 30
+"""Stretches that a record is cut into, to see whether what is left is left everywhere."""
+ACTS = 0.1
+"""Share of its peak from which on an effect acts."""
 SERIAL = REPEATED - {"creep"}
 SAME_FAMILY = 3
 """So many picks of one family, nearly equal, are one unknown and not many causes."""
@@ -139,13 +143,35 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
     return [each for each in findings if each not in doubtful], words
 
 
-def beyond_noise(workshop: Workshop, residual: FloatArray) -> float:
+def elsewhere(workshop: Workshop, residual: FloatArray) -> NDArray[np.bool_]:
+    """The points outside the tenth of the record's stretches in which most is left, shape (m,).
+
+    What is left in one episode, say in nested reversals of a motor that chatters where it turns, casts no
+    shadow on what is seen everywhere else.
+    """
+    number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
+    left = np.bincount(number, residual**2 * workshop.weight**2)
+    return np.asarray(~np.isin(number, np.argsort(left)[-EPISODES // 10 :]))
+
+
+def acts(workshop: Workshop, fitted: Fitted, place: int) -> NDArray[np.bool_]:
+    """The points at which an effect is a good part of what it can be, shape (m,)."""
+    effect = fitted.theory.effects[place]
+    values = workshop.columns(effect, fitted.theory.start) @ effect.coefficients()
+    values = np.abs(values - np.median(values))
+    return np.asarray(values > ACTS * float(np.quantile(values, 0.998)))
+
+
+def beyond_noise(
+    workshop: Workshop, residual: FloatArray, rows: NDArray[np.bool_] | slice = slice(None)
+) -> float:
     """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
-    number = np.floor((workshop.time_s - workshop.time_s[0]) / BLOCK_S).astype(np.intp)
+    time_s, residual, weight = workshop.time_s[rows], residual[rows], workshop.weight[rows]
+    number = np.floor((time_s - time_s[0]) / BLOCK_S).astype(np.intp)
     number = np.unique(number, return_inverse=True)[1]
     count = np.bincount(number)
     mean = np.bincount(number, residual) / count
-    white = np.bincount(number, 1.0 / workshop.weight**2) / count**2
+    white = np.bincount(number, 1.0 / weight**2) / count**2
     return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
 
 

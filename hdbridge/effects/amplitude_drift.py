@@ -11,6 +11,7 @@ from pydantic import Field
 
 from hdbridge.effects.base import (
     Cause,
+    Channel,
     Compensable,
     Effect,
     FloatArray,
@@ -20,19 +21,23 @@ from hdbridge.effects.base import (
     Start,
     Tracker,
 )
-from hdbridge.effects.carried import Loop, loop_of, orders_of
+from hdbridge.effects.carried import Loop, growth_of, loop_of, orders_of
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+from hdbridge.effects.torque import TorqueGrowth
 from hdbridge.effects.warmth import Warmed, WarmthState
 
 
 class AmplitudeDrift(Linear, Warmed):
-    """w (ripple S(theta_M) + friction H): ripple and loop of the model follow the gear's warmth w."""
+    """w (ripple S(theta_M) + friction H): ripple and loop of the model follow the gear's warmth w.
+
+    A ripple that grows with torque too does so warm and cold alike: what torque adds is warmed as well.
+    """
 
     name: ClassVar[str] = "amplitude_drift"
     about: ClassVar[Cause] = Cause(
         title="ripple and friction change with temperature",
-        equation="w (ripple S + friction H), S the model's orders, H its loop, w the gear's warmth as in "
-        "zero_drift",
+        equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
+        "torque), H its loop, w the gear's warmth as in zero_drift",
         signature="the ripple within a motor turn, or the height of the loop, follows the temperature",
         consequence="a compensation measured warm is wrong in the cold morning",
         remedy="warm up before work; calibrate at working temperature; compensate it with a temperature "
@@ -55,6 +60,9 @@ class AmplitudeDrift(Linear, Warmed):
 
     orders: Orders
     loop: Annotated[Loop, Field(description="the model's loop")]
+    under_load: Annotated[
+        TorqueGrowth | None, Field(description="growth of the model's orders with torque (torque_modulation)")
+    ] = None
     ripple_percent_per_k: Annotated[
         float, Field(ge=-10, le=10, description="growth of the orders per kelvin")
     ]
@@ -62,9 +70,16 @@ class AmplitudeDrift(Linear, Warmed):
         float, Field(ge=-10, le=10, description="growth of the loop per kelvin")
     ]
 
+    def needs(self) -> frozenset[Channel]:
+        """Those of the warmth, and the torque where the orders grow with it."""
+        load = self.under_load
+        return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
+
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One per cent per kelvin of ripple and of loop, shape (n, 2)."""
         ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
+        if self.under_load is not None:
+            ripple = ripple * self.under_load.factor(motion, self.name)
         parts = np.column_stack([ripple, self.loop.law().predict(motion, start)])
         columns: FloatArray = 0.01 * self.warmth(motion)[:, np.newaxis] * parts
         return columns
@@ -76,6 +91,7 @@ class AmplitudeDrift(Linear, Warmed):
     def bound_arcsec(self) -> float:
         """At the highest warmth."""
         ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
+        ripple *= self._most()
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k) * self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -88,31 +104,39 @@ class AmplitudeDrift(Linear, Warmed):
     def ripple_fall(self) -> float:
         """The ripple's steepest fall alone, arcsec per motor degree."""
         slope = sum(each.order * each.amplitude_arcsec for each in self.orders)
-        return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope
+        return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
 
     def loop_share(self) -> float:
         """The largest share of the loop that it may take away."""
         return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
 
+    def _most(self) -> float:
+        return 1.0 if self.under_load is None else 1.0 + self.under_load.most()
+
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"orders": orders_of(base), "loop": loop_of(base)}
+        return {"orders": orders_of(base), "loop": loop_of(base), "under_load": growth_of(base)}
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_friction", "_loop", "_orders", "_ripple", "_warmth")
+    __slots__ = ("_friction", "_load", "_loop", "_orders", "_ripple", "_warmth")
 
     def __init__(self, effect: AmplitudeDrift, start: Start) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
+        self._load = effect.under_load
         self._loop = effect.loop.law().tracker(start)
         self._ripple = 0.01 * effect.ripple_percent_per_k
         self._friction = 0.01 * effect.friction_percent_per_k
         self._warmth = WarmthState(effect)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        ripple = self._ripple * self._orders.peek(motor_deg, moment)
-        return self._warmth.at(moment) * (ripple + self._friction * self._loop.peek(motor_deg, moment))
+        friction = self._friction * self._loop.peek(motor_deg, moment)
+        return self._warmth.at(moment) * (self._ripple_at(motor_deg, moment) + friction)
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
+        friction = self._friction * self._loop.advance(motor_deg, moment)
+        return self._warmth.to(moment) * (self._ripple_at(motor_deg, moment) + friction)
+
+    def _ripple_at(self, motor_deg: float, moment: Moment) -> float:
         ripple = self._ripple * self._orders.peek(motor_deg, moment)
-        return self._warmth.to(moment) * (ripple + self._friction * self._loop.advance(motor_deg, moment))
+        return ripple if self._load is None else ripple * self._load.factor_at(moment)

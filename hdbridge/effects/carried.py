@@ -1,4 +1,5 @@
-"""What an effect carries of the model that it modulates: orders of the synchronous part, or the loop.
+"""What an effect carries of the model that it modulates: orders of the synchronous part, their growth, the
+loop.
 
 An effect such as `torque_modulation` says "the synchronous part grows with torque". So that it can be
 predicted, tracked and read on its own, it carries a copy of the part that it modulates, taken from the model
@@ -17,6 +18,7 @@ from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.effects.synchronous import TYPICAL_ORDERS, Synchronous
+from hdbridge.effects.torque import TorqueGrowth
 
 
 class Loop(BaseModel):
@@ -53,3 +55,11 @@ def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
         if isinstance(each, Synchronous) and each.orders:
             return each.orders
     return TYPICAL_ORDERS
+
+
+def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
+    """The growth of a model's orders with torque; None where they do not grow."""
+    for each in base:
+        if isinstance(each, TorqueGrowth):
+            return TorqueGrowth(**{name: getattr(each, name) for name in TorqueGrowth.model_fields})
+    return None

@@ -7,13 +7,14 @@ from collections.abc import Iterable
 
 from hdbridge.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.effects.base import Effect
-from hdbridge.effects.carried import Loop, loop_of
+from hdbridge.effects.carried import Loop, growth_of, loop_of
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.hysteresis_parameters import HysteresisParameters
 from hdbridge.effects.motor_order import MotorOrders
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.effects.synchronous import Synchronous
+from hdbridge.effects.torque import TorqueGrowth
 
 _LAWS = (Hysteresis, HysteresisMemory)
 
@@ -52,11 +53,16 @@ def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
         # Of an order that stands twice, the synchronous part's: a fit tells no shares of it.
         by_number = {order.order: order for each in reversed(series) for order in each.orders}
         orders = tuple(by_number[number] for number in sorted(by_number))
-    return tuple(_refreshed(each, loop, orders) for each in given)
+    growth = growth_of(given)
+    return tuple(_refreshed(each, loop, orders, growth) for each in given)
 
 
-def _refreshed(effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None) -> Effect:
+def _refreshed(
+    effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None, growth: TorqueGrowth | None
+) -> Effect:
     update: dict[str, object] = {}
+    if isinstance(effect, AmplitudeDrift):
+        update["under_load"] = growth
     if loop is not None and "loop" in type(effect).model_fields:
         update["loop"] = loop
     if orders and effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"}:

@@ -21,7 +21,7 @@ from hdbridge.effects.base import (
     Start,
     Tracker,
 )
-from hdbridge.effects.torque_modulation import TorqueChannel, TorqueLimit
+from hdbridge.effects.torque import TorqueChannel, TorqueLimit
 
 ARCSEC_PER_RAD = 648_000.0 / np.pi
 """A stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from hdbridge.effects.base import (
     Cause,
@@ -23,20 +22,10 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.carried import orders_of
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
-
-TorqueChannel = Annotated[
-    Literal["load_torque_nm", "motor_torque_nm"],
-    Field(description="the channel that the torque is taken from"),
-]
-TorqueLimit = Annotated[
-    float,
-    Field(
-        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
-    ),
-]
+from hdbridge.effects.torque import TorqueGrowth
 
 
-class TorqueModulation(Linear):
+class TorqueModulation(TorqueGrowth, Linear):
     """growth |T| S(theta_M): all carried orders grow alike; carry fewer to let fewer grow."""
 
     name: ClassVar[str] = "torque_modulation"
@@ -61,12 +50,6 @@ class TorqueModulation(Linear):
     """One per cent per Nm of all orders."""
 
     orders: Orders
-    growth_percent_per_nm: Annotated[
-        float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")
-    ]
-    signed: Annotated[bool, Field(description="grows with the torque rather than with its magnitude")] = False
-    torque: TorqueChannel = "load_torque_nm"
-    limit_nm: TorqueLimit = 100.0
 
     def needs(self) -> frozenset[Channel]:
         """The torque channel."""
@@ -74,9 +57,8 @@ class TorqueModulation(Linear):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A growth of one per cent per Nm, shape (n, 1)."""
-        torque = np.clip(motion.channel(Channel(self.torque), self.name), -self.limit_nm, self.limit_nm)
         ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
-        column: FloatArray = 0.01 * (torque if self.signed else np.abs(torque)) * ripple
+        column: FloatArray = 0.01 * self.load_nm(motion, self.name) * ripple
         return column[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -85,32 +67,24 @@ class TorqueModulation(Linear):
 
     def bound_arcsec(self) -> float:
         """The ripple's growth at the highest torque."""
-        return self._most() * sum(each.amplitude_arcsec for each in self.orders)
+        return self.most() * sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
         """The slope of the ripple's growth at the highest torque."""
-        return self._most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)
+        return self.most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
         return {"orders": orders_of(base)}
 
-    def _most(self) -> float:
-        return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm
-
 
 class _Tracker(Memoryless):
-    __slots__ = ("_gain", "_limit", "_orders", "_signed", "_torque")
+    __slots__ = ("_gain", "_load_nm", "_orders")
 
     def __init__(self, effect: TorqueModulation) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._gain = 0.01 * effect.growth_percent_per_nm
-        self._limit = effect.limit_nm
-        self._signed = effect.signed
-        self._torque = effect.torque
+        self._load_nm = effect.load_at_nm
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        torque: float = getattr(moment, self._torque)
-        torque = min(max(torque, -self._limit), self._limit)
-        growth = self._gain * (torque if self._signed else abs(torque))
-        return growth * self._orders.peek(motor_deg, moment)
+        return self._gain * self._load_nm(moment) * self._orders.peek(motor_deg, moment)

@@ -1,0 +1,57 @@
+"""What grows with torque: the channel, its limit, and a growth of the ripple."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.effects.base import Channel, FloatArray, Moment, Motion
+
+TorqueChannel = Annotated[
+    Literal["load_torque_nm", "motor_torque_nm"],
+    Field(description="the channel that the torque is taken from"),
+]
+TorqueLimit = Annotated[
+    float,
+    Field(
+        gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
+    ),
+]
+
+
+class TorqueGrowth(BaseModel):
+    """A growth of amplitudes with torque, of which `torque_modulation` has the fields too."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    growth_percent_per_nm: Annotated[
+        float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")
+    ]
+    signed: Annotated[bool, Field(description="grows with the torque rather than with its magnitude")] = False
+    torque: TorqueChannel = "load_torque_nm"
+    limit_nm: TorqueLimit = 100.0
+
+    def load_nm(self, motion: Motion, effect: str) -> FloatArray:
+        """The torque that counts, shape (n,); InputError, naming the effect, where it was not measured."""
+        torque = np.clip(motion.channel(Channel(self.torque), effect), -self.limit_nm, self.limit_nm)
+        return np.asarray(torque if self.signed else np.abs(torque))
+
+    def load_at_nm(self, moment: Moment) -> float:
+        """The torque that counts at one moment."""
+        torque: float = getattr(moment, self.torque)
+        torque = min(max(torque, -self.limit_nm), self.limit_nm)
+        return torque if self.signed else abs(torque)
+
+    def factor(self, motion: Motion, effect: str) -> FloatArray:
+        """What the amplitudes are multiplied by, shape (n,)."""
+        return np.asarray(1.0 + 0.01 * self.growth_percent_per_nm * self.load_nm(motion, effect))
+
+    def factor_at(self, moment: Moment) -> float:
+        """The same at one moment."""
+        return 1.0 + 0.01 * self.growth_percent_per_nm * self.load_at_nm(moment)
+
+    def most(self) -> float:
+        """The largest growth, as a share."""
+        return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm
