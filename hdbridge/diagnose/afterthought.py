@@ -50,6 +50,9 @@ KIN = (
 )
 """Causes that are nearer to each other than that."""
 KIN_SHARE = 0.15
+EXACTLY = 1.1
+"""Chi square per point that is more than noise. Where kin together leave noise and without the smaller one
+there is more, both are there."""
 SIDELINE_SHARE = 0.03
 """A vibration of less than this share of another one's evidence is that one: no source keeps its frequency
 and amplitude exactly, and the gear's loop answers it with other frequencies."""
@@ -130,10 +133,13 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         gain, without = gains[place]
         kinds = {each: _kind(search, fitted, each) for each in gains}
         small = search.peak(fitted, place) < FLOOR_ARCSEC
+        count = len(fitted.residual)
         share = max(
             (kinship(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
             default=0.0,
         )
+        if fitted.chi_square < count and without.chi_square > EXACTLY * count:
+            share = 0.0  # what a form gets wrong is not made up for down to the noise
         if gain > max(_toll(fitted, place), LEFTOVER * largest, share) and not small:
             break
         fitted = without

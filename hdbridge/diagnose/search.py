@@ -128,7 +128,7 @@ class Search:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
-            if found is None or found.chi_square > AGAIN * len(found.residual):
+            if (found or fitted).chi_square > AGAIN * len(fitted.residual):
                 pair = self._best_pair(fitted)
                 if pair is not None and (found is None or cost(pair) < PAIR_SHARE * cost(found)):
                     found = pair

@@ -37,6 +37,7 @@ from hdbridge.effects.rate_dependence import RateDependence
 from hdbridge.effects.ratio_error import RatioError
 from hdbridge.effects.subdivisional_error import SubdivisionalError
 from hdbridge.effects.synchronous import Synchronous
+from hdbridge.effects.torque import TorqueGrowth
 from hdbridge.effects.torque_modulation import TorqueModulation
 from hdbridge.effects.velocity_windup import VelocityWindup
 from hdbridge.effects.vibration import Vibration
@@ -122,6 +123,7 @@ __all__ = [
     "Step",
     "SubdivisionalError",
     "Synchronous",
+    "TorqueGrowth",
     "TorqueModulation",
     "Tracker",
     "VelocityWindup",

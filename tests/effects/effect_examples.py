@@ -30,6 +30,7 @@ from hdbridge.effects import (
     Step,
     SubdivisionalError,
     Synchronous,
+    TorqueGrowth,
     TorqueModulation,
     VelocityWindup,
     Vibration,
@@ -73,6 +74,7 @@ torque = {
     "torque": st.sampled_from(["load_torque_nm", "motor_torque_nm"]),
     "limit_nm": st.floats(1, 100),
 }
+growths = st.builds(TorqueGrowth, growth_percent_per_nm=st.floats(-5, 5), signed=st.booleans(), **torque)
 EXAMPLES = {
     "synchronous": st.builds(Synchronous, orders=low_orders),
     "hysteresis": st.builds(Hysteresis, **loop),
@@ -117,6 +119,7 @@ EXAMPLES = {
         loop=loops,
         ripple_percent_per_k=st.floats(-1, 1),
         friction_percent_per_k=st.one_of(st.just(0.0), st.floats(-1, 1)),
+        under_load=st.none() | growths,
         **warmth,
     ),
     "wear": st.builds(

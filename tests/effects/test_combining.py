@@ -24,6 +24,7 @@ from hdbridge.effects import (
     RateDependence,
     Start,
     Synchronous,
+    TorqueModulation,
     compensable,
     conflicts,
     extended,
@@ -45,6 +46,19 @@ def test_the_law_with_memory_takes_the_place_of_the_plain_one_and_back():
     effects = extended(BASE, memory)
     assert names(effects) == ["synchronous", "hysteresis_memory"]
     assert names(extended(effects, BASE[1])) == ["synchronous", "hysteresis"]
+
+
+def test_a_ripple_that_is_loaded_and_warm_has_changed_by_both():
+    growth = TorqueModulation.candidate(RATIO, BASE).fitted(np.array([4.0]))
+    drift = AmplitudeDrift.candidate(RATIO, BASE).fitted(np.array([-2.0, 0.0]))
+    synchronous, _, growth, drift = refreshed([*BASE, growth, drift])
+    time_s = np.linspace(0.0, 100.0, 500)
+    torque, temperature = np.linspace(-9.0, 9.0, 500), np.full(500, 26.0)
+    motion = Motion(7.0 * time_s, time_s=time_s, load_torque_nm=torque, temperature_c=temperature)
+    total = sum(each.predict(motion) for each in (synchronous, growth, drift))
+    expected = synchronous.predict(motion) * (1.0 + 0.04 * np.abs(torque)) * (1.0 - 0.02 * 6.0)
+    np.testing.assert_allclose(total, expected, atol=1e-9)
+    assert refreshed([*BASE, drift])[2].under_load is None
 
 
 @pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
