@@ -32,6 +32,8 @@ LEAST_BLOCKS = 30
 """A short record is cut into so many, whatever their length."""
 ROBUST = 25.0
 """Block-robust chi square that a finding needs, and 6 more for each further parameter."""
+STEP_SHARE = 0.03
+"""A step of less than this share of another one's evidence is what something slow has left."""
 SHARE_LEFT = 1e-5
 TURN_DEG = 60.0
 """Motor angle after a reversal within which an elastic loop is felt."""
@@ -61,17 +63,21 @@ def robust_chi_square(
     place: int,
     beside: FloatArray | None = None,
     rows: NDArray[np.bool_] | None = None,
+    only: int | None = None,
 ) -> float:
     """Of one effect of a theory: its coefficients against zero, by the sums of their scores over blocks of
     time.
 
     Everything else is projected out, and the columns ``beside`` (weighted) too; only ``rows`` count, where
-    given.
+    given, and of the coefficients the one with the number ``only``.
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
+    coefficients = fitted.theory.effects[place].coefficients()
+    if only is not None:
+        own, coefficients = [own[only]], coefficients[[only]]
     others = np.setdiff1d(np.arange(fitted.count()), own)
     tangent, residual, time = fitted.tangent, fitted.residual, workshop.time_s
-    target = residual + tangent[:, own] @ fitted.theory.effects[place].coefficients()
+    target = residual + tangent[:, own] @ coefficients
     rest = tangent[:, others] if beside is None else np.hstack([tangent[:, others], beside])
     columns = tangent[:, own]
     if rows is not None:
@@ -131,6 +137,13 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
     if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
         return Gate(robust, needed, passed=False, reason="too small to tell from the loop's shape")
     return Gate(robust, needed, passed=True)
+
+
+def all_steps_seen(workshop: Workshop, fitted: Fitted, place: int) -> bool:
+    """Whether each step of a `count_loss` is seen, and none is what another cause leaves beside it."""
+    steps = range(len(fitted.theory.effects[place].coefficients()))
+    robust = [robust_chi_square(workshop, fitted, place, only=each) for each in steps]
+    return min(robust) > max(ROBUST, STEP_SHARE * max(robust))
 
 
 def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
-from hdbridge.diagnose.gates import gate, standing_s
+from hdbridge.diagnose.gates import all_steps_seen, gate, standing_s
 from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import Fitted, Theory, Workshop
 from hdbridge.effects import (
@@ -43,7 +43,7 @@ FEW = 3
 AGAIN = 1.5
 """Chi square per point beyond which a search is made again."""
 PAIR_SHARE = 0.9
-"""Two causes at once in place of one have to leave less than this share of what it leaves."""
+"""Two causes at once in place of one, or none, have to leave less than this share of what it leaves."""
 WITH_SPEED = frozenset({"velocity_windup", "channel_skew", "rate_dependence"})
 FREE_LOOP_ARCSEC = 0.2
 """Root mean square that a free-form loop has to take away to stand beside the law."""
@@ -128,9 +128,10 @@ class Search:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
-            if (found or fitted).chi_square > AGAIN * len(fitted.residual):
+            rival = found or fitted
+            if rival.chi_square > AGAIN * len(rival.residual):
                 pair = self._best_pair(fitted)
-                if pair is not None and (found is None or cost(pair) < PAIR_SHARE * cost(found)):
+                if pair is not None and cost(pair) < PAIR_SHARE * cost(rival):
                     found = pair
             if number < 3 and not self.workshop.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
@@ -257,6 +258,8 @@ class Search:
             return False
         # What is over at once, or seen only where the axis turns round, is another cause's, which would not
         # be found beside it.
+        if isinstance(effect, CountLoss) and not all_steps_seen(self.workshop, trial, place):
+            return False
         return not isinstance(effect, Creep | CountLoss) or gate(self.workshop, trial, place).passed
 
     def _makes_sense(self, effect: Effect) -> bool:
