@@ -55,6 +55,46 @@ def test_a_drift_of_ripple_stands_beside_a_much_larger_skew(diagnosed: Diagnosed
     assert set(names(diagnosed(effects, temperature_rise_k=14.0))) == {"channel_skew", "amplitude_drift"}
 
 
+def test_a_ripple_that_is_loaded_and_warm_has_grown_by_both(diagnosed: Diagnosed) -> None:
+    """By the product of both; a sum would put a quarter of the one down to the other."""
+    effects = {"torque_modulation": {"growth": 0.06}, "amplitude_drift": {"ripple": -0.04}}
+    result = diagnosed(effects, torque_nm=9.0, temperature_rise_k=10.0)
+    found = {each.cause: each.parameters for each in result.findings}
+    assert set(found) == set(effects)
+    growth = found["torque_modulation"]["growth_percent_per_nm"]
+    assert growth.value == pytest.approx(6.0, rel=0.02)
+    drift = found["amplitude_drift"]["ripple_percent_per_k"]
+    assert drift.value == pytest.approx(-4.0, rel=0.12)  # the gear follows the sensor with a lag
+
+
+def test_what_is_left_in_one_episode_casts_no_shadow_on_what_is_seen_everywhere(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    record = columns({"torque_modulation": {"growth": 0.03}}, torque_nm=9.0)
+    time_s = record["time_s"]
+    share = time_s / time_s[-1]
+    jolts = 10.0 * np.sign(np.sin(2 * np.pi * time_s / 7.3) + 0.3 * np.sin(2 * np.pi * time_s / 2.9))
+    record["load_position_deg"] = (
+        record["load_position_deg"] + jolts * ((share > 0.5) & (share < 0.56)) / 3600.0
+    )
+    assert names(diagnose(Record(record), model)) == ["unexplained", "torque_modulation"]
+
+
+def test_a_wind_up_that_every_axis_has_is_allowed_for_and_not_named(diagnosed: Diagnosed) -> None:
+    result = diagnosed({"inertial_windup": {"s2": 6e-6}})
+    assert names(result) == []
+    assert "inertial_windup: no more than usual" in result.considered
+    assert "inertial_windup" not in {each.name for each in result.model.effects}
+
+
+def test_small_steps_beside_a_large_one_are_what_something_slow_has_left(diagnosed: Diagnosed) -> None:
+    effects = {"count_loss": {"size": 6.0, "at": 0.4}, "creep": {"size": 4.0, "tau": 3.0}}
+    result = diagnosed(effects)
+    assert set(names(result)) == set(effects)
+    (loss,) = [each for each in result.findings if each.cause == "count_loss"]
+    assert sum(name.endswith("size_arcsec") for name in loss.parameters) == 1
+
+
 def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:

@@ -166,6 +166,7 @@ PAIRS = dict(
         pair("motor_order", "channel_skew", SPEEDS),
         pair("load_order", "vibration", TURN),
         pair("flexspline_order", "hysteresis_parameters", TURN),
+        pair("torque_modulation", "amplitude_drift", (*TORQUES, *AGAIN)),
     )
 )
 UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",))}
