@@ -117,15 +117,14 @@ class _Judge:
         fitted = as_calibrated(workshop, fitted, self.model.effects)
         judged = self._likely_only(fitted)
         fitted, left, spread = judged.fitted, judged.left, judged.spread
-        findings = [each for each in judged.findings if not _ordinary(each)]
-        considered += judged.considered
-        considered += [f"{each.cause}: no more than usual" for each in judged.findings if _ordinary(each)]
+        usual = {each.cause for each in judged.findings if _ordinary(each)}
+        findings = [each for each in judged.findings if each.cause not in usual]
+        considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
         findings = self._with_unexplained(findings, left)
-        usual = {id(each.effect) for each in judged.findings if _ordinary(each)}
         chosen = tuple(
             place
             for place in range(base, len(fitted.theory.effects))
-            if id(fitted.theory.effects[place]) not in usual
+            if fitted.theory.effects[place].name not in usual
         )
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
