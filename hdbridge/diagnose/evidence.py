@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hdbridge.diagnose.driven import kinematics
 from hdbridge.diagnose.noise import noise_arcsec, third_deviation
-from hdbridge.diagnose.unseen import hunting_arcsec
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import quantum_deg, steadied
@@ -67,7 +66,7 @@ class Series:
     """Driving angle, time, speed, acceleration and the channels that were recorded."""
     error_arcsec: FloatArray
     sigma_arcsec: FloatArray
-    """Noise of each point: white, and what a motor may do within a count."""
+    """White noise of each point."""
     usable: BoolArray
     """False in fast moves between the legs of a bench plan, and just after them."""
     zero: IntArray
@@ -138,11 +137,10 @@ def gather(
     if turns < 2:
         remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
     known = expected(motion) if expected is not None else 0.0
-    unseen = 0.0 if expected is None else hunting_arcsec(motion, facts.motor_count_deg, expected)
     sigma = noise_arcsec(
         full.error_arcsec - known, still, facts.motor_count, facts.load_count, facts.commanded
     )
-    full = replace(full, sigma_arcsec=np.hypot(sigma, unseen))
+    full = replace(full, sigma_arcsec=sigma)
     return Evidence(
         ratio=ratio,
         points=_averaged(full, -(-count // MOST_POINTS)),
@@ -162,7 +160,6 @@ def gather(
 @dataclass(frozen=True, slots=True)
 class _Facts:
     commanded: bool
-    motor_count_deg: float
     motor_count: float
     load_count: float
     period_s: float
@@ -222,7 +219,6 @@ def _series(
     )
     facts = _Facts(
         target is not None,
-        count,
         count / ratio * ARCSEC_PER_DEG,
         quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
         period,

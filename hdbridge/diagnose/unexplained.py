@@ -146,7 +146,7 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
 def elsewhere(workshop: Workshop, residual: FloatArray) -> NDArray[np.bool_]:
     """The points outside the tenth of the record's stretches in which most is left, shape (m,).
 
-    What is left in one episode, say in nested reversals of a motor that chatters where it turns, casts no
+    What is left in one episode, say in small swings of a motor that sticks where it turns, casts no
     shadow on what is seen everywhere else.
     """
     number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
