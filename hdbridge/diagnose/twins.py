@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdbridge.diagnose.noise import third_deviation
 from hdbridge.diagnose.search import FLOOR_ARCSEC, Search
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
@@ -23,6 +24,9 @@ STRAIGHT = 20.0
 """A drag whose shear speed is so many times the fastest there was has been seen as a straight line."""
 TWIN = 1e-3
 """A spring is a first load order's better where it misses less than this share of its evidence."""
+
+NOISY = 1.5
+"""... and so many times what the noise of its torque channel costs it."""
 
 
 def inertial(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
@@ -95,8 +99,16 @@ def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
             trial, neither = workshop.fit(without.plus(linear)), without
         own = workshop.fit(neither).chi_square - fitted.chi_square
         worse = trial.chi_square - fitted.chi_square
-        if worse < TWIN * own and not any(
-            each.violations() for each in trial.theory.effects if isinstance(each, Compliance)
-        ):
+        springs = [each for each in trial.theory.effects if isinstance(each, Compliance)]
+        if any(each.violations() for each in springs):
+            continue
+        if worse < TWIN * own + NOISY * sum(_lost_to_noise(workshop, each) for each in springs):
             return trial
     return fitted
+
+
+def _lost_to_noise(workshop: Workshop, spring: Compliance) -> float:
+    """Chi square that a spring leaves because its torque was measured with noise."""
+    torque = workshop.motion.channel(Channel(spring.torque), spring.name)
+    noise_nm = third_deviation(np.diff(torque, 3))
+    return float(np.sum((workshop.weight * spring.coefficients()[0] * noise_nm) ** 2))

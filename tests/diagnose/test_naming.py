@@ -106,6 +106,16 @@ def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(
     assert result.findings[0].parameters["c1_arcsec_per_nm"].value == pytest.approx(1.5, rel=0.1)
 
 
+def test_a_spring_under_a_torque_that_is_measured_with_noise_is_no_load_order(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    record = columns({"compliance": {"c1": 3.0, "c2": 3.0, "t1": 4.0}}, torque_nm=2.0)
+    noise = np.random.default_rng(3).normal(size=len(record["time_s"]))
+    record["load_torque_nm"] = record["load_torque_nm"] + 0.1 * noise
+    (found,) = diagnose(Record(record), model).findings
+    assert (found.cause, found.aliases) == ("compliance", ("load_order",))
+
+
 def test_flanks_shift_an_order_that_the_model_lacks_as_well(diagnosed: Diagnosed, plant: ModuleType) -> None:
     orders = (*plant.ORDERS, (9, 4.0, 60.0))
     found = diagnosed({"direction_phase": {"shift": 6.0}}, orders=orders)
