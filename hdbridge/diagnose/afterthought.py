@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from hdbridge.diagnose.candidates import candidates
 from hdbridge.diagnose.search import (
     ENTER,
     FEW,
@@ -22,7 +23,7 @@ from hdbridge.diagnose.search import (
     cost,
 )
 from hdbridge.diagnose.theory import Fitted
-from hdbridge.effects import AmplitudeDrift
+from hdbridge.effects import AmplitudeDrift, Wear
 
 TWO_WAYS = frozenset(
     {
@@ -67,7 +68,7 @@ def reconsidered(search: Search, trail: Trail) -> Trail:
     fitted = trail.fitted
     if len(fitted.theory.effects) - search.base <= FEW:
         fitted = _swapped(search, fitted)
-    fitted = _pruned(search, fitted)
+    fitted = _pruned(search, _from_elsewhere(search, fitted))
     fitted = _merged(search, fitted)
     fitted, _ = search.with_best_law(fitted)
     fitted = _pruned(search, fitted)
@@ -98,6 +99,19 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
         if not changed:
             break
     search.forget()
+    return fitted
+
+
+def _from_elsewhere(search: Search, fitted: Fitted) -> Fitted:
+    """With wear fitted anew from each width that is offered: from a wide one it ends as part of the loop."""
+    for place, effect in enumerate(fitted.theory.effects[search.base :], search.base):
+        if isinstance(effect, Wear):
+            trials = [
+                search.workshop.fit(fitted.theory.instead(place, each.effect))
+                for each in candidates(search.workshop.evidence, fitted.theory.effects[: search.base])
+                if isinstance(each.effect, Wear)
+            ]
+            fitted = min((fitted, *trials), key=cost)
     return fitted
 
 
