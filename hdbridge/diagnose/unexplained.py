@@ -147,8 +147,10 @@ def elsewhere(workshop: Workshop, residual: FloatArray) -> NDArray[np.bool_]:
     """The points outside the tenth of the record's stretches in which most is left, shape (m,).
 
     What is left in one episode, say in small swings of a motor that sticks where it turns, casts no
-    shadow on what is seen everywhere else.
+    shadow on what is seen everywhere else. Without reversals an episode is a place, and all points count.
     """
+    if workshop.evidence.reversals < 2:
+        return np.ones(len(residual), dtype=np.bool_)
     number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
     left = np.bincount(number, residual**2 * workshop.weight**2)
     return np.asarray(~np.isin(number, np.argsort(left)[-EPISODES // 10 :]))
