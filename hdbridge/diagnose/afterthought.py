@@ -1,8 +1,8 @@
 """Second thoughts on what a search has picked: swap, merge, prune.
 
 A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. A merge
-does so with two findings that are kin: one cause that explains what they do is more likely than both.
-Pruning takes out what no longer earns its keep beside the others.
+does so with two findings that are kin: one cause that explains what they do is more likely than both. Wear is
+fitted from several widths. Pruning takes out what no longer earns its keep beside the others.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def reconsidered(search: Search, trail: Trail) -> Trail:
     fitted = trail.fitted
     if len(fitted.theory.effects) - search.base <= FEW:
         fitted = _swapped(search, fitted)
-    fitted = _pruned(search, _from_elsewhere(search, fitted))
+    fitted = _pruned(search, _with_wear_anew(search, fitted))
     fitted = _merged(search, fitted)
     fitted, _ = search.with_best_law(fitted)
     fitted = _pruned(search, fitted)
@@ -102,7 +102,7 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _from_elsewhere(search: Search, fitted: Fitted) -> Fitted:
+def _with_wear_anew(search: Search, fitted: Fitted) -> Fitted:
     """With wear fitted anew from each width that is offered: from a wide one it ends as part of the loop."""
     for place, effect in enumerate(fitted.theory.effects[search.base :], search.base):
         if isinstance(effect, Wear):

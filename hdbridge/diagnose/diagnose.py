@@ -232,9 +232,10 @@ class _Judge:
             share = {}
             for place, effect in enumerate(fitted.theory.effects[self.trail.base :], self.trail.base):
                 if effect.name in LINES or effect.name in ORDINARY_ARCSEC:
-                    continue  # what is left has no such line, and casts no shadow there
-                where = acts(self.workshop, fitted, place)
-                rows = where & apart if np.any(where & apart) else where
+                    continue  # what is left has no such line, and casts no shadow there; or any axis has it
+                rows = acts(self.workshop, fitted, place)
+                if np.any(rows & apart):
+                    rows &= apart
                 without = self.workshop.fit(fitted.theory.without(place))
                 lost = without.residual[rows] / self.workshop.weight[rows]
                 does = float(np.mean(lost**2) - np.mean(residual[rows] ** 2))

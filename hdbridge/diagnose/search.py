@@ -256,11 +256,13 @@ class Search:
             largest = max(abs(each.amplitude_arcsec) for each in effect.parts)
         if peak < FLOOR_ARCSEC or largest > EXTRAPOLATED * peak:
             return False
+        if not isinstance(effect, Creep | CountLoss):
+            return True
         # What is over at once, or seen only where the axis turns round, is another cause's, which would not
         # be found beside it.
-        if isinstance(effect, CountLoss) and not all_steps_seen(self.workshop, trial, place):
+        if not gate(self.workshop, trial, place).passed:
             return False
-        return not isinstance(effect, Creep | CountLoss) or gate(self.workshop, trial, place).passed
+        return isinstance(effect, Creep) or all_steps_seen(self.workshop, trial, place)
 
     def _makes_sense(self, effect: Effect) -> bool:
         """Whether an effect is physical, and this record one in which it can be seen."""

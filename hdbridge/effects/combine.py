@@ -61,9 +61,10 @@ def _refreshed(
     effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None, growth: TorqueGrowth | None
 ) -> Effect:
     update: dict[str, object] = {}
-    if isinstance(effect, AmplitudeDrift):
+    fields = type(effect).model_fields
+    if "under_load" in fields:
         update["under_load"] = growth
-    if loop is not None and "loop" in type(effect).model_fields:
+    if loop is not None and "loop" in fields:
         update["loop"] = loop
     if orders and effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"}:
         update["orders"] = orders

@@ -95,24 +95,29 @@ def test_small_steps_beside_a_large_one_are_what_something_slow_has_left(diagnos
     assert sum(name.endswith("size_arcsec") for name in loss.parameters) == 1
 
 
-def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(
-    columns: Callable[..., dict[str, Any]], model: TransmissionModel
-) -> None:
-    record = columns({"compliance": {"c1": 1.5, "c2": 1.0, "t1": 4.0}}, torque_nm=9.0)
-    noise = np.random.default_rng(3).normal(size=len(record["time_s"]))
-    record["load_torque_nm"] = record["load_torque_nm"] + 0.15 * noise
-    result = diagnose(Record(record), model)
+@pytest.fixture
+def sprung(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
+    """A mass on a spring, and a torque that is measured with noise."""
+
+    def run(spring: dict[str, float], torque_nm: float, noise_nm: float) -> Diagnosis:
+        record = columns({"compliance": spring}, torque_nm=torque_nm)
+        noise = np.random.default_rng(3).normal(size=len(record["time_s"]))
+        record["load_torque_nm"] = record["load_torque_nm"] + noise_nm * noise
+        return diagnose(Record(record), model)
+
+    return run
+
+
+def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(sprung: Callable[..., Diagnosis]) -> None:
+    result = sprung({"c1": 1.5, "c2": 1.0, "t1": 4.0}, torque_nm=9.0, noise_nm=0.15)
     assert names(result) == ["compliance"]
     assert result.findings[0].parameters["c1_arcsec_per_nm"].value == pytest.approx(1.5, rel=0.1)
 
 
 def test_a_spring_under_a_torque_that_is_measured_with_noise_is_no_load_order(
-    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+    sprung: Callable[..., Diagnosis],
 ) -> None:
-    record = columns({"compliance": {"c1": 3.0, "c2": 3.0, "t1": 4.0}}, torque_nm=2.0)
-    noise = np.random.default_rng(3).normal(size=len(record["time_s"]))
-    record["load_torque_nm"] = record["load_torque_nm"] + 0.1 * noise
-    (found,) = diagnose(Record(record), model).findings
+    (found,) = sprung({"c1": 3.0, "c2": 3.0, "t1": 4.0}, torque_nm=2.0, noise_nm=0.1).findings
     assert (found.cause, found.aliases) == ("compliance", ("load_order",))
 
 
