@@ -24,7 +24,7 @@ unit: $(READY)   ## the tests on the virtual bus
 
 test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
 	@tools/socketcan.sh $(BIN)/python -m pytest -q -rs tests/socketcan; status=$$?; \
-	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED: no vcan here and no user-mode-linux"; \
+	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED, for the reason above: this machine has no vcan"; \
 	else exit $$status; fi
 
 check: $(READY)  ## format, lint, types, import contracts

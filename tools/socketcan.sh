@@ -9,19 +9,22 @@
 #   2. The kernel has vcan and we may add interfaces: vcan0 is made, and removed afterwards.
 #   3. Otherwise Debian's user-mode-linux (a Linux kernel that runs as a process, with the CAN modules that the
 #      host lacks) boots on this machine's own file system. It has one CPU: good for function and faults, not
-#      for judging timing below 4 ms. Missing Debian packages are installed when we are root.
+#      for judging timing below 4 ms. Missing Debian packages are installed when we are root. Where there is a C
+#      compiler, tools/uml/whole_xstate.c is put under it: without it, it does not boot on processors with AMX.
 #
 #   --timeout SECONDS   end everything after that long (default 600); exit status 124
 #   --uml               use user-mode-linux even where the kernel has vcan
 #   --check             run nothing: exit 0 when one of the ways above is possible, 69 and the reason otherwise
 #
-# Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had; 70 user-mode-linux did not come up.
+# Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had, user-mode-linux that does not boot on
+# this machine included; 70 user-mode-linux booted, and ended without running the command to its end.
 # SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux.
 set -u
 
 readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 readonly unavailable=69 broken=70 timed_out=124
 readonly packages=(user-mode-linux kmod iproute2 can-utils)
+readonly boot_limit_s=120 # it takes 2 s
 limit_s=600 force_uml=no check_only=no
 
 say() { echo "socketcan: $*" >&2; }
@@ -69,6 +72,18 @@ install_uml() {
     uml_is_complete || { say "user-mode-linux is still incomplete after installation"; return 1; }
 }
 
+# Prints the library to load before user-mode-linux; nothing where it cannot be made.
+compile_preload() {
+    if ! command -v cc >/dev/null; then
+        say "no C compiler (cc): user-mode-linux is tried as it is, which fails on processors with AMX"
+    elif cc -O2 -shared -fPIC -o "$work/whole_xstate.so" "$here/uml/whole_xstate.c" -ldl 2>"$work/cc.log"; then
+        echo "$work/whole_xstate.so"
+    else
+        head -n 3 "$work/cc.log" >&2
+        say "cc could not compile tools/uml/whole_xstate.c: user-mode-linux is tried without it"
+    fi
+}
+
 # In its own session, so that one signal to the group ends user-mode-linux and every process in it.
 run_uml() {
     export -p | grep -vE '^declare -[a-zA-Z]*r' >"$work/environment"
@@ -84,8 +99,10 @@ run_uml() {
         while IFS=- read -r from to; do seq "$from" "${to:-$from}"; done)
     [ ${#processors[@]} -eq 0 ] || first=(taskset -c "${processors[$$ % ${#processors[@]}]}")
     chrt --rr 1 true 2>/dev/null && first+=(chrt --rr 1)
-    setsid "${first[@]}" linux.uml "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw \
-        "init=$work/init.sh" "SOCKETCAN_WORK=$work" "uml_dir=$work/" umid=uml \
+    local preload
+    preload=$(compile_preload)
+    setsid "${first[@]}" env ${preload:+"LD_PRELOAD=$preload"} linux.uml \
+        "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw "init=$work/init.sh" "SOCKETCAN_WORK=$work" "uml_dir=$work/" umid=uml \
         con=null con0=null,fd:1 ssl=null quiet \
         >"$work/boot.log" 2>&1 </dev/null &
     uml=$!
@@ -93,8 +110,12 @@ run_uml() {
     local followers=$!
     tail -q -n +1 -f -s 0.1 --pid=$uml "$work/stderr" >&2 &
     followers+=" $!"
-    local deadline=$((SECONDS + limit_s)) status=$broken
+    local deadline=$((SECONDS + limit_s)) boot_deadline=$((SECONDS + boot_limit_s)) status=$broken
     while kill -0 $uml 2>/dev/null; do
+        if [ ! -e "$work/ready" ] && [ $SECONDS -ge $boot_deadline ]; then
+            say "user-mode-linux was not ready after $boot_limit_s s"
+            break
+        fi
         if [ $SECONDS -ge $deadline ]; then
             say "not finished after $limit_s s: ended"
             end_uml
@@ -107,7 +128,11 @@ run_uml() {
     end_uml
     # shellcheck disable=SC2086
     wait $followers
-    if [ -s "$work/status" ]; then
+    if [ ! -e "$work/ready" ]; then
+        tail -qn 15 "$work/boot.log" "$work/init.log" >&2 2>/dev/null
+        say "this kernel has no vcan, and user-mode-linux does not boot here (its last words are above)"
+        status=$unavailable
+    elif [ -s "$work/status" ]; then
         status=$(cat "$work/status")
     else
         say "user-mode-linux ended without running the command to its end:"

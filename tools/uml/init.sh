@@ -29,6 +29,7 @@ done
 insmod "$modules/net/can/can-gw.ko" 2>/dev/null # only for measuring: answers frames within the kernel
 ip link set up lo
 ip link add dev vcan0 type vcan && ip link set up vcan0 || end 70
+: >"$work/ready"
 
 # The host follows the two files; "sync" has each piece written through to it at once. (A console of
 # user-mode-linux passes 20 kB/s and looks like a terminal to the command.)

@@ -1,0 +1,52 @@
+"""What ``tools/socketcan.sh`` does where user-mode-linux does not boot: a reason and 69, which skips the tests."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "tools" / "socketcan.sh"
+UNAVAILABLE, BROKEN = 69, 70
+IS_COMPLETE = all(shutil.which(each) for each in ("linux.uml", "insmod", "ip", "candump")) and any(
+    Path("/usr/lib/uml/modules").rglob("vcan.ko")
+)
+
+pytestmark = pytest.mark.skipif(not IS_COMPLETE, reason="user-mode-linux is not installed")
+
+
+@pytest.fixture
+def run_with(tmp_path: Path):
+    """Runs a command with programs of one's own (name: shell text) in front of the machine's."""
+
+    def run(**programs: str) -> subprocess.CompletedProcess[str]:
+        for name, text in programs.items():
+            path = tmp_path / name.replace("_", ".")
+            path.write_text(f"#!/bin/sh\n{text}\n")
+            path.chmod(0o755)
+        environment = dict(os.environ, PATH=f"{tmp_path}:{os.environ['PATH']}")
+        return subprocess.run(
+            [SCRIPT, "--uml", "true"], env=environment, capture_output=True, text=True, check=False
+        )
+
+    return run
+
+
+def test_a_kernel_that_does_not_boot_is_unavailable_and_says_why(run_with) -> None:
+    done = run_with(linux_uml="echo Kernel panic: no floating point; kill -ABRT $$")
+    assert done.returncode == UNAVAILABLE
+    assert "Kernel panic: no floating point" in done.stderr
+    assert "does not boot here" in done.stderr
+
+
+def test_a_kernel_that_boots_and_then_dies_has_failed(run_with) -> None:
+    done = run_with(linux_uml='for each; do case $each in uml_dir=*) : >"${each#uml_dir=}/ready";; esac; done')
+    assert done.returncode == BROKEN
+
+
+def test_a_compiler_that_fails_is_said_and_the_kernel_tried_as_it_is(run_with) -> None:
+    done = run_with(cc="echo no such header >&2; exit 1", linux_uml="echo preload=$LD_PRELOAD; exit 1")
+    assert done.returncode == UNAVAILABLE
+    assert "no such header" in done.stderr
+    assert "preload=\n" in done.stderr
