@@ -1,4 +1,4 @@
-"""What ``tools/socketcan.sh`` does where user-mode-linux does not boot: a reason and 69, which skips the tests."""
+"""What ``tools/socketcan.sh`` does where user-mode-linux does not boot: it says why and ends with 69."""
 
 import os
 import shutil
@@ -41,7 +41,9 @@ def test_a_kernel_that_does_not_boot_is_unavailable_and_says_why(run_with) -> No
 
 
 def test_a_kernel_that_boots_and_then_dies_has_failed(run_with) -> None:
-    done = run_with(linux_uml='for each; do case $each in uml_dir=*) : >"${each#uml_dir=}/ready";; esac; done')
+    done = run_with(
+        linux_uml='for each; do case $each in uml_dir=*) : >"${each#uml_dir=}/ready";; esac; done'
+    )
     assert done.returncode == BROKEN
 
 
