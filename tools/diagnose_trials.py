@@ -1,7 +1,7 @@
 """Blind trials of the diagnosis on records from formulas: `python tools/diagnose_trials.py [seeds]
 [only,these]`.
 
-The plant (tests/diagnose/plant.py) shares no code with the effects. Each line is one record; the table at
+The plant (tests/support/plant.py) shares no code with the effects. Each line is one record; the table at
 the end gives right names, wrong names apart from abstentions, and the time that a diagnosis takes.
 """
 
@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
-import plant
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support import plant
 
 from hdbridge.diagnose import diagnose
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
 

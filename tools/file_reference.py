@@ -19,10 +19,10 @@ from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
-from hdbridge.modelfile import ModelFile
-from hdbridge.modelstore import LogFile
-from hdbridge.record import OPTIONAL, REQUIRED
-from hdbridge.recording import RecordingFile
+from hdbridge.model.file import ModelFile
+from hdbridge.model.store import LogFile
+from hdbridge.records.record import OPTIONAL, REQUIRED
+from hdbridge.records.recording import RecordingFile
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "files.md"
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)

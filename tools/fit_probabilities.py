@@ -2,7 +2,7 @@
 [--keep TABLE.json]`.
 
 Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
-formulas of tests/diagnose/plant.py, N seeds of each cause. Each finding gives the terms of the formula
+formulas of tests/support/plant.py, N seeds of each cause. Each finding gives the terms of the formula
 (hdbridge/diagnose/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
 every term with the sign that it must have; how well it fares is told by cross-validation that leaves whole
 records out. The table that is kept is read again where it is there. Prints the coefficients for
@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.diagnose.probability import COEFFICIENTS, LEAST, MOST
 from hdbridge.model import TransmissionModel
-from hdbridge.recording import Recording
+from hdbridge.records.recording import Recording
 
 RIDGE = 1.0
 FOLDS = 10

@@ -16,7 +16,7 @@ import numpy as np
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record, concatenate
+from hdbridge.records.record import Record, concatenate
 
 NOTHING = TransmissionModel(100.0, ())
 ARCSEC_PER_N = 0.01

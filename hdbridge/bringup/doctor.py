@@ -6,9 +6,9 @@ from typing import Final
 
 from hdbridge.bringup import moving, still
 from hdbridge.bringup.checks import Check
-from hdbridge.bringup.patient import Patient
+from hdbridge.bringup.context import BringUpContext
 
-CHECKS: Final[tuple[Check[Patient], ...]] = (
+CHECKS: Final[tuple[Check[BringUpContext], ...]] = (
     Check("files", "the files", still.files),
     Check("bus", "the bus", still.bus, ("files",)),
     Check("node", "the node answers", still.answers, ("bus",)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from hdbridge.bringup.checks import Verdict, failed, not_possible, passed
+from hdbridge.bringup.context import BringUpContext
 from hdbridge.bringup.judge import (
     judge_following,
     judge_hold,
@@ -13,7 +14,6 @@ from hdbridge.bringup.judge import (
     judge_stop,
     judge_torque,
 )
-from hdbridge.bringup.patient import Patient
 from hdbridge.bringup.scale import Turned, judge_turn
 from hdbridge.bringup.slow import Silence, SlowAxis, TravelPlan, plan_travel
 from hdbridge.drive import objects
@@ -33,27 +33,27 @@ _DRIVES_DOING: Final = frozenset(
 """What a drive that stops by itself looks like to the master's supervision."""
 
 
-def hold(patient: Patient) -> Verdict:
+def hold(context: BringUpContext) -> Verdict:
     """Power comes, the axis stays where it is."""
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
-        positions = patient.drive.read_positions()
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
+        positions = context.drive.read_positions()
         with slow.enabled() as first:
             seen = [first, *slow.sit(HOLD_S)]
     return judge_hold(
-        patient.axis,
+        context.axis,
         Turned(positions.motor_counts, positions.load_counts),
         [Turned(each.motor_counts, each.load_counts) for each in seen],
     )
 
 
-def nudge(patient: Patient) -> Verdict:
+def nudge(context: BringUpContext) -> Verdict:
     """Two degrees of the motor, forth and back."""
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
         with slow.enabled():
-            way = _plan(patient, slow)
-            patient.began_deg = slow.place_deg
+            way = _plan(context, slow)
+            context.began_deg = slow.place_deg
             step = NUDGE_DEG if way.span_deg > 0 else -NUDGE_DEG
             begin, start_deg = slow.stand(), slow.place_deg
             slow.travel(start_deg + step)
@@ -61,65 +61,65 @@ def nudge(patient: Patient) -> Verdict:
             slow.travel(start_deg)
             back = slow.stand()
     return judge_nudge(
-        patient.axis,
-        patient.axis.motor_encoder.counts(step),
+        context.axis,
+        context.axis.motor_encoder.counts(step),
         there.motor_counts - begin.motor_counts,
         back.motor_counts - there.motor_counts,
     )
 
 
-def turn(patient: Patient) -> Verdict:
+def turn(context: BringUpContext) -> Verdict:
     """A turn of the motor each way: which way and how far both encoders go."""
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
         with slow.enabled():
-            way, start_deg = _plan(patient, slow), slow.place_deg
+            way, start_deg = _plan(context, slow), slow.place_deg
             slow.travel(start_deg + way.lead_deg)
             near = slow.stand()
-            patient.out = slow.travel(start_deg + way.lead_deg + way.span_deg)
-            patient.rest_begins = len(patient.out)
-            patient.out += slow.sit(SETTLE_S)
+            context.out = slow.travel(start_deg + way.lead_deg + way.span_deg)
+            context.rest_begins = len(context.out)
+            context.out += slow.sit(SETTLE_S)
             far = slow.stand()
             slow.travel(start_deg + way.span_deg)
             turned_back = slow.stand()
             slow.travel(start_deg)
             home = slow.stand()
     return judge_turn(
-        patient.axis, _between(near, far), _between(turned_back, home), frozenset(patient.confirmed)
+        context.axis, _between(near, far), _between(turned_back, home), frozenset(context.confirmed)
     )
 
 
-def following(patient: Patient) -> Verdict:
+def following(context: BringUpContext) -> Verdict:
     """The following error of that move."""
-    if not patient.out:
+    if not context.out:
         return not_possible(_NOT_MOVED)
-    return judge_following(patient.axis, [each.demand_counts - each.motor_counts for each in patient.out])
+    return judge_following(context.axis, [each.demand_counts - each.motor_counts for each in context.out])
 
 
-def torque(patient: Patient) -> Verdict:
+def torque(context: BringUpContext) -> Verdict:
     """The torque of that move."""
-    if not patient.out:
+    if not context.out:
         return not_possible(_NOT_MOVED)
-    limit = min(patient.torque_percent, patient.axis.limits.torque_percent)
-    return judge_torque(patient.axis, [each.torque_permille for each in patient.out], limit)
+    limit = min(context.torque_percent, context.axis.limits.torque_percent)
+    return judge_torque(context.axis, [each.torque_permille for each in context.out], limit)
 
 
-def settling(patient: Patient) -> Verdict:
+def settling(context: BringUpContext) -> Verdict:
     """How the load came to rest after it."""
-    if len(patient.out) <= patient.rest_begins:
+    if len(context.out) <= context.rest_begins:
         return not_possible(_NOT_MOVED)
-    resting = [each.load_counts for each in patient.out[patient.rest_begins :]]
-    return judge_settling(patient.axis, resting, patient.axis.drive.cycle_s, patient.noise_arcsec)
+    resting = [each.load_counts for each in context.out[context.rest_begins :]]
+    return judge_settling(context.axis, resting, context.axis.drive.cycle_s, context.noise_arcsec)
 
 
-def quick_stop(patient: Patient) -> Verdict:
+def quick_stop(context: BringUpContext) -> Verdict:
     """A quick stop in slow motion: way, time, and the state after it."""
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
         with slow.enabled():
-            speed, distance, time_s = slow.stop_on_the_way(_far_from(patient, slow))
+            speed, distance, time_s = slow.stop_on_the_way(_far_from(context, slow))
             state = slow.image.power.state
-    axis = patient.axis
+    axis = context.axis
     verdict = judge_stop(axis, speed, distance, time_s, f"'{state.value}'", 0.0)
     option = axis.drive.quick_stop_option
     expected = State.QUICK_STOP_ACTIVE if option >= 5 else State.SWITCH_ON_DISABLED
@@ -133,9 +133,9 @@ def quick_stop(patient: Patient) -> Verdict:
     return verdict
 
 
-def heartbeat(patient: Patient) -> Verdict:
+def heartbeat(context: BringUpContext) -> Verdict:
     """The master's heartbeat stays away in slow motion: the drive has to stop by itself."""
-    axis, sdo = patient.axis, patient.drive.sdo
+    axis, sdo = context.axis, context.drive.sdo
     has_timer = sdo.has(objects.RPDO_COMMUNICATION, 5)
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
         if has_timer:
@@ -146,14 +146,14 @@ def heartbeat(patient: Patient) -> Verdict:
             f"{axis.where('drive.eds')} is not its EDS",
         )
     beat_s = axis.drive.heartbeat_ms / 1000.0
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
         with slow.enabled():
-            speed, silence = slow.lose_heartbeat(_far_from(patient, slow), 3.0 * beat_s + 0.2)
+            speed, silence = slow.lose_heartbeat(_far_from(context, slow), 3.0 * beat_s + 0.2)
     if silence.event is not None and silence.event.fault not in _DRIVES_DOING:
         return failed(f"disturbed: {silence.event}", "remove the cause and check again")
     return _judge_silence(
-        patient,
+        context,
         silence,
         speed,
         "heartbeat",
@@ -164,18 +164,18 @@ def heartbeat(patient: Patient) -> Verdict:
     )
 
 
-def set_points(patient: Patient) -> Verdict:
+def set_points(context: BringUpContext) -> Verdict:
     """SYNC and set-points stay away in slow motion while the heartbeat goes on: the drive has to stop."""
-    axis, sdo = patient.axis, patient.drive.sdo
+    axis, sdo = context.axis, context.drive.sdo
     if not sdo.has(objects.RPDO_COMMUNICATION, 5):
         return not_possible("the drive has no RPDO event timer (1400h:05); its heartbeat consumer has to do")
     timer_s = sdo.read(objects.RPDO_COMMUNICATION, 5) / 1000.0
-    with patient.interruptible() as interrupted:
-        slow = patient.slow(interrupted)
+    with context.interruptible() as interrupted:
+        slow = context.slow(interrupted)
         with slow.enabled():
-            speed, silence = slow.lose_set_points(_far_from(patient, slow), 3.0 * timer_s + 0.2)
+            speed, silence = slow.lose_set_points(_far_from(context, slow), 3.0 * timer_s + 0.2)
     return _judge_silence(
-        patient,
+        context,
         silence,
         speed,
         "SYNC and set-points",
@@ -185,9 +185,9 @@ def set_points(patient: Patient) -> Verdict:
     )
 
 
-def switched_off(patient: Patient) -> Verdict:
+def switched_off(context: BringUpContext) -> Verdict:
     """It boots again after all that, and is left switched off."""
-    drive = patient.boot()
+    drive = context.boot()
     word = drive.sdo.fetch(objects.STATUSWORD)
     state = decode(word)
     text = f"boots again; '{state.value}' (statusword {word:04X}h)"
@@ -196,22 +196,22 @@ def switched_off(patient: Patient) -> Verdict:
     return failed(text, "switch the drive off by its enable input and look at its error display")
 
 
-def _plan(patient: Patient, slow: SlowAxis) -> TravelPlan:
-    way = plan_travel(patient.axis, slow.place_deg)
+def _plan(context: BringUpContext, slow: SlowAxis) -> TravelPlan:
+    way = plan_travel(context.axis, slow.place_deg)
     if way is None:
-        where = patient.axis.where("limits.position_min_deg")
+        where = context.axis.where("limits.position_min_deg")
         raise InputError(
-            f"the axis stands at {slow.place_deg / patient.axis.gear.ratio:.4g} deg and has no room to move "
+            f"the axis stands at {slow.place_deg / context.axis.gear.ratio:.4g} deg and has no room to move "
             f"within {where} and position_max_deg; turn it away from its limits, or home it"
         )
     return way
 
 
-def _far_from(patient: Patient, slow: SlowAxis) -> float:
+def _far_from(context: BringUpContext, slow: SlowAxis) -> float:
     """Where to move to for a stop on the way: back to where the axis stood at first, or away from there."""
-    if abs(slow.place_deg - patient.began_deg) > BACK_FROM_DEG:
-        return patient.began_deg
-    return slow.place_deg + _plan(patient, slow).span_deg
+    if abs(slow.place_deg - context.began_deg) > BACK_FROM_DEG:
+        return context.began_deg
+    return slow.place_deg + _plan(context, slow).span_deg
 
 
 def _between(start: Turned, end: Turned) -> Turned:
@@ -219,7 +219,7 @@ def _between(start: Turned, end: Turned) -> Turned:
 
 
 def _judge_silence(
-    patient: Patient, silence: Silence, speed: float, what: str, after_s: float, remedy: str
+    context: BringUpContext, silence: Silence, speed: float, what: str, after_s: float, remedy: str
 ) -> Verdict:
     state = decode(silence.statusword)
     still_on = state is State.OPERATION_ENABLED
@@ -230,7 +230,7 @@ def _judge_silence(
             reacted=False,
         )
     return judge_stop(
-        patient.axis,
+        context.axis,
         speed,
         silence.distance_deg,
         silence.noticed_after_s,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hdbridge.bringup.scale import Turned
 from hdbridge.clock import Clock
-from hdbridge.cycle import Cycle, Feedback
+from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from hdbridge.bringup.checks import Verdict, failed, passed
+from hdbridge.bringup.context import BringUpContext
 from hdbridge.bringup.judge import judge_channels, judge_rest
 from hdbridge.bringup.match import compare
-from hdbridge.bringup.patient import Patient
 from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO
 from hdbridge.bringup.scan import scan_bus
 from hdbridge.bringup.slow import SlowAxis
@@ -46,12 +46,12 @@ _ABSENT: Final = (0x0602_0000, 0x0609_0011)
 """Abort codes: no such object, no such sub-index."""
 
 
-def files(patient: Patient) -> Verdict:
+def files(context: BringUpContext) -> Verdict:
     """The axis file and the EDS can be read, and every value of the boot-up fits its object."""
-    axis = patient.load()
+    axis = context.load()
     od = load_eds(axis.eds_path, axis.drive.node_id)
     rows = plan(axis, od)
-    patient.admit(axis, od)
+    context.admit(axis, od)
     return passed(
         f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to write",
         axis_file=str(axis.path),
@@ -60,16 +60,16 @@ def files(patient: Patient) -> Verdict:
     )
 
 
-def bus(patient: Patient) -> Verdict:
+def bus(context: BringUpContext) -> Verdict:
     """The bus opens."""
-    patient.connect()
-    link = patient.drive.link
+    context.connect()
+    link = context.drive.link
     return passed(f"{link.name} is open", bus=link.name)
 
 
-def answers(patient: Patient) -> Verdict:
+def answers(context: BringUpContext) -> Verdict:
     """The node answers; where it does not, whoever else does."""
-    axis, drive = patient.axis, patient.drive
+    axis, drive = context.axis, context.drive
     try:
         device_type = drive.sdo.fetch(objects.DEVICE_TYPE)
     except SdoAbortError:
@@ -96,9 +96,9 @@ def answers(patient: Patient) -> Verdict:
     return passed(f"node {axis.drive.node_id}, device type {device_type:08X}h (CiA 402)")
 
 
-def identity(patient: Patient) -> Verdict:
+def identity(context: BringUpContext) -> Verdict:
     """It is the drive that the axis file means, and has the mode that is needed."""
-    axis, sdo = patient.axis, patient.drive.sdo
+    axis, sdo = context.axis, context.drive.sdo
     found = {
         name: sdo.fetch(address)
         for address, name in IDENTITY
@@ -109,9 +109,9 @@ def identity(patient: Patient) -> Verdict:
     return failed(text, *(each.text for each in complaints), **found) if complaints else passed(text, **found)
 
 
-def eds(patient: Patient) -> Verdict:
+def eds(context: BringUpContext) -> Verdict:
     """The EDS describes this drive: the objects that are used exist, with the type that it says."""
-    axis, drive = patient.axis, patient.drive
+    axis, drive = context.axis, context.drive
     where = axis.where("drive.eds")
     wrong = [
         f"the EDS does not list {each}, which the control cycle needs"
@@ -119,7 +119,7 @@ def eds(patient: Patient) -> Verdict:
         if not drive.sdo.has(each.index, each.sub)
     ]
     looked_at = 0
-    for index, sub in dict.fromkeys(_listed(patient)):
+    for index, sub in dict.fromkeys(_listed(context)):
         looked_at += 1
         try:
             drive.sdo.read(index, sub)
@@ -149,9 +149,9 @@ def eds(patient: Patient) -> Verdict:
     return passed(f"{looked_at} objects answer as {axis.drive.eds} says", objects=looked_at)
 
 
-def _listed(patient: Patient) -> Iterator[tuple[int, int]]:
+def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
     """The objects to look at: those that are used, as far as the EDS lists them."""
-    axis, sdo = patient.axis, patient.drive.sdo
+    axis, sdo = context.axis, context.drive.sdo
     for address in (*_REQUIRED, objects.RATED_TORQUE, objects.ERROR_CODE, *scaling_addresses(axis)):
         if sdo.has(address.index, address.sub):
             yield address.index, address.sub
@@ -165,9 +165,9 @@ def _listed(patient: Patient) -> Iterator[tuple[int, int]]:
         yield channel.source.index, channel.source.subindex
 
 
-def units(patient: Patient) -> Verdict:
+def units(context: BringUpContext) -> Verdict:
     """The drive counts as the axis file says, by every object that says something about it."""
-    axis, sdo = patient.axis, patient.drive.sdo
+    axis, sdo = context.axis, context.drive.sdo
 
     def read(*addresses: Address) -> dict[Address, int]:
         return {each: sdo.fetch(each) for each in addresses if sdo.has(each.index, each.sub)}
@@ -185,14 +185,14 @@ def units(patient: Patient) -> Verdict:
         (LOAD_COUNTS, any(each.index == 0x60E6 for each in readings)),
     ):
         if known:
-            patient.confirmed.add(key)
+            context.confirmed.add(key)
     notes = torque_notes(axis, read(objects.RATED_TORQUE).get(objects.RATED_TORQUE))
     return passed("; ".join((text, *notes)))
 
 
-def boot(patient: Patient) -> Verdict:
+def boot(context: BringUpContext) -> Verdict:
     """The boot-up writes its plan and reads every object back."""
-    drive = patient.boot()
+    drive = context.boot()
     report = drive.report
     assert report is not None
     return passed(
@@ -201,19 +201,19 @@ def boot(patient: Patient) -> Verdict:
     )
 
 
-def rest(patient: Patient) -> Verdict:
+def rest(context: BringUpContext) -> Verdict:
     """Both encoders come with every SYNC, and rest while the power is off; other channels tell something."""
-    drive = patient.drive
-    with patient.interruptible() as interrupted:
+    drive = context.drive
+    with context.interruptible() as interrupted:
         positions = drive.read_positions()
         drive.image.seed(
             positions.motor_counts, positions.load_counts, drive.sdo.read(0x6041, 0, IntegerType.UINT16)
         )
-        seen = SlowAxis(drive, patient.torque_percent, interrupted).sit(REST_S)
+        seen = SlowAxis(drive, context.torque_percent, interrupted).sit(REST_S)
     fresh = [each for each in seen if each.fresh]
     verdict = judge_rest(
-        patient.axis, [each.motor_counts for each in fresh], [each.load_counts for each in fresh]
+        context.axis, [each.motor_counts for each in fresh], [each.load_counts for each in fresh]
     )
-    patient.noise_arcsec = float(verdict.figures["load_noise_arcsec"] or 0.0)
+    context.noise_arcsec = float(verdict.figures["load_noise_arcsec"] or 0.0)
     readings = {each.key: each.value for each in drive.image.channels}
-    return judge_channels(patient.axis, readings, REST_S, verdict)
+    return judge_channels(context.axis, readings, REST_S, verdict)

@@ -13,8 +13,8 @@ from hdbridge.calibration.journal import tasks_of
 from hdbridge.effects import FloatArray, Start
 from hdbridge.identify import FitOptions, FitResult, Kind, Segment, fit
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record, time_shifts_s
-from hdbridge.recording import Recording, versions_here
+from hdbridge.records.record import Record, time_shifts_s
+from hdbridge.records.recording import Recording, versions_here
 
 STANDING = ("reference", "standstill")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.bench import Bench, axis_view, lost_channels
 from hdbridge.calibration.journal import Journal
+from hdbridge.control.bench import Bench, axis_view, lost_channels
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.atomic import make_folder

@@ -18,8 +18,8 @@ from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.model import TransmissionModel
-from hdbridge.modelstore import propose
-from hdbridge.recording import Recording
+from hdbridge.model.store import propose
+from hdbridge.records.recording import Recording
 
 RESULT_NAME = "calibration.json"
 MODEL_NAME = "model.yaml"

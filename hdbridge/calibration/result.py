@@ -10,7 +10,7 @@ from typing import Any
 from hdbridge.calibration.validation import Stepped, Validation
 from hdbridge.identify import FitResult
 from hdbridge.model import TransmissionModel
-from hdbridge.modeldiff import diff
+from hdbridge.model.difference import diff
 
 __all__ = ["Calibration", "Offer", "Stepped"]
 

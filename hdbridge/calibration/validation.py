@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Bench, axis_view, compensation_for
 from hdbridge.calibration.identification import resting
 from hdbridge.calibration.measure import Pace
+from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
+from hdbridge.evaluation.accuracy import AxisAccuracy, axis_accuracy
+from hdbridge.evaluation.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.stepping import SteppingOutcome
-from hdbridge.recording import Recording
-from hdbridge.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
+from hdbridge.records.recording import Recording
 
 WINDOW_S = 0.06
 """Over which the stepping test takes its mean at rest."""

@@ -11,7 +11,7 @@ from rich.markup import escape
 from hdbridge.calibration import Calibration, calibrate
 from hdbridge.calibration.validation import validation_s
 from hdbridge.cli.booted import booted
-from hdbridge.cli.findings import print_calibration, print_next, print_page, write_calibration_page
+from hdbridge.cli.calibration_output import print_calibration, print_next, print_page, write_calibration_page
 from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import typer
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import compensation_for
 from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, write_json
+from hdbridge.control.bench import compensation_for
 from hdbridge.drive import load_eds, plan
+from hdbridge.evaluation.stepping import quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
-from hdbridge.stepping import quantisation_floor_arcsec
 
 
 def register(app: typer.Typer) -> None:

@@ -17,10 +17,10 @@ from hdbridge.diagnose.planned import plan_report
 from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
-from hdbridge.foreign import check_records, zeros_apart_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
-from hdbridge.recording import Recording
+from hdbridge.records.foreign import check_records, zeros_apart_arcsec
+from hdbridge.records.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 

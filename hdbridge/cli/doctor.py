@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from hdbridge.bringup.checks import Outcome, Row, run_checks
+from hdbridge.bringup.context import TORQUE_PERCENT, BringUpContext
 from hdbridge.bringup.doctor import CHECKS
-from hdbridge.bringup.patient import TORQUE_PERCENT, Patient
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     ChannelOption,
@@ -87,13 +87,13 @@ def doctor(
         refused.append(DECLINED)
         return DECLINED
 
-    with Patient(
+    with BringUpContext(
         lambda: load_axis(files, interface, channel),
         lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed),
         torque_percent=torque_percent,
         interruptible=deferred_interrupt,
-    ) as patient:
-        rows = run_checks(patient, CHECKS, permitted=permitted, tell=_tell)
+    ) as context:
+        rows = run_checks(context, CHECKS, permitted=permitted, tell=_tell)
     failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
     write_json(
         json_file,
@@ -124,7 +124,7 @@ def _confirm(torque_percent: float) -> bool:
         return False
 
 
-def _tell(row: Row[Patient]) -> None:
+def _tell(row: Row[BringUpContext]) -> None:
     console.print(f"{_MARKS[row.verdict.outcome]}  {row.check.title:<25}", end=" ")
     console.print(row.verdict.measured, markup=False, soft_wrap=True)
     for remedy in row.verdict.remedies:

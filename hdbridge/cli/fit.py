@@ -10,12 +10,12 @@ import typer
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import conclude
-from hdbridge.cli.findings import print_calibration, print_page, write_calibration_page
+from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
 from hdbridge.errors import InputError
-from hdbridge.foreign import check_records
 from hdbridge.model import TransmissionModel
-from hdbridge.recording import Recording
+from hdbridge.records.foreign import check_records
+from hdbridge.records.recording import Recording
 
 
 def register(app: typer.Typer) -> None:

@@ -9,8 +9,8 @@ import typer
 from rich.markup import escape
 
 from hdbridge.cli.booted import booted
+from hdbridge.cli.calibration_output import print_next, print_page, print_stepping, print_steps
 from hdbridge.cli.diagnose import print_diagnosis
-from hdbridge.cli.findings import print_next, print_page, print_stepping, print_steps
 from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
@@ -32,7 +32,7 @@ from hdbridge.files.atomic import write_atomically
 from hdbridge.improvement import Improvement, Source, improve
 from hdbridge.improvement.trial import trial_s
 from hdbridge.model import TransmissionModel
-from hdbridge.recording import Recording
+from hdbridge.records.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 

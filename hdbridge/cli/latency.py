@@ -9,8 +9,8 @@ import typer
 
 from hdbridge.cli.options import JsonOption, console, notes, write_json
 from hdbridge.clock import MonotonicClock
-from hdbridge.latency import CANDIDATES_S, Measurement, measure
-from hdbridge.realtime import prepare_realtime
+from hdbridge.control.latency import CANDIDATES_S, Measurement, measure
+from hdbridge.control.realtime import prepare_realtime
 
 
 def register(app: typer.Typer) -> None:

@@ -11,11 +11,11 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge import modelstore
 from hdbridge.cli.options import JsonOption, Profile, ProfileArgument, console, print_table, write_json
 from hdbridge.errors import InputError
-from hdbridge.modeldiff import Difference, diff
-from hdbridge.modelstore import ACTIVE, PENDING, Version
+from hdbridge.model import store
+from hdbridge.model.difference import Difference, diff
+from hdbridge.model.store import ACTIVE, PENDING, Version
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
 
@@ -35,7 +35,7 @@ def register(app: typer.Typer) -> None:
 
 def log(profile: ProfileArgument, json_file: JsonOption = None) -> None:
     """List every model of the profile, newest first, with dates and reasons."""
-    versions = modelstore.log(_folder(profile))
+    versions = store.log(_folder(profile))
     write_json(json_file, {"schema": "hdbridge.model-log/1", "models": [_version(each) for each in versions]})
     if not versions:
         console.print("no model yet: calibrate first")
@@ -62,17 +62,17 @@ def compare(
 ) -> None:
     """Show what changed between two models, parameter by parameter."""
     folder = _folder(profile)
-    names = {name for each in modelstore.log(folder) for name in _names(each)}
+    names = {name for each in store.log(folder) for name in _names(each)}
     if after is None and before is None and PENDING not in names:
         others = f", or name two of: {', '.join(sorted(names))}" if len(names) > 1 else ""
         raise InputError(f"{folder}: there is no pending model to compare with; calibrate first{others}")
     if before is None and ACTIVE not in names:
-        later = modelstore.find(folder, after or PENDING)
+        later = store.find(folder, after or PENDING)
         earlier_name, model = "no model", later.model.only(())
     else:
-        earlier = modelstore.find(folder, before or ACTIVE)
+        earlier = store.find(folder, before or ACTIVE)
         earlier_name, model = earlier.name, earlier.model
-        later = modelstore.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
+        later = store.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
     rows = diff(model, later.model)
     write_json(
         json_file,
@@ -88,7 +88,7 @@ def compare(
 
 def commit(profile: ProfileArgument) -> None:
     """Make the pending model the active one; the one before stays in the history."""
-    number = modelstore.commit(_folder(profile), _now())
+    number = store.commit(_folder(profile), _now())
     console.print(f"model {number} is active")
 
 
@@ -98,19 +98,19 @@ def activate(
     reason: ReasonOption = "",
 ) -> None:
     """Make a model of the history the active one."""
-    number = modelstore.activate(_folder(profile), version, reason, _now())
+    number = store.activate(_folder(profile), version, reason, _now())
     console.print(f"model {number} is active")
 
 
 def rollback(profile: ProfileArgument, reason: ReasonOption = "") -> None:
     """Undo the last activation: the model before it is active again."""
-    number = modelstore.rollback(_folder(profile), reason, _now())
+    number = store.rollback(_folder(profile), reason, _now())
     console.print(f"model {number} is active again")
 
 
 def discard(profile: ProfileArgument) -> None:
     """Throw the pending model away; the recording that it came from stays."""
-    modelstore.discard(_folder(profile))
+    store.discard(_folder(profile))
     console.print("the pending model is gone; its recording is kept")
 
 

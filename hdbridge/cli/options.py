@@ -19,11 +19,11 @@ from rich.text import Text
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.control.realtime import prepare_realtime
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable, write_atomically
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.realtime import prepare_realtime
 from hdbridge.sim.lockstep import simulated_bench
 
 console = Console(highlight=False)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hdbridge.calibration import concluded
-from hdbridge.cli.findings import print_calibration, print_page, write_calibration_page
+from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 

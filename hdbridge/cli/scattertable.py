@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from rich.table import Table
 
 from hdbridge.cli.options import print_table
-from hdbridge.stepping import Scatter
+from hdbridge.evaluation.stepping import Scatter
 
 
 def print_scatter(

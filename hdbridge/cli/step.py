@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Run
 from hdbridge.cli.booted import booted
 from hdbridge.cli.options import (
     ChannelOption,
@@ -29,14 +28,15 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.cli.scattertable import print_scatter
-from hdbridge.comparison import Comparison, compare_schemes
+from hdbridge.control.bench import Run
 from hdbridge.errors import InputError
+from hdbridge.evaluation.comparison import Comparison, compare_schemes
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.report.page import render
 from hdbridge.report.stepping import stepping_page
-from hdbridge.stepping import Scheme
 
 
 def register(app: typer.Typer) -> None:

@@ -39,7 +39,7 @@ from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 NAMED = 0.3

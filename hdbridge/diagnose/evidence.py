@@ -22,7 +22,7 @@ from hdbridge.diagnose.noise import noise_arcsec, third_deviation
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import quantum_deg, steadied
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 
 BoolArray = NDArray[np.bool_]
@@ -40,7 +40,7 @@ FAST_KINDS = frozenset({"move", "precondition", "step"})
 
 
 class Leg(Protocol):
-    """A stretch of a recording; `hdbridge.recording.Segment` is one."""
+    """A stretch of a recording; `hdbridge.records.recording.Segment` is one."""
 
     @property
     def kind(self) -> str:

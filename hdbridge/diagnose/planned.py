@@ -13,8 +13,8 @@ from hdbridge.effects import Motion, Start
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Procedure, Sample
 from hdbridge.procedures.plan import Plan
-from hdbridge.record import Record
-from hdbridge.recording import Segment
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
 
 PERIOD_S: Final = 0.04

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
 
     from hdbridge.axis import AxisConfig
-    from hdbridge.axischannels import MeasuredChannel
+    from hdbridge.axis.channels import MeasuredChannel
 
 _CIA_301_TYPES = {
     "int8": 0x02, "int16": 0x03, "int32": 0x04, "uint8": 0x05, "uint16": 0x06, "uint32": 0x07,

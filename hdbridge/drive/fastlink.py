@@ -16,7 +16,7 @@ from typing import Any, Final
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from hdbridge.dataframe import DataFrame
+from hdbridge.canframe import DataFrame
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull, new_tuple
 from hdbridge.errors import BusError
 

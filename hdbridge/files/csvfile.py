@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.expectation import nearest, one_line
 
+FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
 """A column: float64, or text where it holds something else than numbers."""
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import axis_view
 from hdbridge.calibration.identification import provenance, with_provenance
 from hdbridge.calibration.journal import Journal, tasks_of
 from hdbridge.calibration.measure import identity_of, measure, start_journal
 from hdbridge.calibration.pipeline import ACTIVE_NAME, MODEL_NAME
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import floor_of
+from hdbridge.control.bench import axis_view
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -26,9 +26,9 @@ from hdbridge.improvement.further import advice, choose, untold
 from hdbridge.improvement.result import Improvement, Round
 from hdbridge.improvement.trial import Trial, try_out
 from hdbridge.model import TransmissionModel
-from hdbridge.modelstore import propose
+from hdbridge.model.store import propose
 from hdbridge.procedures.plan import Plan
-from hdbridge.recording import ABOUT_NAME, Recording
+from hdbridge.records.recording import ABOUT_NAME, Recording
 
 RESULT_NAME = "improvement.json"
 Progress = Callable[[str, float, float], None]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Bench, axis_view, compensation_for
 from hdbridge.calibration.measure import Pace
 from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept
+from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Hysteresis, HysteresisMemory
 from hdbridge.model import TransmissionModel

@@ -14,7 +14,7 @@ from hdbridge.calibration import Calibration
 from hdbridge.calibration.result import unit_of
 from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
-from hdbridge.modeldiff import diff
+from hdbridge.model.difference import diff
 from hdbridge.report.page import Block, Chart, Facts, Grid, Mark, Page, Section, Series, Table, histogram
 from hdbridge.report.validation import stepping_sections
 from hdbridge.report.words import SIGMA, figure, sentence, with_interval

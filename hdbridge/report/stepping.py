@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from hdbridge import __version__
+from hdbridge.evaluation.stepping import Scheme, SchemeResult
 from hdbridge.report.page import Chart, Facts, Grid, Level, Mark, Page, Section, Series, Table, histogram
-from hdbridge.stepping import Scheme, SchemeResult
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 X_LABEL: Final = "load target, deg"

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Protocol
 
-from hdbridge.sim.truth_encoder import (
+from hdbridge.sim.truth.encoder import (
     TrueCable,
     TrueDisc,
     TrueEncoder,

@@ -10,7 +10,7 @@ import random
 from typing import ClassVar
 
 from hdbridge.sim.conditions import Conditions
-from hdbridge.sim.truth_gear import (
+from hdbridge.sim.truth.gear import (
     TrueCreep,
     TrueDamage,
     TrueFlank,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from hdbridge.sim.truth_hysteresis import BoucWen, Dahl, Hysteresis, MaxwellSlip, RollingFriction
+from hdbridge.sim.truth.hysteresis import BoucWen, Dahl, Hysteresis, MaxwellSlip, RollingFriction
 
 
 class Law(Protocol):

@@ -11,7 +11,7 @@ import math
 
 from hdbridge.sim.plant import RAD_PER_DEG, Plant
 from hdbridge.sim.truth import Truth
-from hdbridge.sim.truth_gear import TrueStiffening
+from hdbridge.sim.truth.gear import TrueStiffening
 from hdbridge.units import ARCSEC_PER_DEG
 
 GRAVITY_M_S2 = 9.80665

@@ -19,7 +19,7 @@ from uuid import uuid4
 import can
 from can.interfaces.virtual import VirtualBus, channels_lock
 
-from hdbridge.dataframe import DataFrame
+from hdbridge.canframe import DataFrame
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
 from hdbridge.sim.nameplate import Nameplate

@@ -14,8 +14,8 @@ from typing import Final
 
 import can
 
+from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
-from hdbridge.dataframe import DataFrame
 from hdbridge.errors import InputError
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode

@@ -6,7 +6,7 @@ import cmath
 import math
 from collections.abc import Iterable
 
-from hdbridge.sim.truth_hysteresis import TrueOrder
+from hdbridge.sim.truth.hysteresis import TrueOrder
 
 
 class Orders:

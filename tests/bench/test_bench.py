@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Bench, compensation_for
-from hdbridge.comparison import compare_schemes
+from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive import State
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError, SafetyStop
+from hdbridge.evaluation.comparison import compare_schemes
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import Dwell, MoveTo
 from hdbridge.procedures.sine import Sines
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
-from hdbridge.stepping import Scheme
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from two_channels import CHANNELS, resumes, stops
+from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Bench, compensation_for
+from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.errors import DriveError, InputError, SdoError
+from hdbridge.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import Dwell, MoveTo
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.stepping import SchemeResult, quantisation_floor_arcsec
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 MASS = ("  encoder:\n    counts_per_turn: 2880000", "  gravity: {mass_kg: 5, arm_m: 0.15}\n")

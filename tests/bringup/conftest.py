@@ -13,8 +13,8 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.bringup.checks import Row, Verdict, run_checks
+from hdbridge.bringup.context import BringUpContext
 from hdbridge.bringup.doctor import CHECKS
-from hdbridge.bringup.patient import Patient
 from hdbridge.clock import Clock
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of
@@ -45,7 +45,7 @@ class Case:
     """Whether the drive's own objects say what the plant really is, rather than what the axis file says."""
     node_id: int = 1
     spoil: Callable[[SimulatedDrive], None] = lambda node: None
-    rows: dict[str, Row[Patient]] = field(default_factory=dict)
+    rows: dict[str, Row[BringUpContext]] = field(default_factory=dict)
     node: SimulatedDrive | None = None
     motor_counts_seen: set[int] = field(default_factory=set)
 
@@ -74,8 +74,8 @@ class Case:
         """The verdicts by the name of the check, up to the check ``until``."""
         last = [check.name for check in CHECKS].index(until)
         permitted = options.pop("permitted", lambda: None)
-        with Patient(self.prepare, self.connect, **options) as patient:
-            rows = run_checks(patient, CHECKS[: last + 1], permitted=permitted)
+        with BringUpContext(self.prepare, self.connect, **options) as context:
+            rows = run_checks(context, CHECKS[: last + 1], permitted=permitted)
         self.rows = {row.check.name: row for row in rows}
         return {name: row.verdict for name, row in self.rows.items()}
 

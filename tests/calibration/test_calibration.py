@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from hdbridge.model import TransmissionModel
-from hdbridge.recording import Recording
+from hdbridge.records.recording import Recording
 
 
 def truth(cell):

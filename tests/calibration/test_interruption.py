@@ -4,7 +4,7 @@ import signal
 
 import yaml
 
-from hdbridge.recording import Recording
+from hdbridge.records.recording import Recording
 
 LONG = """\
 schema: hdbridge.plan/1

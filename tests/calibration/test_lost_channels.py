@@ -3,7 +3,7 @@
 from datetime import UTC, datetime
 
 import yaml
-from two_channels import CHANNELS, resumes, stops
+from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import measure, start_journal

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hdbridge.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
+from hdbridge.control.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
 from hdbridge.effects import CATALOGUE, Channel, Compliance, Moment, Observer, Start, compensable, extended
 from hdbridge.model import TransmissionModel
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.compensation import Compensation, CompensationLimits, Inverse
+from hdbridge.control.compensation import Compensation, CompensationLimits, Inverse
 from hdbridge.effects import CATALOGUE, Backlash, Hysteresis, Moment, MotorOrder, Start, Synchronous, Wear
 from hdbridge.effects.elastic_loop import rise_at
 from hdbridge.errors import InputError

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.cycle import Cycle, Feedback
+from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from hdbridge.cycle import Feedback
+from hdbridge.control.cycle import Feedback
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
 

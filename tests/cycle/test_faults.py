@@ -11,7 +11,7 @@ from dataclasses import replace
 import can
 import pytest
 
-from hdbridge.cycle import Cycle
+from hdbridge.control.cycle import Cycle
 from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.latency import Histogram, LatencyReport, Measurement, carries, measure, wake_ups
+from hdbridge.control.latency import Histogram, LatencyReport, Measurement, carries, measure, wake_ups
 
 lateness_us = st.lists(st.integers(0, 50_000_000), min_size=1, max_size=200)
 

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from hdbridge.realtime import prepare_realtime
+from hdbridge.control.realtime import prepare_realtime
 
 
 def state() -> tuple[int, int, bool, int]:

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
+import support.plant
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
-
-
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("diagnose_plant", Path(__file__).with_name("plant.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+from hdbridge.records.record import Record
 
 
 @pytest.fixture(scope="session")
 def plant() -> ModuleType:
-    return _load()
+    return support.plant
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 RUN = CliRunner()
 

@@ -11,7 +11,7 @@ import pytest
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 Diagnosed = Callable[..., Diagnosis]
 

@@ -19,7 +19,7 @@ from hdbridge.diagnose.theory import Theory, Workshop
 from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]
 SEEDS = range(10, 20)

@@ -15,7 +15,7 @@ from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.probability import Beside, Signs, weighed
 from hdbridge.effects import Hysteresis
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 Diagnosed = Callable[..., Diagnosis]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.diagnose import diagnose
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record, concatenate
+from hdbridge.records.record import Record, concatenate
 
 
 def test_a_part_of_one_sample_is_no_obstacle(

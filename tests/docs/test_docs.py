@@ -1,14 +1,13 @@
 """What the documents promise: links that lead somewhere, commands that exist, examples that run."""
 
 import re
-import runpy
 from pathlib import Path
 
+import command_reference
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-COMMANDS = runpy.run_path(str(ROOT / "tools" / "command_reference.py"))
 API_EXAMPLES = re.findall(
     r"```python\n(.*?)```", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.DOTALL
 )
@@ -49,12 +48,12 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_on_the_pages_exist_with_their_options(page):
-    wrong = [COMMANDS["refused"](line) for line in command_lines(page)]
+    wrong = [command_reference.refused(line) for line in command_lines(page)]
     assert [each for each in wrong if each] == []
 
 
 def test_the_check_of_command_lines_finds_what_is_wrong():
-    refused = COMMANDS["refused"]
+    refused = command_reference.refused
     assert refused("hdbridge step my-axis --simulate --count 60   # with a remark") is None
     assert refused("hdbridge model activate my-axis 3 --reason summer") is None
     assert "no option --cuont" in refused("hdbridge step my-axis --cuont 60")
@@ -65,13 +64,13 @@ def test_the_check_of_command_lines_finds_what_is_wrong():
 
 
 def test_the_reference_of_commands_is_up_to_date():
-    page = COMMANDS["PAGE"].read_text(encoding="utf-8")
-    assert page == COMMANDS["page"](), "run python tools/command_reference.py"
+    page = command_reference.PAGE.read_text(encoding="utf-8")
+    assert page == command_reference.page(), "run python tools/command_reference.py"
 
 
 def test_every_command_stands_under_a_heading_and_every_option_says_what_it_does():
-    page = COMMANDS["page"]()
-    for command in COMMANDS["commands"]():
+    page = command_reference.page()
+    for command in command_reference.commands():
         assert f"### `{command.usage}`" in page
         assert [each.names[0] for each in command.parameters if each.is_option and not each.help] == []
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axischannels import LoadTorque, Temperature
+from hdbridge.axis.channels import LoadTorque, Temperature
 from hdbridge.drive import Drive, ProcessImage, load_eds, plan
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.supervision import Fault

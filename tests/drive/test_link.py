@@ -11,8 +11,8 @@ import can
 import pytest
 
 from hdbridge.axis import BusConfig
+from hdbridge.canframe import DataFrame
 from hdbridge.clock import MonotonicClock
-from hdbridge.dataframe import DataFrame
 from hdbridge.drive import Link, TransmitBufferFull, open_bus
 from hdbridge.errors import BusError
 

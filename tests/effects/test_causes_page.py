@@ -1,19 +1,18 @@
 """docs/causes.md is what the catalogue says."""
 
-import runpy
-from pathlib import Path
+import catalogue_docs
 
 from hdbridge.effects import CATALOGUE
 
-TOOL = runpy.run_path(str(Path(__file__).parents[2] / "tools" / "catalogue_docs.py"))
-
 
 def test_the_page_of_causes_is_up_to_date():
-    assert TOOL["PAGE"].read_text(encoding="utf-8") == TOOL["page"](), "run python tools/catalogue_docs.py"
+    assert catalogue_docs.PAGE.read_text(encoding="utf-8") == catalogue_docs.page(), (
+        "run python tools/catalogue_docs.py"
+    )
 
 
 def test_every_cause_has_its_section_with_every_parameter():
-    sections = {each.split("\n", 1)[0]: each for each in TOOL["page"]().split("\n## ")[1:]}
+    sections = {each.split("\n", 1)[0]: each for each in catalogue_docs.page().split("\n## ")[1:]}
     assert list(sections) == list(CATALOGUE)
     for name, kind in CATALOGUE.items():
         for parameter in kind.model_fields:

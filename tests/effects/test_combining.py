@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hdbridge.compensation import Inverse
+from hdbridge.control.compensation import Inverse
 from hdbridge.effects import (
     CATALOGUE,
     AmplitudeDrift,

@@ -1,15 +1,14 @@
 """Laws that every effect of the catalogue obeys."""
 
-import importlib.util
 import math
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel
+from support.effect_examples import EXAMPLES, motions, starts
 
 from hdbridge.effects import (
     CATALOGUE,
@@ -24,13 +23,6 @@ from hdbridge.effects import (
     unmet,
 )
 from hdbridge.errors import InputError
-
-_SPEC = importlib.util.spec_from_file_location(
-    "effect_examples", Path(__file__).with_name("effect_examples.py")
-)
-_EXAMPLES = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(_EXAMPLES)
-EXAMPLES, motions, starts = _EXAMPLES.EXAMPLES, _EXAMPLES.motions, _EXAMPLES.starts
 
 NAMES = sorted(CATALOGUE)
 BASE = [CATALOGUE["synchronous"].candidate(50.0), CATALOGUE["hysteresis"].candidate(50.0)]

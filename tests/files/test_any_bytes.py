@@ -10,8 +10,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import load_yaml
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
-from hdbridge.recording import RecordingFile
+from hdbridge.records.record import Record
+from hdbridge.records.recording import RecordingFile
 
 PIECES = [
     "schema: ", "hdbridge.axis/1", "hdbridge.model/1", "ratio: ", "effects:", "effect: ", "hysteresis", "\n", "\n  ",

@@ -1,26 +1,18 @@
 """The reference of the files says what the code expects."""
 
-import importlib.util
 import re
-from pathlib import Path
 
+import file_reference
 import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 
-TOOL = Path(__file__).resolve().parents[2] / "tools" / "file_reference.py"
-
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("file_reference", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return file_reference
 
 
 def test_the_page_is_up_to_date(tool):

@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge import modelstore
 from hdbridge.axis import Identity
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.modeldiff import Difference, diff
-from hdbridge.modelstore import Activation
+from hdbridge.model import TransmissionModel, store
+from hdbridge.model.difference import Difference, diff
+from hdbridge.model.store import Activation
 
 AXIS = """\
 schema: hdbridge.axis/1
@@ -61,18 +60,18 @@ def profile(tmp_path) -> Path:
 
 def make(profile: Path, *offsets: float) -> None:
     for each in offsets:
-        modelstore.propose(profile, model(each), f"offset {each:g}", DATE, SERIAL_17)
-        modelstore.commit(profile, DATE, SERIAL_17)
+        store.propose(profile, model(each), f"offset {each:g}", DATE, SERIAL_17)
+        store.commit(profile, DATE, SERIAL_17)
 
 
 def test_a_model_is_pending_until_it_is_committed(profile):
-    assert modelstore.log(profile) == []
-    path = modelstore.propose(profile, model(), "first calibration", DATE, SERIAL_17)
+    assert store.log(profile) == []
+    path = store.propose(profile, model(), "first calibration", DATE, SERIAL_17)
     assert path == profile / "pending.yaml"
     assert not (profile / "model.yaml").exists()
-    assert [each.name for each in modelstore.log(profile)] == ["pending"]
-    assert modelstore.commit(profile, DATE, SERIAL_17) == 1
-    (version,) = modelstore.log(profile)
+    assert [each.name for each in store.log(profile)] == ["pending"]
+    assert store.commit(profile, DATE, SERIAL_17) == 1
+    (version,) = store.log(profile)
     assert (version.name, version.active, version.reason) == ("1", True, "first calibration")
     assert version.date == "2025-01-31T12:00:00Z"
     assert version.activations == (
@@ -87,52 +86,52 @@ def test_a_model_is_pending_until_it_is_committed(profile):
 
 def test_every_version_stays_in_the_history_byte_for_byte(profile):
     make(profile, 40, 41, 42)
-    assert [(each.name, each.active) for each in modelstore.log(profile)] == [
+    assert [(each.name, each.active) for each in store.log(profile)] == [
         ("3", True), ("2", False), ("1", False),
     ]  # fmt: skip
     assert (profile / "history" / "0003.yaml").read_bytes() == (profile / "model.yaml").read_bytes()
     assert offset(profile) == 42
-    assert modelstore.find(profile, "0002").model == modelstore.find(profile, "2").model
-    assert modelstore.find(profile, "active").number == 3
+    assert store.find(profile, "0002").model == store.find(profile, "2").model
+    assert store.find(profile, "active").number == 3
 
 
 def test_activating_and_rolling_back(profile):
     make(profile, 40, 41, 42)
-    assert modelstore.activate(profile, 1, "worked better", DATE) == 1
+    assert store.activate(profile, 1, "worked better", DATE) == 1
     assert offset(profile) == 40
-    assert modelstore.rollback(profile, "no", DATE) == 3
-    assert modelstore.rollback(profile, "no", DATE) == 2
-    assert modelstore.rollback(profile, "no", DATE) == 1
+    assert store.rollback(profile, "no", DATE) == 3
+    assert store.rollback(profile, "no", DATE) == 2
+    assert store.rollback(profile, "no", DATE) == 1
     assert offset(profile) == 40
     with pytest.raises(
         InputError, match=r": no model was active before this one; there is nothing to roll back"
     ):
-        modelstore.rollback(profile, "no", DATE)
-    assert len(modelstore.log(profile)) == 3
-    actions = [each.action for each in modelstore.log(profile)[-1].activations]
+        store.rollback(profile, "no", DATE)
+    assert len(store.log(profile)) == 3
+    actions = [each.action for each in store.log(profile)[-1].activations]
     assert actions == ["commit", "activate", "rollback"]
 
 
 def test_a_model_put_there_by_hand_is_kept_before_it_is_replaced(profile):
     model(7).save(profile / "model.yaml")
-    assert [(each.name, each.active) for each in modelstore.log(profile)] == [("active", True)]
+    assert [(each.name, each.active) for each in store.log(profile)] == [("active", True)]
     make(profile, 40)
-    assert [(each.name, each.active) for each in modelstore.log(profile)] == [("2", True), ("1", False)]
+    assert [(each.name, each.active) for each in store.log(profile)] == [("2", True), ("1", False)]
     (profile / "model.yaml").write_text((profile / "model.yaml").read_text() + "# edited\n")
-    modelstore.rollback(profile, "undo the edit", DATE)
+    store.rollback(profile, "undo the edit", DATE)
     assert offset(profile) == 40
-    modelstore.rollback(profile, "and the calibration", DATE)
+    store.rollback(profile, "and the calibration", DATE)
     assert offset(profile) == 7
-    assert [each.number for each in modelstore.log(profile)] == [3, 2, 1]
+    assert [each.number for each in store.log(profile)] == [3, 2, 1]
 
 
 def test_a_model_broken_by_hand_can_be_rolled_back(profile):
     make(profile, 40)
     (profile / "model.yaml").write_text("schema: [")
-    modelstore.rollback(profile, "broken", DATE)
+    store.rollback(profile, "broken", DATE)
     assert offset(profile) == 40
     assert (profile / "history" / "unreadable.yaml").read_text() == "schema: ["
-    assert [each.number for each in modelstore.log(profile)] == [1]
+    assert [each.number for each in store.log(profile)] == [1]
 
 
 def test_another_drive_axis_or_gear_is_refused_and_nothing_changes(profile):
@@ -143,42 +142,42 @@ def test_another_drive_axis_or_gear_is_refused_and_nothing_changes(profile):
         r"\(.*axis\.yaml\); use the model of this drive, or calibrate it$"
     )
     with pytest.raises(InputError, match=line):
-        modelstore.activate(profile, 1, "", DATE, SERIAL_18)
+        store.activate(profile, 1, "", DATE, SERIAL_18)
     with pytest.raises(InputError, match=line):
-        modelstore.rollback(profile, "", DATE, SERIAL_18)
+        store.rollback(profile, "", DATE, SERIAL_18)
     with pytest.raises(InputError, match=r"^this model: ratio: this model is of a gear with ratio 40, but "):
-        modelstore.propose(profile, model(ratio=40), "", DATE)
+        store.propose(profile, model(ratio=40), "", DATE)
     assert before == {each: each.read_bytes() for each in profile.rglob("*.yaml")}
     (profile / "axis.yaml").write_text(AXIS.replace("name: test", "name: other"))
     with pytest.raises(InputError, match=r"was made for 'test', but the axis here is 'other'"):
-        modelstore.activate(profile, 1, "", DATE)
+        store.activate(profile, 1, "", DATE)
     (profile / "axis.yaml").write_text(AXIS)
-    modelstore.propose(profile, model(44), "", DATE, SERIAL_17)
+    store.propose(profile, model(44), "", DATE, SERIAL_17)
     with pytest.raises(InputError, match=r"pending\.yaml: provenance\.drive: "):
-        modelstore.commit(profile, DATE, SERIAL_18)
+        store.commit(profile, DATE, SERIAL_18)
     assert (profile / "pending.yaml").exists()
     assert offset(profile) == 41
 
 
 def test_what_is_not_there_is_said(profile):
     with pytest.raises(InputError, match=r": there is no pending model; calibrate first$"):
-        modelstore.commit(profile, DATE)
+        store.commit(profile, DATE)
     with pytest.raises(InputError, match=r": there is no pending model$"):
-        modelstore.discard(profile)
+        store.discard(profile)
     with pytest.raises(
         InputError, match=r": there is no version 3; expected one of: none yet, calibrate first$"
     ):
-        modelstore.activate(profile, 3, "", DATE)
+        store.activate(profile, 3, "", DATE)
     make(profile, 40)
-    modelstore.propose(profile, model(41), "", DATE)
+    store.propose(profile, model(41), "", DATE)
     with pytest.raises(InputError, match=r": there is no model '3'; expected one of: pending, 1, active$"):
-        modelstore.find(profile, "3")
+        store.find(profile, "3")
     with pytest.raises(InputError, match=r": there is no version 3; expected one of: 1$"):
-        modelstore.activate(profile, 3, "", DATE)
-    modelstore.discard(profile)
-    assert [each.name for each in modelstore.log(profile)] == ["1"]
+        store.activate(profile, 3, "", DATE)
+    store.discard(profile)
+    assert [each.name for each in store.log(profile)] == ["1"]
     with pytest.raises(InputError, match=r"nowhere: not a profile's folder: No such file or directory$"):
-        modelstore.commit(profile / "nowhere", DATE)
+        store.commit(profile / "nowhere", DATE)
 
 
 STEPS = st.lists(st.sampled_from(["commit", "activate", "rollback"]), max_size=12)
@@ -193,7 +192,7 @@ def test_rolling_back_undoes_activations_one_by_one(steps, random):
     for step in steps:
         if step == "rollback":
             expected = stack[-2] if len(stack) > 1 else None
-            assert modelstore.undone(log, stack[-1] if stack else None) == expected
+            assert store.undone(log, stack[-1] if stack else None) == expected
             if expected is None:
                 continue
             stack.pop()
@@ -209,8 +208,8 @@ def test_rolling_back_undoes_activations_one_by_one(steps, random):
 
 def test_a_log_that_lacks_the_last_step_is_understood():
     log = [Activation(date="", action="commit", version=each) for each in (1, 2)]
-    assert modelstore.undone(log, 3) == 2  # killed between the activation of 3 and the log
-    assert modelstore.undone(log, None) == 2  # a model that was put there by hand
+    assert store.undone(log, 3) == 2  # killed between the activation of 3 and the log
+    assert store.undone(log, None) == 2  # a model that was put there by hand
 
 
 def test_a_difference_lists_every_parameter_of_both():
@@ -243,17 +242,17 @@ WORKER = """
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hdbridge import modelstore
+from hdbridge.model import store
 from hdbridge.effects import Hysteresis
 from hdbridge.model import TransmissionModel
 profile, first = Path(sys.argv[1]), int(sys.argv[2])
 print("ready", flush=True)
 for offset in range(first, 3600):
     loop = Hysteresis(offset_arcsec=offset, width_deg=20, exponent=1.6)
-    modelstore.propose(profile, TransmissionModel(50.0, (loop,)), "again", datetime(2025, 1, 1, tzinfo=UTC))
-    modelstore.commit(profile, datetime(2025, 1, 1, tzinfo=UTC))
+    store.propose(profile, TransmissionModel(50.0, (loop,)), "again", datetime(2025, 1, 1, tzinfo=UTC))
+    store.commit(profile, datetime(2025, 1, 1, tzinfo=UTC))
     if offset % 3 == 0:
-        modelstore.rollback(profile, "back", datetime(2025, 1, 1, tzinfo=UTC))
+        store.rollback(profile, "back", datetime(2025, 1, 1, tzinfo=UTC))
 """
 
 
@@ -270,14 +269,14 @@ def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
         worker.send_signal(signal.SIGKILL)
         worker.wait()
         worker.stdout.close()
-        versions = modelstore.log(profile)
+        versions = store.log(profile)
         numbered = [each for each in versions if each.number]
         assert [each.number for each in numbered] == list(range(len(numbered), 0, -1))
         assert sum(each.active for each in numbered) == 1
         committed = max(committed, len(numbered))
         active = next(each for each in numbered if each.active)
-        went_back = modelstore.rollback(profile, "after the kill", DATE)
+        went_back = store.rollback(profile, "after the kill", DATE)
         assert went_back != active.number
-        modelstore.activate(profile, int(active.name), "and forth", DATE)
-        assert modelstore.find(profile, "active").number == active.number
+        store.activate(profile, int(active.name), "and forth", DATE)
+        assert store.find(profile, "active").number == active.number
     assert committed > 2, "the worker never got to commit"

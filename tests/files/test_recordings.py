@@ -5,8 +5,8 @@ import pytest
 
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
-from hdbridge.record import Record
-from hdbridge.recording import Recording, Segment, versions_here
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment, versions_here
 
 
 def record(start_s: float = 0.0, samples: int = 10) -> Record:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
-from hdbridge.record import Record, concatenate
+from hdbridge.records.record import Record, concatenate
 
 HEAD = "time_s,motor_position_deg,load_position_deg"
 

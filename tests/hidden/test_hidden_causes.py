@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hidden_bench import (
+from support.hidden import CAUSES
+from support.hidden_bench import (
     ACCELERATION_DEG_S2,
     REACH_DEG,
     SPEED_DEG_S,
@@ -38,8 +39,7 @@ from hdbridge.procedures.sine import Sines
 from hdbridge.procedures.standstill import Precondition
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.procedures.sweep import Sweep
-from hdbridge.recording import Recording
-from hdbridge.sim.hidden import CAUSES
+from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.truth import Truth
 

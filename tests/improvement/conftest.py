@@ -10,9 +10,9 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+from support.hidden import Run, hide
 
 from hdbridge.cli import main
-from hdbridge.sim.hidden import Run, hide
 from hdbridge.sim.truth import Truth
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"

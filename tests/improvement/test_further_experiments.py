@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import axis_view
+from hdbridge.control.bench import axis_view
 from hdbridge.diagnose.experiment import machine_for_unexplained, machine_plans
 from hdbridge.diagnose.result import Finding
 from hdbridge.improvement import choose, untold

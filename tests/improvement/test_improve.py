@@ -5,7 +5,7 @@ import json
 import pytest
 
 from hdbridge.model import TransmissionModel
-from hdbridge.recording import Recording
+from hdbridge.records.recording import Recording
 
 
 def causes(result):

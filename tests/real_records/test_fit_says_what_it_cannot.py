@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hdbridge.cli import app
 from hdbridge.errors import InputError
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 
 def write(path: Path, motor: np.ndarray, rate_hz: float = 100.0) -> Path:

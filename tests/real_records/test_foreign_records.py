@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.files import csvfile
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 RATIO = 50.0
 HEADER = "time_s,motor_position_deg,load_position_deg\n"

@@ -19,7 +19,7 @@ from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record, concatenate
+from hdbridge.records.record import Record, concatenate
 
 BESIDE = Path(__file__).parents[3] / "shared" / "data"
 NOTHING = TransmissionModel(100.0, ())

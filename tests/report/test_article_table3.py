@@ -1,9 +1,9 @@
 """What the page about the article's Table 3 says is what its script computes."""
 
-import importlib.util
 import re
 from pathlib import Path
 
+import article_table3
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -11,10 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("article_table3", ROOT / "tools" / "article_table3.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return article_table3
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import pytest
 from hdbridge.calibration import Calibration, Offer
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.evaluation.stepping import Scatter
 from hdbridge.identify.intervals import Interval
 from hdbridge.identify.noise import NoiseModel
 from hdbridge.identify.orders import Order
@@ -27,7 +28,6 @@ from hdbridge.identify.spectrum import Curve, Line, Resolution, Spectrum
 from hdbridge.model import TransmissionModel
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
-from hdbridge.stepping import Scatter
 
 
 def model(amplitude, phase, offset):

@@ -25,10 +25,10 @@ from hdbridge.effects import (
     extended,
 )
 from hdbridge.effects.kinematics import direction_of
+from hdbridge.evaluation.stepping import Scatter
 from hdbridge.model import TransmissionModel
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
-from hdbridge.stepping import Scatter
 
 RATIO = 50.0
 MODEL = TransmissionModel(

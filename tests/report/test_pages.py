@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.evaluation.stepping import Scheme, SchemeResult
 from hdbridge.procedures.stepping import Standing, SteppingOutcome
 from hdbridge.report.page import (
     Chart,
@@ -28,7 +29,6 @@ from hdbridge.report.page import (
     thinned,
 )
 from hdbridge.report.stepping import stepping_page
-from hdbridge.stepping import Scheme, SchemeResult
 
 
 class Reader(HTMLParser):

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
 
 from hdbridge.sim.exercise import Exercise
-from hdbridge.sim.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 

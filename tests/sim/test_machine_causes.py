@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.hidden.elastic import remembering
 
 from hdbridge.sim.encoder import Disc, Late, Losses, Signals
 from hdbridge.sim.exercise import Exercise
-from hdbridge.sim.hidden_elastic import remembering
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.loaded_plant import LoadedPlant, Spring
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.truth import Dahl, RollingFriction, Truth
-from hdbridge.sim.truth_encoder import TrueDisc, TrueLoss, TrueSignals
-from hdbridge.sim.truth_gear import TrueStiffening
+from hdbridge.sim.truth.encoder import TrueDisc, TrueLoss, TrueSignals
+from hdbridge.sim.truth.gear import TrueStiffening
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0

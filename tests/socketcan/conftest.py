@@ -23,7 +23,7 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
-from hdbridge.cycle import Cycle, Feedback
+from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import open_bus
 from hdbridge.drive.objects import Mode

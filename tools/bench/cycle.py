@@ -6,7 +6,7 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
   bare         python-can alone: SYNC, two TPDOs, RPDO (and the master's heartbeat as often as it is due),
                built and taken apart with struct; nothing is checked
-  cycle        `hdbridge.cycle.Cycle` with the whole fault table, target held
+  cycle        `hdbridge.control.cycle.Cycle` with the whole fault table, target held
   compensated  the same with the compensation of the article's model in every cycle
   canopen      the same loop on canopen's PDO objects (no compensation, nothing is checked)
 
@@ -43,8 +43,8 @@ from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
-from hdbridge.compensation import Compensation, CompensationLimits
-from hdbridge.cycle import Cycle, Feedback
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "diagnose"))
-import plant
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from support import plant
 
 from hdbridge.diagnose import diagnose
 from hdbridge.model import TransmissionModel
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 HIDDEN = {"backlash": {"gap": 6.0}, "load_order": {"orders": [(1, 5.0, 30.0)]}}
 

@@ -23,17 +23,17 @@ from pathlib import Path
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
-from hdbridge.compensation import Compensation, CompensationLimits
-from hdbridge.cycle import LATE, Cycle, Feedback
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.control.cycle import LATE, Cycle, Feedback
+from hdbridge.control.latency import wake_ups
+from hdbridge.control.realtime import prepare_realtime
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import open_bus
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Supervision
 from hdbridge.errors import HdbridgeError, SafetyStop
-from hdbridge.latency import wake_ups
 from hdbridge.model import TransmissionModel
-from hdbridge.realtime import prepare_realtime
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 SWING_DEG = 2.0

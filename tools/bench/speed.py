@@ -14,8 +14,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 from hdbridge.axis import AxisConfig, LoadTorque, Temperature
-from hdbridge.axischannels import ChannelSource
-from hdbridge.bench import Bench, compensation_for
+from hdbridge.axis.channels import ChannelSource
+from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Compliance, extended
 from hdbridge.files.bundled import bundled_profile

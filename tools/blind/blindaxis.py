@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import curve_fit
+from support.hidden.elastic import remembering
 
-from hdbridge.sim.hidden_elastic import remembering
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import RollingFriction, Truth
 

@@ -11,9 +11,9 @@ import random
 from dataclasses import dataclass
 
 import numpy as np
+from support.hidden import Run
 
 from hdbridge.sim.exercise import Exercise, Readings
-from hdbridge.sim.hidden import Run
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 

@@ -14,10 +14,10 @@ import numpy as np
 import yaml
 from blindaxis import OTHER_LAWS, BlindAxis, drawn_axis
 from blindbench import Bench, drawn_plan, run_of
+from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide_all
+from support.hidden.site import ARCSEC_PER_RAD
 
 from hdbridge.sim.exercise import Readings
-from hdbridge.sim.hidden import CAUSES, UNKNOWN, Hidden, Run, hide_all
-from hdbridge.sim.hidden_site import ARCSEC_PER_RAD
 from hdbridge.sim.truth import Truth
 
 KINDS = ("single", "power", "pair", "triple", "none", "other_law", "unknown", "no_torque")

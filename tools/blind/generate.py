@@ -17,6 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from blindcase import KINDS, Case, cases, make
 
 SUITE = "single=2,pair=30,triple=10,none=30,other_law=20,unknown=20,no_torque=4"

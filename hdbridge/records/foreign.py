@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import line_of_row
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WRAPPED_SHARE = 0.05

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cmath
 import math
 
-from hdbridge.sim.hidden_site import ARCSEC_PER_RAD, Hidden, Site, solve
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.loaded_plant import GRAVITY_M_S2
 from hdbridge.sim.truth import MaxwellSlip, RollingFriction, SlipElement
+from support.hidden.site import ARCSEC_PER_RAD, Hidden, Site, solve
 
 
 def hang_mass(site: Site, torque_nm: float) -> float:

@@ -13,7 +13,7 @@ from hdbridge.calibration.result import Offer, unit_of
 from hdbridge.cli.options import Profile, console, print_table
 from hdbridge.cli.scattertable import print_scatter
 from hdbridge.files.atomic import write_atomically
-from hdbridge.modeldiff import diff
+from hdbridge.model.difference import diff
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
 

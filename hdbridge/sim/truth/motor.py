@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from hdbridge.sim.truth_encoder import TrueMotorEncoder
-from hdbridge.sim.truth_part import Part
+from hdbridge.sim.truth.encoder import TrueMotorEncoder
+from hdbridge.sim.truth.part import Part
 
 
 class TrueMotor(Part):

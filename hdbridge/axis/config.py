@@ -14,17 +14,12 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
-from hdbridge.axischannels import LoadTorque, MeasuredChannel, Temperature
-from hdbridge.axisencoders import INT32_MAX, Encoder, LoadEncoder, MotorEncoder, NodeId, Source
+from hdbridge.axis.channels import LoadTorque, MeasuredChannel, Temperature
+from hdbridge.axis.encoders import INT32_MAX, LoadEncoder, MotorEncoder, NodeId
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wrong
 from hdbridge.units import ARCSEC_PER_DEG
-
-__all__ = [
-    "AxisConfig", "BusConfig", "CompensationConfig", "DriveConfig", "Encoder", "Gear", "Identity", "Limits",
-    "LoadEncoder", "LoadTorque", "MotorEncoder", "Source", "Teeth", "Temperature",
-]  # fmt: skip
 
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 

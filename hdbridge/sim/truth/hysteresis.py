@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
-from hdbridge.sim.truth_part import Part
+from hdbridge.sim.truth.part import Part
 
 
 class TrueOrder(Part):

@@ -14,7 +14,7 @@ from hdbridge.axis import AxisConfig, Identity, Teeth
 from hdbridge.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
-from hdbridge.modelfile import Provenance, binding, content_of, text_of
+from hdbridge.model.file import Provenance, binding, content_of, text_of
 
 
 @dataclass(frozen=True)

@@ -14,47 +14,47 @@ import random
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 
-from hdbridge.sim import hidden_elastic, hidden_readings, hidden_slow, hidden_teeth, hidden_unknown
-from hdbridge.sim.hidden_site import Hidden, Run, Site
 from hdbridge.sim.truth import Truth
+from support.hidden import elastic, readings, slow, teeth, unknown
+from support.hidden.site import Hidden, Run, Site
 
 __all__ = ["CAUSES", "UNKNOWN", "Hidden", "Run", "hide", "hide_all"]
 
 UNKNOWN: Mapping[str, Callable[[Site], Hidden]] = MappingProxyType(
     {
-        "unexplained:roller": hidden_unknown.roller,
-        "unexplained:seat": hidden_unknown.seat,
-        "unexplained:cable": hidden_unknown.cable,
-        "unexplained:sensor_warming": hidden_unknown.sensor_warming,
+        "unexplained:roller": unknown.roller,
+        "unexplained:seat": unknown.seat,
+        "unexplained:cable": unknown.cable,
+        "unexplained:sensor_warming": unknown.sensor_warming,
     }
 )
 """Causes outside the catalogue."""
 
 CAUSES: Mapping[str, Callable[[Site], Hidden]] = MappingProxyType(
     {
-        "motor_order": hidden_teeth.motor_order,
-        "motor_encoder_eccentricity": hidden_readings.motor_encoder_eccentricity,
-        "load_order": hidden_readings.load_order,
-        "flexspline_order": hidden_teeth.flexspline_order,
-        "direction_phase": hidden_teeth.direction_phase,
-        "torque_modulation": hidden_teeth.torque_modulation,
-        "compliance": hidden_elastic.compliance,
-        "inertial_windup": hidden_elastic.inertial_windup,
-        "velocity_windup": hidden_elastic.velocity_windup,
-        "channel_skew": hidden_readings.channel_skew,
-        "backlash": hidden_elastic.backlash,
-        "hysteresis_memory": hidden_elastic.hysteresis_memory,
-        "hysteresis_parameters": hidden_elastic.hysteresis_parameters,
-        "rate_dependence": hidden_elastic.rate_dependence,
-        "subdivisional_error": hidden_readings.subdivisional_error,
-        "zero_drift": hidden_slow.zero_drift,
-        "amplitude_drift": hidden_slow.amplitude_drift,
-        "wear": hidden_slow.wear,
-        "creep": hidden_slow.creep,
-        "ratio_error": hidden_teeth.ratio_error,
-        "count_loss": hidden_readings.count_loss,
-        "vibration": hidden_elastic.vibration,
-        "local_defect": hidden_teeth.local_defect,
+        "motor_order": teeth.motor_order,
+        "motor_encoder_eccentricity": readings.motor_encoder_eccentricity,
+        "load_order": readings.load_order,
+        "flexspline_order": teeth.flexspline_order,
+        "direction_phase": teeth.direction_phase,
+        "torque_modulation": teeth.torque_modulation,
+        "compliance": elastic.compliance,
+        "inertial_windup": elastic.inertial_windup,
+        "velocity_windup": elastic.velocity_windup,
+        "channel_skew": readings.channel_skew,
+        "backlash": elastic.backlash,
+        "hysteresis_memory": elastic.hysteresis_memory,
+        "hysteresis_parameters": elastic.hysteresis_parameters,
+        "rate_dependence": elastic.rate_dependence,
+        "subdivisional_error": readings.subdivisional_error,
+        "zero_drift": slow.zero_drift,
+        "amplitude_drift": slow.amplitude_drift,
+        "wear": slow.wear,
+        "creep": slow.creep,
+        "ratio_error": teeth.ratio_error,
+        "count_loss": readings.count_loss,
+        "vibration": elastic.vibration,
+        "local_defect": teeth.local_defect,
     }
 )
 """The catalogue's causes."""

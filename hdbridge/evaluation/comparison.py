@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from hdbridge.bench import Bench, Run, compensation_for
+from hdbridge.control.bench import Bench, Run, compensation_for
 from hdbridge.drive.drive import Drive
+from hdbridge.evaluation.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
-from hdbridge.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 from hdbridge.sim.encoder import Signals
-from hdbridge.sim.hidden_site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site
-from hdbridge.sim.truth_encoder import TrueSignals
+from hdbridge.sim.truth.encoder import TrueSignals
+from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site
 
 
 def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:

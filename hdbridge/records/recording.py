@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically, wrong
-from hdbridge.record import Record, concatenate, time_shifts_s
+from hdbridge.records.record import Record, concatenate, time_shifts_s
 
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"

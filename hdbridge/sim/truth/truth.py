@@ -2,7 +2,7 @@
 
 A calibration does not read this file; it has to find out. docs/truth-file.md describes each key, and
 `profiles/article/truth.yaml` is the article's bench. Angles and torques of the gear are at the load.
-The sections have their own files, ``truth_*.py``.
+The sections have their own files in this folder.
 """
 
 from __future__ import annotations
@@ -14,24 +14,10 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import document_from_text, read_yaml, wrong
-from hdbridge.sim.truth_gear import TrueGear
-from hdbridge.sim.truth_hysteresis import (
-    BoucWen,
-    Dahl,
-    Hysteresis,
-    MaxwellSlip,
-    RollingFriction,
-    SlipElement,
-    TrueOrder,
-)
-from hdbridge.sim.truth_load import TrueLoad
-from hdbridge.sim.truth_motor import TrueMotor, TrueServo
-from hdbridge.sim.truth_part import Part
-
-__all__ = [
-    "BoucWen", "Dahl", "Hysteresis", "MaxwellSlip", "RollingFriction", "SlipElement", "TrueGear", "TrueLoad",
-    "TrueMotor", "TrueOrder", "TrueServo", "TrueTemperature", "Truth",
-]  # fmt: skip
+from hdbridge.sim.truth.gear import TrueGear
+from hdbridge.sim.truth.load import TrueLoad
+from hdbridge.sim.truth.motor import TrueMotor, TrueServo
+from hdbridge.sim.truth.part import Part
 
 
 class TrueTemperature(Part):

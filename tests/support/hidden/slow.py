@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from hdbridge.sim.hidden_site import Hidden, Site
+from support.hidden.site import Hidden, Site
 
 
 def _warm(site: Site) -> float:

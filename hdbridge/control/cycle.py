@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from hdbridge.clock import Clock
+from hdbridge.control.latency import Histogram
 from hdbridge.drive.fastlink import fast_link
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import HALT_BIT, ProcessImage
@@ -35,7 +36,6 @@ from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
 from hdbridge.errors import BusError, InputError, SafetyStop
-from hdbridge.latency import Histogram
 
 __all__ = ["Command", "Cycle", "Feedback", "Target"]
 

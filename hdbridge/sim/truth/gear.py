@@ -8,8 +8,8 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
-from hdbridge.sim.truth_hysteresis import Hysteresis, TrueOrder
-from hdbridge.sim.truth_part import Part
+from hdbridge.sim.truth.hysteresis import Hysteresis, TrueOrder
+from hdbridge.sim.truth.part import Part
 from hdbridge.units import ARCSEC_PER_DEG
 
 

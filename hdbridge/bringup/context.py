@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
 
     from hdbridge.axis import AxisConfig
-    from hdbridge.cycle import Feedback
+    from hdbridge.control.cycle import Feedback
 
 Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]
 """Opens an axis's bus and gives the clock that goes with it."""
@@ -27,7 +27,7 @@ Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
 TORQUE_PERCENT: Final = 50.0
 
 
-class Patient:
+class BringUpContext:
     """One axis under examination; a context manager that leaves the drive off and the bus closed.
 
     ``load`` reads the axis file, ``connect`` opens its bus: both are checks, so they come as functions.

@@ -15,8 +15,8 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.compensation import Compensation, CompensationLimits
-from hdbridge.cycle import Cycle, Feedback
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
@@ -27,7 +27,7 @@ from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
-from hdbridge.record import Record
+from hdbridge.records.record import Record
 
 Outcome = TypeVar("Outcome")
 KEYS = {Channel.LOAD_TORQUE: "load_torque", Channel.TEMPERATURE: "temperature"}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hdbridge.sim.hidden_elastic import hang_mass
-from hdbridge.sim.hidden_site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, solve
 from hdbridge.sim.loaded_plant import GRAVITY_M_S2
+from support.hidden.elastic import hang_mass
+from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, solve
 
 
 def motor_order(site: Site) -> Hidden:

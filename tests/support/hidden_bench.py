@@ -18,19 +18,19 @@ from pathlib import Path
 from typing import Any
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
+from hdbridge.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.chain import Chain
 from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.stepping import Stepping
-from hdbridge.recording import Recording, Segment
-from hdbridge.sim.hidden import Hidden, Run, hide_all
+from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.stepping import SchemeResult, quantisation_floor_arcsec
+from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 CYCLE_MS = 10

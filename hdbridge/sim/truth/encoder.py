@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
-from hdbridge.sim.truth_part import Part
+from hdbridge.sim.truth.part import Part
 
 Direction = Literal[1, -1]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hdbridge.sim.hidden_site import Hidden, Site
+from support.hidden.site import Hidden, Site
 
 
 def roller(site: Site) -> Hidden:

@@ -1,0 +1,19 @@
+"""The axis file: drive, bus, encoders, measured channels and gear, and the limits of motion."""
+
+from hdbridge.axis.channels import LoadTorque, Temperature
+from hdbridge.axis.config import (
+    AxisConfig,
+    BusConfig,
+    CompensationConfig,
+    DriveConfig,
+    Gear,
+    Identity,
+    Limits,
+    Teeth,
+)
+from hdbridge.axis.encoders import Encoder, LoadEncoder, MotorEncoder, Source
+
+__all__ = [
+    "AxisConfig", "BusConfig", "CompensationConfig", "DriveConfig", "Encoder", "Gear", "Identity", "Limits",
+    "LoadEncoder", "LoadTorque", "MotorEncoder", "Source", "Teeth", "Temperature",
+]  # fmt: skip

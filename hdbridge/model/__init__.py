@@ -1,0 +1,5 @@
+"""The transmission model: a gear ratio and a sum of effects; its file, its history, its differences."""
+
+from hdbridge.model.transmission import ModelTracker, TransmissionModel
+
+__all__ = ["ModelTracker", "TransmissionModel"]

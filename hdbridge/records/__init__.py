@@ -1,0 +1,1 @@
+"""Measured time series of one axis: records, recordings with what moved how, records of other benches."""

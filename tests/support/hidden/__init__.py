@@ -1,0 +1,6 @@
+"""Hides a physical cause in the simulated axis: what a diagnosis is then asked to find."""
+
+from support.hidden.hide import CAUSES, UNKNOWN, hide, hide_all
+from support.hidden.site import Hidden, Run
+
+__all__ = ["CAUSES", "UNKNOWN", "Hidden", "Run", "hide", "hide_all"]
