@@ -144,8 +144,11 @@ def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatA
     own = fitted.places(place)
     names = [fitted.parameters[i].name if fitted.parameters[i].shape else "offset_arcsec" for i in own]
 
+    sign = -1.0 if given.parameters()["offset_arcsec"] < 0.0 else 1.0
+
     def sizes(effect: Effect) -> FloatArray:
         values = effect.parameters()
+        values["offset_arcsec"] *= sign
         return np.array([float(values[name]) - (1.0 if name == "exponent" else 0.0) for name in names])
 
     here = sizes(now)

@@ -16,7 +16,7 @@ from hdbridge.diagnose import seek
 from hdbridge.diagnose.candidates import Candidate, candidates
 from hdbridge.diagnose.gates import all_steps_seen, gate, standing_s
 from hdbridge.diagnose.screen import Score, Screen, score_of
-from hdbridge.diagnose.theory import Fitted, Theory, Workshop
+from hdbridge.diagnose.theory import LOOPS, Fitted, Theory, Workshop
 from hdbridge.effects import (
     AmplitudeDrift,
     ChannelSkew,
@@ -102,6 +102,27 @@ class Search:
         self._screens: dict[object, Screen] = {}
         self._refused: set[object] = set()
         self._left_out: str | None = None
+        law = next((each for each in self._base if isinstance(each, LOOPS)), None)
+        if law is not None:
+            workshop.loop_sign = -1.0 if law.offset_arcsec < 0.0 else 1.0
+            self._choose_sign()
+
+    def _choose_sign(self) -> None:
+        """Let the load lag where the model has it lead, or the other way round, where that explains more than
+        a loop of the model's sign with the best cause beside it (play lags, too).
+        """
+        if self.workshop.evidence.reversals < 2:
+            return
+        known = self._begin()
+        if any(isinstance(each, LOOPS) and each.offset_arcsec for each in known.theory.effects):
+            return  # not held at zero: it has the model's sign
+        self.workshop.loop_sign *= -1.0
+        other = self._begin()
+        self.workshop.loop_sign *= -1.0
+        rival = self.best_addition(known) or known
+        self.forget()
+        if cost(other) + ENTER < cost(rival):
+            self.workshop.loop_sign *= -1.0
 
     def run(self) -> Trail:
         """Find causes, best first; where much is left, again without the cause that was best at first.

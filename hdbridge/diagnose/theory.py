@@ -38,9 +38,11 @@ KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large."""
 FIXED_SHAPES = frozenset({"time_s", "frequency_hz", "torque1_nm", "torque2_nm"})
 """Shapes that a local step cannot improve: found by search over all their values."""
-ONE_SIDED = (Hysteresis, HysteresisMemory, VelocityWindup)
+LOOPS = (Hysteresis, HysteresisMemory)
+ONE_SIDED = (VelocityWindup,)
 """Effects of which no coefficient is negative. One that is not there would come out on either side of zero
-by chance, and half of the time the effect would be refused for it: it is held at zero instead."""
+by chance, and half of the time the effect would be refused for it: it is held at zero instead. A loop has the
+sign of `Workshop.loop_sign`, for the same reason."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 _EPS = 1e-9
@@ -123,6 +125,8 @@ class Workshop:
         self._fits: OrderedDict[object, Fitted] = OrderedDict()
         # About the level that they have in common: an encoder's zero is no part of the physics.
         self.level = float(np.median(self.observed))
+        self.loop_sign = 1.0
+        """Of the loop's offset: -1 where the load lags."""
         self.nuisance: FloatArray = np.empty((len(self.index), 0))
         """Columns that every fit may use and that mean nothing, shape (m, k)."""
 
@@ -172,7 +176,9 @@ class Workshop:
     def fit(self, theory: Theory, iterations: int = ITERATIONS) -> Fitted:
         """Gauss-Newton from where the theory stands; never worse than where it began."""
         counted = any(Channel.LOAD_ANGLE in each.channels for each in theory.effects)
-        key = (theory, iterations, self.nuisance.shape[1], self.load_angles if counted else 0)
+        key = (
+            theory, iterations, self.nuisance.shape[1], self.load_angles if counted else 0, self.loop_sign,
+        )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
@@ -217,11 +223,11 @@ class Workshop:
         observed = (self.observed - self.level) * self.weight
         # Linear in the coefficients: solve for them outright; what is carried elsewhere follows in
         # `refreshed`.
-        bounded = [
-            each.effect >= 0 and isinstance(theory.effects[each.effect], ONE_SIDED) for each in parameters
-        ]
+        sign = np.array(
+            [0.0 if each.effect < 0 else self._sign(theory.effects[each.effect]) for each in parameters]
+        )
         solution = solve(linear, observed)
-        while np.any(below := np.array(bounded) & (solution < 0.0)):
+        while np.any(below := sign * solution < 0.0):
             linear[:, below] = 0.0
             solution = solve(linear, observed)
         effects: list[Effect] = []
@@ -239,6 +245,12 @@ class Workshop:
             tuple(parameters),
             float(residual @ residual),
         )
+
+    def _sign(self, effect: Effect) -> float:
+        """The sign that an effect's coefficients have; 0 where they may have either."""
+        if isinstance(effect, LOOPS):
+            return self.loop_sign
+        return 1.0 if isinstance(effect, ONE_SIDED) else 0.0
 
     def with_shapes(self, fitted: Fitted, names: Container[str] | None = None) -> Fitted:
         """With the tangents of these shapes, or of all but `FIXED_SHAPES`; the same where there are none."""

@@ -86,13 +86,21 @@ class AmplitudeDrift(Linear, Warmed):
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; in thermal equilibrium at its first moment."""
-        return _Tracker(self, start)
+        return _Tracker(self, self.loop.law().tracker(start))
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """Where the load lags: of a loop that at the highest warmth falls no steeper than that."""
+        left = fall_arcsec_per_deg - self.ripple_fall()
+        if not self.loop_share() or left <= 0.0:
+            return None
+        loop = self.loop.law().gentle_tracker(start, left / self.loop_share())
+        return None if loop is None else _Tracker(self, loop)
 
     def bound_arcsec(self) -> float:
         """At the highest warmth."""
         ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
         ripple *= self._most()
-        return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k) * self.loop.offset_arcsec)
+        return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
 
     def slope_bound_arcsec_per_deg(self) -> float:
         """The ripple's steepest fall; no bound where the loop changes: it falls as steeply as the loop rises.
@@ -121,10 +129,10 @@ class AmplitudeDrift(Linear, Warmed):
 class _Tracker(Tracker):
     __slots__ = ("_friction", "_load", "_loop", "_orders", "_ripple", "_warmth")
 
-    def __init__(self, effect: AmplitudeDrift, start: Start) -> None:
+    def __init__(self, effect: AmplitudeDrift, loop: Tracker) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._load = effect.under_load
-        self._loop = effect.loop.law().tracker(start)
+        self._loop = loop
         self._ripple = 0.01 * effect.ripple_percent_per_k
         self._friction = 0.01 * effect.friction_percent_per_k
         self._warmth = WarmthState(effect)

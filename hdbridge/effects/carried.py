@@ -26,7 +26,9 @@ class Loop(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    offset_arcsec: Annotated[float, Field(ge=0, le=3600, description="half the height, at the load")]
+    offset_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")
+    ]
     width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle of a full crossing")]
     exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
     memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False

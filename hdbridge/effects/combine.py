@@ -80,13 +80,14 @@ def fall_bound(effects: Iterable[Effect]) -> float:
     """A bound on how steeply the *sum* can fall, arcsec per motor degree.
 
     The sum of the effects' own bounds, but for one case: what takes a share from the model's loop falls as
-    steeply as the loop rises, and as long as no more than the whole loop is taken, the sum still rises.
+    steeply as the loop rises, and as long as no more than the whole loop is taken, the sum still rises. (That
+    of a loop in which the load lags may fall without bound either way.)
     """
     given = tuple(effects)
     left = {
         _key(Loop(**each.parameters(), memory=isinstance(each, HysteresisMemory))): 1.0
         for each in given
-        if isinstance(each, _LAWS)
+        if isinstance(each, _LAWS) and each.offset_arcsec >= 0.0
     }
     total = 0.0
     for each in given:

@@ -1,6 +1,12 @@
 """What the laws of the elastic loop share: offset, width and exponent, and the branch.
 
 The error is the offset times a loop of unit height (`_unit`), which is what one law has and another has not.
+
+The offset has a sign. Positive: the load is ahead in the direction of motion, and the error rises along
+the path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path.
+Then the load stands still until the gear has wound up the other way, so the fall is at most the gear's own
+slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the inverse takes
+it with a slope that it can invert (`gentle_tracker`).
 """
 
 from __future__ import annotations
@@ -13,7 +19,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from hdbridge.effects.base import Compensable, Effect, FloatArray, Motion, Shape, Start
+from hdbridge.effects.base import Compensable, Effect, FloatArray, Motion, Shape, Start, Tracker
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
@@ -32,15 +38,16 @@ def rise(xi: FloatArray, n: float) -> FloatArray:
     return result
 
 
-def rise_at(xi: float, n: float) -> float:
-    """`rise` for one number, in plain floats for the control loop."""
+def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
+    """`rise` for one number, in plain floats for the control loop; nowhere above ``steepest`` times xi."""
     if xi <= 0.0:
         return 0.0
     if xi >= 1.0:
         return 1.0
     log = -math.log(xi)
     m = 2.0 - n
-    return xi * (1.0 + (log if m == 0.0 else math.expm1(m * log) / m))
+    slope = 1.0 + (log if m == 0.0 else math.expm1(m * log) / m)
+    return xi * (slope if slope < steepest else steepest)
 
 
 class ElasticLoop(Effect):
@@ -57,7 +64,12 @@ class ElasticLoop(Effect):
     """A published gear of ratio 50."""
 
     offset_arcsec: Annotated[
-        float, Field(ge=0, le=3600, description="half the height of the loop, at the load")
+        float,
+        Field(
+            ge=-3600,
+            le=3600,
+            description="half the height of the loop, at the load; negative where the load lags",
+        ),
     ]
     width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
     exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
@@ -79,12 +91,33 @@ class ElasticLoop(Effect):
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:
-        """The offset."""
-        return self.offset_arcsec
+        """The offset's size."""
+        return abs(self.offset_arcsec)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """On-line tracker; its first `advance` only says where the motor stands."""
+        return self._tracker(start, self.width_deg, math.inf)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: along its path hysteresis only rises."""
-        return 0.0
+        """Zero where the load leads: along its path the error only rises. Where it lags, the slope at a
+        reversal, which is without bound for exponents up to 2.
+        """
+        if self.offset_arcsec >= 0.0:
+            return 0.0
+        n = self.exponent
+        return -2.0 * self.offset_arcsec / self.width_deg * (n - 1.0) / (n - 2.0) if n > 2.0 else math.inf
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """Of a load that lags: the same branch, from each reversal on no steeper than that."""
+        if self.offset_arcsec >= 0.0:
+            return None
+        height = -2.0 * self.offset_arcsec
+        width = max(self.width_deg, height / fall_arcsec_per_deg)
+        return self._tracker(start, width, fall_arcsec_per_deg * width / height)
+
+    @abstractmethod
+    def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
+        """A tracker with this width, whose branch rises by no more than ``steepest`` per width."""
 
     @abstractmethod
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:

@@ -31,20 +31,21 @@ class Hysteresis(ElasticLoop):
     about: ClassVar[Cause] = Cause(
         title="nonlinear-elastic transmission error (hysteresis)",
         equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; "
-        "xi = |theta_M - theta_M,rev| / width",
+        "xi = |theta_M - theta_M,rev| / width; offset > 0: the load leads, offset < 0: it lags",
         signature="a loop of constant height between the two directions; after a reversal it takes a fixed "
         "motor angle to cross",
-        consequence="the load arrives short of its target, from either side",
-        remedy="compensate it; it grows with preload and friction in the mesh",
+        consequence="the load comes to rest ahead of its target in the direction of motion (offset > 0) or "
+        "short of it (offset < 0), from either side",
+        remedy="compensate it; a leading loop grows with preload and friction in the mesh, a lagging one "
+        "with friction at the load",
         experiment="slow sines of several amplitudes, some smaller than the width",
         aliases=("backlash",),
         source="rolling-friction law with exponent n; the height is twice the offset",
         size="10-80 arcsec from side to side",
     )
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; its first `advance` only says where the motor stands."""
-        return _HysteresisTracker(self.offset_arcsec, self.width_deg, self.exponent, start)
+    def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
+        return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
         """The loop for an offset of one: a loop over the reversals, then all samples at once."""
@@ -93,25 +94,31 @@ def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[i
 
 
 class _HysteresisTracker(Tracker):
-    """State: the present branch (where it began, from which value, in which direction) and the last angle."""
+    """State: the present branch (where it began, from which value, in which direction), the last angle, and
+    the value there; values are those of a loop of unit offset.
+    """
 
     __slots__ = (
-        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_value", "_virgin",
-        "_width",
+        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_steepest", "_value",
+        "_virgin", "_width",
     )  # fmt: skip
 
-    def __init__(self, offset: float, width: float, exponent: float, start: Start) -> None:
+    def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset
         self._width = width
         self._exponent = exponent
+        self._steepest = steepest
         self._sign = start.value
-        self._value = start.value * offset
+        self._value = float(start.value)
         self._virgin = start is Start.VIRGIN
         self._angle: float | None = None
         self._branch_angle = 0.0
         self._branch_value = self._value
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._offset * self._at(motor_deg)
+
+    def _at(self, motor_deg: float) -> float:
         last = self._angle
         if last is None or motor_deg == last:
             return self._value
@@ -124,8 +131,8 @@ class _HysteresisTracker(Tracker):
         last = self._angle
         if last is None:
             self._angle = self._branch_angle = motor_deg
-            return self._value
-        value = self.peek(motor_deg, moment)
+            return self._offset * self._value
+        value = self._at(motor_deg)
         if motor_deg != last:
             sign = 1 if motor_deg > last else -1
             if sign != self._sign:
@@ -133,12 +140,12 @@ class _HysteresisTracker(Tracker):
                 self._branch_angle, self._branch_value, self._sign = last, self._value, sign
             self._angle = motor_deg
             self._value = value
-        return value
+        return self._offset * value
 
     def _on_branch(self, motor_deg: float, origin: float, value: float, sign: int, virgin: bool) -> float:
         xi = abs(motor_deg - origin) / self._width
         if virgin:
-            height = self._offset * rise_at(2.0 * xi, self._exponent)
+            height = rise_at(2.0 * xi, self._exponent, self._steepest)
         else:
-            height = 2.0 * self._offset * rise_at(xi, self._exponent)
-        return sign * min(sign * value + height, self._offset)
+            height = 2.0 * rise_at(xi, self._exponent, self._steepest)
+        return sign * min(sign * value + height, 1.0)

@@ -19,6 +19,7 @@ infinitely steeply where the plain law rises, and would have to repeat the plain
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -53,9 +54,8 @@ class HysteresisMemory(ElasticLoop):
         size="10-27 arcsec from the plain law, for a loop of 80",
     )
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; its first `advance` only says where the motor stands."""
-        return _MemoryTracker(self.offset_arcsec, self.width_deg, self.exponent, start)
+    def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
+        return _MemoryTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
@@ -116,11 +116,14 @@ class _Memory:
     where it closes. Empty: on the virgin curve through ``_origin`` in direction ``_sign``.
     """
 
-    __slots__ = ("_exponent", "_origin", "_points", "_sign", "_width")
+    __slots__ = ("_exponent", "_origin", "_points", "_sign", "_steepest", "_width")
 
-    def __init__(self, width: float, exponent: float, angle: float, start: int) -> None:
+    def __init__(
+        self, width: float, exponent: float, angle: float, start: int, steepest: float = math.inf
+    ) -> None:
         self._width = width
         self._exponent = exponent
+        self._steepest = steepest
         self._points: list[tuple[float, float]] = []
         self._sign = start
         # A saturated start is half a width up the virgin curve.
@@ -202,23 +205,27 @@ class _Memory:
     def _on(self, segment: _Segment, angle: float) -> float:
         xi = abs(angle - segment.angle) / self._width
         virgin = segment.virgin
-        height = rise_at(2.0 * xi, self._exponent) if virgin else 2.0 * rise_at(xi, self._exponent)
+        if virgin:
+            height = rise_at(2.0 * xi, self._exponent, self._steepest)
+        else:
+            height = 2.0 * rise_at(xi, self._exponent, self._steepest)
         return segment.sign * min(segment.sign * segment.value + height, 1.0)
 
 
 class _MemoryTracker(Tracker):
     """State: the remembered reversals, the last angle and the value there."""
 
-    __slots__ = ("_angle", "_exponent", "_memory", "_offset", "_start", "_value", "_width")
+    __slots__ = ("_angle", "_exponent", "_memory", "_offset", "_start", "_steepest", "_value", "_width")
 
-    def __init__(self, offset: float, width: float, exponent: float, start: Start) -> None:
+    def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset
         self._width = width
         self._exponent = exponent
+        self._steepest = steepest
         self._start = start.value
         self._value = float(start.value)
         self._angle: float | None = None
-        self._memory = _Memory(width, exponent, 0.0, start.value)
+        self._memory = _Memory(width, exponent, 0.0, start.value, steepest)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
         last = self._angle
@@ -231,7 +238,7 @@ class _MemoryTracker(Tracker):
         last = self._angle
         if last is None:
             self._angle = motor_deg
-            self._memory = _Memory(self._width, self._exponent, motor_deg, self._start)
+            self._memory = _Memory(self._width, self._exponent, motor_deg, self._start, self._steepest)
         elif motor_deg != last:
             self._value = self._memory.move(last, self._value, motor_deg, 1 if motor_deg > last else -1)
             self._angle = motor_deg

@@ -52,7 +52,9 @@ class HysteresisParameters(Effect):
     shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
 
     base: Annotated[Loop, Field(description="the model's loop")]
-    offset_arcsec: Annotated[float, Field(ge=0, le=3600, description="new offset")]
+    offset_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
+    ]
     width_deg: Annotated[float, Field(gt=0, le=3600, description="new width")]
     exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
 
@@ -86,12 +88,12 @@ class HysteresisParameters(Effect):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """Sum of the offsets."""
-        return self.offset_arcsec + self.base.offset_arcsec
+        """Sum of the offsets' sizes."""
+        return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """No bound: where the old loop sets out infinitely steeply, the difference falls so."""
-        return math.inf if self.base.offset_arcsec else 0.0
+        """No bound: where a loop that is taken off sets out infinitely steeply, the difference falls so."""
+        return math.inf if self.base.offset_arcsec > 0.0 or self.offset_arcsec < 0.0 else 0.0
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:

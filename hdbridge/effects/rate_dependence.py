@@ -64,16 +64,28 @@ class RateDependence(Linear):
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; speed comes with the moment."""
-        return _Tracker(self, start)
+        return _Tracker(self, self.loop.law().tracker(start))
 
     def bound_arcsec(self) -> float:
         """The growth at the highest speed."""
-        decades = math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
-        return 0.01 * self.growth_percent * decades * self.loop.offset_arcsec
+        return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: a growing loop only rises along its path (one that shrank could fall without bound)."""
-        return 0.0 if self.growth_percent >= 0.0 else math.inf
+        """Zero: a growing loop only rises along its path. One that shrinks, or in which the load lags, falls
+        as steeply as the loop sets out.
+        """
+        return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """Where the load lags: of a loop that at the highest speed falls no steeper than that."""
+        if self.growth_percent <= 0.0:
+            return None
+        loop = self.loop.law().gentle_tracker(start, fall_arcsec_per_deg / self._most())
+        return None if loop is None else _Tracker(self, loop)
+
+    def _most(self) -> float:
+        """The share of the loop at the highest speed."""
+        return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
@@ -83,8 +95,8 @@ class RateDependence(Linear):
 class _Tracker(Tracker):
     __slots__ = ("_gain", "_limit", "_loop", "_reference")
 
-    def __init__(self, effect: RateDependence, start: Start) -> None:
-        self._loop = effect.loop.law().tracker(start)
+    def __init__(self, effect: RateDependence, loop: Tracker) -> None:
+        self._loop = loop
         self._gain = 0.01 * effect.growth_percent / math.log(10.0)
         self._reference = effect.reference_deg_s
         self._limit = effect.limit_deg_s

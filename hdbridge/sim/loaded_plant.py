@@ -56,8 +56,9 @@ class LoadedPlant(Plant):
     """A `Plant` with all that the truth file can put on its spring and load."""
 
     __slots__ = (
-        "_arm_nm", "_breakaway", "_breakaway_speed", "_down_deg", "_gap_deg", "_play_deg", "_played_deg",
-        "_shaking", "_spring", "_step", "_thinning", "_viscous", "_whole_inertia",
+        "_arm_nm", "_breakaway", "_breakaway_speed", "_down_deg", "_gap_deg", "_held_deg", "_held_nm",
+        "_play_deg", "_played_deg", "_shaking", "_sliders", "_spring", "_step", "_thinning", "_viscous",
+        "_whole_inertia",
     )  # fmt: skip
 
     def __init__(self, truth: Truth) -> None:
@@ -82,6 +83,9 @@ class LoadedPlant(Plant):
             (math.tau * each.frequency_hz * self._dt, math.radians(each.phase_deg), each.torque_nm)
             for each in load.vibration
         )
+        self._sliders = tuple((each.limit_nm / each.travel_deg, each.limit_nm) for each in load.presliding)
+        self._held_nm = [0.0] * len(self._sliders)
+        self._held_deg = self.now.load_deg
         self._step = 0
         coupling = load.encoder.coupling
         self._play_deg = 0.5 * coupling.play_arcsec / ARCSEC_PER_DEG if coupling else 0.0
@@ -99,6 +103,7 @@ class LoadedPlant(Plant):
             or load.gravity is not None
             or load.stribeck is not None
             or load.thinning is not None
+            or load.presliding
             or load.vibration
             or (coupling is not None and coupling.play_arcsec)
         )
@@ -144,6 +149,8 @@ class LoadedPlant(Plant):
         now.torque_nm = self._spring.torque_nm(new_output - new_load)
         now.load_deg = new_load
         self.load_deg_s = new_load_speed
+        if self._sliders:
+            self._held_nm, self._held_deg = self._held_at(new_load), new_load
         if self._play_deg:
             load, new_load = self._played_deg, self._play(new_load)
         self._turn_encoder(load, new_load)
@@ -161,11 +168,21 @@ class LoadedPlant(Plant):
             # No more than stops the load within the substep.
             inertia = self._whole_inertia
             outer += inertia * math.expm1(-viscous / inertia * self._dt) / self._dt * load_speed
+        if self._sliders:
+            outer -= sum(self._held_at(load_deg))
         if self._shaking:
             self._step += 1
             for turn, phase, torque in self._shaking:
                 outer += torque * math.sin(turn * self._step + phase)
         return outer
+
+    def _held_at(self, load_deg: float) -> list[float]:
+        """The friction of each slider once the load has moved straight to this angle."""
+        travel = load_deg - self._held_deg
+        return [
+            min(limit, max(-limit, held + stiffness * travel))
+            for (stiffness, limit), held in zip(self._sliders, self._held_nm, strict=True)
+        ]
 
     def _play(self, load_deg: float) -> float:
         """The coupling's near side, which the load takes along once the play is used up."""

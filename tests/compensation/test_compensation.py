@@ -8,7 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.control.compensation import Compensation, CompensationLimits, Inverse
-from hdbridge.effects import CATALOGUE, Backlash, Hysteresis, Moment, MotorOrder, Start, Synchronous, Wear
+from hdbridge.effects import (
+    CATALOGUE,
+    Backlash,
+    Hysteresis,
+    HysteresisMemory,
+    Moment,
+    MotorOrder,
+    Start,
+    Synchronous,
+    Wear,
+)
 from hdbridge.effects.elastic_loop import rise_at
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -116,6 +126,49 @@ def test_past_the_crossing_play_is_made_up_for_though_it_has_no_inverse(play):
     inverse.advance(0.0)
     gear.advance(0.0, NOW)
     for load_deg in (1.0, 8.0, 7.0, 7.5, -3.0, -2.9, 4.0):
+        motor_deg = inverse.solve(load_deg)
+        inverse.advance(motor_deg)
+        assert motor_deg / 50.0 + gear.advance(motor_deg, NOW) / 3600 == pytest.approx(load_deg, abs=1e-8)
+
+
+lagging = st.builds(
+    lambda law, **shape: TransmissionModel(50.0, (law(**shape),)),
+    law=st.sampled_from([Hysteresis, HysteresisMemory]),
+    offset_arcsec=st.floats(-80, -1),
+    width_deg=st.floats(0.2, 40),
+    exponent=st.floats(1.1, 3.0),
+)
+
+
+@settings(deadline=None)
+@given(model=lagging, path=load_paths, start=st.sampled_from(list(Start)))
+def test_the_inverse_of_a_load_that_lags_lets_it_stand_still_and_never_run_back(model, path, start):
+    """Where the law is steeper than the gear, what is inverted is the same law as steep as can be."""
+    (loop,) = model.effects
+    steepest = 0.9 * 3600.0 / model.ratio
+    steep = loop.slope_bound_arcsec_per_deg() > steepest
+    inverse = Inverse(model, start)
+    gear = loop.gentle_tracker(start, 0.9 * steepest) if steep else model.tracker(start)
+    inverse.advance(0.0)
+    last_deg, last_load_deg = 0.0, gear.advance(0.0, NOW) / 3600
+    for load_deg in path:
+        motor_deg = inverse.solve(load_deg)
+        inverse.advance(motor_deg)
+        reached = motor_deg / model.ratio + gear.advance(motor_deg, NOW) / 3600
+        assert abs(reached - load_deg) * 3600 <= 1e-6
+        if abs(load_deg - last_load_deg) > 1e-6:
+            # Behind friction the motor has further to go than the load, and never goes the other way.
+            ahead = (motor_deg - last_deg) / (load_deg - last_load_deg)
+            assert ahead >= 0.99 * model.ratio
+        last_deg, last_load_deg = motor_deg, load_deg
+
+
+def test_past_the_crossing_a_load_that_lags_arrives_on_its_target():
+    lags = model(offset=-30.0, width=10.0)
+    inverse, gear = Inverse(lags, Start.FORWARD), lags.tracker(Start.FORWARD)
+    inverse.advance(0.0)
+    gear.advance(0.0, NOW)
+    for load_deg in (1.0, 8.0, 7.0, 7.5, -3.0, -2.5, 4.0):
         motor_deg = inverse.solve(load_deg)
         inverse.advance(motor_deg)
         assert motor_deg / 50.0 + gear.advance(motor_deg, NOW) / 3600 == pytest.approx(load_deg, abs=1e-8)

@@ -210,3 +210,18 @@ def test_better_seen_is_surer() -> None:
     (weak,) = weighed([finding("creep", 400.0, 1.0)], ALONE)
     (strong,) = weighed([finding("creep", 40000.0, 4.0)], ALONE)
     assert weak.probability < strong.probability < 1.0
+
+
+def test_a_load_that_lags_is_a_loop_of_the_other_sign(
+    columns: Callable[..., dict[str, Any]], plant: ModuleType
+) -> None:
+    """Nothing is named where the model has it lag as well; where it has it lead, its loop has changed."""
+    record = Record(columns(offset=-30.0))
+    lags = TransmissionModel.from_text(plant.model_text(5, truth=plant.Truth(offset=-30.0)))
+    assert [each.cause for each in diagnose(record, lags).findings] == []
+    leads = TransmissionModel.from_text(plant.model_text(5, truth=plant.Truth(offset=30.0)))
+    found = diagnose(record, leads)
+    assert [each.cause for each in found.findings] == ["hysteresis_parameters"]
+    loop = next(each for each in found.model.effects if each.name == "hysteresis")
+    assert loop.parameters()["offset_arcsec"] == pytest.approx(-30.0, abs=0.5)
+    assert found.extended.rms_arcsec < 1.5 * found.noise_floor_arcsec

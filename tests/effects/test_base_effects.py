@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hdbridge.effects import Hysteresis, Moment, Motion, MotorOrder, Start, Synchronous
+from hdbridge.effects import (
+    Hysteresis,
+    HysteresisMemory,
+    Moment,
+    Motion,
+    MotorOrder,
+    Start,
+    Synchronous,
+)
 
 ARTICLE_ORDERS = [
     (1, 4.9, -126.8),
@@ -140,3 +148,24 @@ def test_it_does_not_remember_return_points():
     back_step = np.array([0.0, -50.0, -45.0, -47.0, -45.0, -40.0])
     straight = np.array([0.0, -50.0, -40.0])
     assert ARTICLE.predict(Motion(back_step))[-1] - ARTICLE.predict(Motion(straight))[-1] > 8.0
+
+
+@pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
+@given(
+    size=st.floats(1, 80),
+    width=st.floats(2, 40),
+    n=st.floats(1.1, 3.0),
+    reach=st.floats(1.05, 4.0),
+    start=st.sampled_from(list(Start)),
+)
+def test_a_load_that_lags_mirrors_one_that_leads_and_a_reversed_path_closes(
+    law, size, width, n, reach, start
+):
+    once = reach * width * np.sin(np.linspace(0.0, 2.0 * np.pi, 401))
+    motion = Motion(np.tile(once[:-1], 3))
+    leads, lags = (law(offset_arcsec=sign * size, width_deg=width, exponent=n) for sign in (1, -1))
+    error = lags.predict(motion, start)
+    np.testing.assert_array_equal(error, -leads.predict(motion, start))
+    np.testing.assert_allclose(error[400:800], error[800:], atol=1e-9)
+    forward = np.diff(motion.motor_deg[400:]) > 0
+    assert np.all(np.diff(error[400:])[forward] <= 1e-9)  # it falls along the path

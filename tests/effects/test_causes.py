@@ -15,6 +15,8 @@ from hdbridge.effects import (
     Creep,
     DirectionPhase,
     FlexsplineOrders,
+    Hysteresis,
+    HysteresisMemory,
     InertialWindup,
     LoadOrders,
     LocalDefect,
@@ -255,6 +257,19 @@ def test_a_gear_that_runs_in_wears_less_and_less():
 
 PLAY = [
     Backlash(gap_arcsec=20, crossing_deg=0.01),
+    Hysteresis(offset_arcsec=-20, width_deg=1.0, exponent=1.6),
+    HysteresisMemory(offset_arcsec=-30, width_deg=0.5, exponent=1.3),
+    RateDependence(
+        loop=Loop(offset_arcsec=-20, width_deg=1.0, exponent=1.6), growth_percent=30, reference_deg_s=30
+    ),
+    AmplitudeDrift(
+        orders=(ORDER_4,),
+        loop=Loop(offset_arcsec=-20, width_deg=1.0, exponent=2.0),
+        ripple_percent_per_k=0.0,
+        friction_percent_per_k=0.5,
+        driven_by="time",
+        tau_s=100.0,
+    ),
     Wear(growth_arcsec_per_kiloturn=-100, width_deg=0.05, exponent=0.7, turns_before=40),
 ]
 
@@ -268,13 +283,17 @@ def test_play_for_an_inverse_is_crossed_no_steeper_than_asked_and_is_the_same_be
     back = 720.0 - np.linspace(0, 5, 5001)
     soft = np.array([gentle.peek(float(each), Moment()) for each in back])
     assert np.max(np.diff(soft)) <= 50.0 * 0.001 * (1 + 1e-6)
-    assert soft[0] == exact.peek(720.0, Moment())
-    assert soft[-1] == exact.peek(715.0, Moment())
+    assert soft[0] == pytest.approx(exact.peek(720.0, Moment()), rel=1e-12)
+    assert soft[-1] == pytest.approx(exact.peek(715.0, Moment()), rel=1e-12)
 
 
 @pytest.mark.parametrize(
     "effect",
-    [Synchronous(orders=(ORDER_4,)), Wear(growth_arcsec_per_kiloturn=4, width_deg=1)],
+    [
+        Synchronous(orders=(ORDER_4,)),
+        Wear(growth_arcsec_per_kiloturn=4, width_deg=1),
+        Hysteresis(offset_arcsec=20, width_deg=20, exponent=1.6),
+    ],
     ids=lambda each: each.name,
 )
 def test_what_is_no_play_has_no_gentler_form(effect):

@@ -239,3 +239,14 @@ def test_default_options_suit_a_bare_record(bench):
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
     assert result.interval("hysteresis", "width_deg").value == pytest.approx(18.0, rel=0.04)
     assert {each.order.number for each in result.orders} == {1, 2, 6}
+
+
+def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
+    """Friction at the load: the loop is that of an elastic one with the other sign."""
+    axis = bench.axis(offset=-30.0)
+    found = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
+    assert off(found, "hysteresis", "offset_arcsec", -30.0) < 2.0
+    assert off(found, "hysteresis", "width_deg", axis.width) < 2.0
+    assert {each.order.number for each in found.orders} == set(axis.orders)
+    assert found.interval("synchronous", "orders[6].amplitude_arcsec").half_width < 0.2
+    assert found.noise.residual_arcsec == pytest.approx(0.5, rel=0.1)

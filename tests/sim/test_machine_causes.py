@@ -94,6 +94,25 @@ def test_the_stages_of_the_spring_join() -> None:
     assert np.allclose(torques, -torques[::-1])
 
 
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_friction_at_the_load_holds_it_back_and_gives_way_before_it_slips(sense: float) -> None:
+    """The load lags by the wind-up of the friction, and after a reversal it follows less than the motor."""
+    sliders = [{"limit_nm": 1.0, "travel_deg": 0.02}, {"limit_nm": 2.0, "travel_deg": 0.1}]
+    machine, exercise = moved(axis(load__presliding=sliders), sense * 100.0, speed_deg_s=60.0)
+    held_arcsec = 3.0 / 16_000 * ARCSEC_PER_RAD
+    assert error_arcsec(machine) == pytest.approx(-sense * held_arcsec, rel=0.01)
+    errors, loads = [error_arcsec(machine)], [machine.true_load_deg]
+    for _ in range(40):
+        exercise.move(-sense * 0.5, 20.0, 400.0)
+        exercise.hold(0.3)
+        errors.append(error_arcsec(machine))
+        loads.append(machine.true_load_deg)
+    rise = sense * np.diff(errors)
+    assert np.all(sense * np.diff(loads) < 0.0)  # it goes the motor's way, never the other
+    assert rise[0] > 1.5 * rise[8] > 1.5 * abs(rise[-1])
+    assert errors[-1] == pytest.approx(sense * held_arcsec, rel=0.01)
+
+
 def test_a_load_that_swings_on_its_spring_keeps_its_energy() -> None:
     truth = axis(
         load__gravity=mass(20.0, 0.3),

@@ -59,7 +59,7 @@ def orders(numbers):
 
 low_orders = orders(st.integers(1, 12))
 loop = {
-    "offset_arcsec": st.floats(0, 80),
+    "offset_arcsec": st.floats(-80, 80),
     "width_deg": st.floats(1, 60),
     "exponent": st.one_of(st.floats(1.05, 3.0), st.just(2.0), st.just(2.0 + 1e-9)),
 }

@@ -138,6 +138,8 @@ def rise(xi: np.ndarray | float, n: float) -> Any:
 
 def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> np.ndarray:
     """The elastic part, from a saturated start forwards; carried through the whole motion."""
+    if offset < 0.0:  # the load lags
+        return -loop(motor, law, -offset, width, n)
     step = np.sign(np.diff(motor, prepend=motor[0] - 1e-9))
     if law == "plain":
         out = np.empty(len(motor))

@@ -41,6 +41,13 @@ class TrueVibration(Part):
     phase_deg: float = Field(0.0, ge=-360, le=360, description="phase when the axis is switched on")
 
 
+class TrueSlip(Part):
+    """A spring between load and ground that slips at its limit."""
+
+    limit_nm: float = Field(gt=0, le=1e6, description="friction at which it slips")
+    travel_deg: float = Field(gt=0, le=360, description="load travel from no friction to slipping")
+
+
 class TrueLoad(Part):
     """The load with its encoder."""
 
@@ -49,11 +56,19 @@ class TrueLoad(Part):
         0.0, ge=0, le=1e6, description="Coulomb friction at the load; leaves wind-up at rest"
     )
     viscous_nm_s_per_rad: float = Field(0.0, ge=0, le=1e6, description="viscous friction at the load")
+    presliding: tuple[TrueSlip, ...] = Field(
+        (), max_length=16, description="friction at the load that gives way before it slips; they add up"
+    )
     stribeck: TrueStribeck | None = Field(None, description="friction near rest; without it: Coulomb only")
     thinning: TrueThinning | None = Field(None, description="shear thinning of the viscous friction")
     gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
     vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
     encoder: TrueLoadEncoder = Field(description="encoder at the load")
+
+    @property
+    def presliding_nm_per_deg(self) -> float:
+        """Stiffness of what holds the load before it slips."""
+        return sum(each.limit_nm / each.travel_deg for each in self.presliding)
 
     @property
     def whole_inertia_kg_m2(self) -> float:

@@ -97,7 +97,8 @@ class Truth(Part):
     def _step_resolves_the_spring(self) -> Self:
         reflected = self.motor.inertia_kg_m2 * self.gear.ratio**2
         stiffness = self.gear.stiffest_nm_per_rad
-        fastest = math.sqrt(stiffness / self.load_.inertia_kg_m2 + stiffness / reflected)
+        held = stiffness + math.degrees(self.load_.presliding_nm_per_deg)
+        fastest = math.sqrt(held / self.load_.inertia_kg_m2 + stiffness / reflected)
         if fastest * self.substep_s > 1.0:
             raise wrong(
                 f"{self.substep_ms:g} ms is too long for a resonance of {fastest / math.tau:.0f} Hz; "
