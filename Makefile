@@ -23,7 +23,7 @@ unit: $(READY)   ## the tests on the virtual bus
 	$(BIN)/python -m pytest -q -n 2 --ignore=tests/socketcan
 
 test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
-	@tools/socketcan.sh $(BIN)/python -m pytest -q -rs tests/socketcan; status=$$?; \
+	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs tests/socketcan; status=$$?; \
 	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED, for the reason above: this machine has no vcan"; \
 	else exit $$status; fi
 

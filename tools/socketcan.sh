@@ -10,10 +10,13 @@
 #   3. Otherwise Debian's user-mode-linux (a Linux kernel that runs as a process, with the CAN modules that the
 #      host lacks) boots on this machine's own file system. It has one CPU: good for function and faults, not
 #      for judging timing below 4 ms. Missing Debian packages are installed when we are root. Where there is a C
-#      compiler, tools/uml/whole_xstate.c is put under it: without it, it does not boot on processors with AMX.
+#      compiler, tools/uml/*.c are put under it: without them, it does not boot on processors with AMX.
 #
 #   --timeout SECONDS   end everything after that long (default 600); exit status 124
 #   --uml               use user-mode-linux even where the kernel has vcan
+#   --slowed N          tests of function: in user-mode-linux (taken where it can be had, even where the kernel has
+#                       vcan) time passes N times as slowly while anything computes, and idle time is skipped, so
+#                       that what else this machine does is nothing to the command; see tools/uml/guest_clock.c
 #   --check             run nothing: exit 0 when one of the ways above is possible, 69 and the reason otherwise
 #
 # Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had, user-mode-linux that does not boot on
@@ -25,7 +28,7 @@ readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 readonly unavailable=69 broken=70 timed_out=124
 readonly packages=(user-mode-linux kmod iproute2 can-utils)
 readonly boot_limit_s=120 # it takes 2 s
-limit_s=600 force_uml=no check_only=no
+limit_s=600 force_uml=no check_only=no slowed=''
 
 say() { echo "socketcan: $*" >&2; }
 
@@ -34,6 +37,7 @@ while [ $# -gt 0 ]; do
         --timeout) limit_s=${2:?--timeout needs seconds}; shift 2 ;;
         --timeout=*) limit_s=${1#*=}; shift ;;
         --uml) force_uml=yes; shift ;;
+        --slowed) slowed=${2:?--slowed needs a number}; shift 2 ;;
         --check) check_only=yes; shift ;;
         --) shift; break ;;
         -*) say "unknown option $1"; exit 2 ;;
@@ -74,13 +78,14 @@ install_uml() {
 
 # Prints the library to load before user-mode-linux; nothing where it cannot be made.
 compile_preload() {
+    local without="user-mode-linux is tried as it is: not on processors with AMX, and with the machine's own time"
     if ! command -v cc >/dev/null; then
-        say "no C compiler (cc): user-mode-linux is tried as it is, which fails on processors with AMX"
-    elif cc -O2 -shared -fPIC -o "$work/whole_xstate.so" "$here/uml/whole_xstate.c" -ldl 2>"$work/cc.log"; then
-        echo "$work/whole_xstate.so"
+        say "no C compiler (cc): $without"
+    elif cc -O2 -shared -fPIC -o "$work/preload.so" "$here"/uml/*.c -ldl 2>"$work/cc.log"; then
+        echo "$work/preload.so"
     else
         head -n 3 "$work/cc.log" >&2
-        say "cc could not compile tools/uml/whole_xstate.c: user-mode-linux is tried without it"
+        say "cc could not compile tools/uml/*.c: $without"
     fi
 }
 
@@ -101,7 +106,7 @@ run_uml() {
     chrt --rr 1 true 2>/dev/null && first+=(chrt --rr 1)
     local preload
     preload=$(compile_preload)
-    setsid "${first[@]}" env ${preload:+"LD_PRELOAD=$preload"} linux.uml \
+    setsid "${first[@]}" env ${preload:+"LD_PRELOAD=$preload"} "UML_CLOCK_SLOWED=$slowed" "UML_CLOCK_SLOWED_FROM=$work/ready" linux.uml \
         "mem=${SOCKETCAN_MEMORY:-1G}" root=/dev/root rootfstype=hostfs rootflags=/ rw "init=$work/init.sh" "SOCKETCAN_WORK=$work" "uml_dir=$work/" umid=uml \
         con=null con0=null,fd:1 ssl=null quiet \
         >"$work/boot.log" 2>&1 </dev/null &
@@ -130,7 +135,7 @@ run_uml() {
     wait $followers
     if [ ! -e "$work/ready" ]; then
         tail -qn 15 "$work/boot.log" "$work/init.log" >&2 2>/dev/null
-        say "this kernel has no vcan, and user-mode-linux does not boot here (its last words are above)"
+        say "user-mode-linux does not boot here (its last words are above)"
         status=$unavailable
     elif [ -s "$work/status" ]; then
         status=$(cat "$work/status")
@@ -157,27 +162,38 @@ trap finish EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM HUP
 
-made_native=no work=
-if [ $force_uml = no ]; then
-    if interface_is_up; then
-        way=present
-    elif make_native; then
-        way=native made_native=yes
-    fi
-fi
-if [ -z "${way:-}" ]; then
-    if [ "$(uname -s)-$(uname -m)" != Linux-x86_64 ]; then
-        say "this kernel has no vcan, and user-mode-linux is for Linux on x86-64 only"
-        exit $unavailable
-    fi
-    work=$(mktemp -d /tmp/socketcan.XXXXXX) || exit $broken
-    install_uml || { say "this kernel has no vcan, and user-mode-linux is not to be had"; exit $unavailable; }
-    way=uml
-fi
-[ $check_only = no ] || { say "vcan0: $way"; exit 0; }
+native() {
+    interface_is_up && return 0
+    make_native && made_native=yes
+}
 
-case $way in
-    uml) run_uml "$@" ;;
-    *) timeout --kill-after=5 "$limit_s" "$@" </dev/null ;;
-esac
-exit $?
+uml() {
+    if [ "$(uname -s)-$(uname -m)" != Linux-x86_64 ]; then
+        say "user-mode-linux is for Linux on x86-64 only"
+        return $unavailable
+    fi
+    work=$(mktemp -d /tmp/socketcan.XXXXXX) || return $broken
+    install_uml || return $unavailable
+    if [ $check_only = yes ]; then say "vcan0: user-mode-linux"; else run_uml "$@"; fi
+}
+
+here() {
+    if [ $check_only = yes ]; then say "vcan0: this kernel's"; else timeout --kill-after=5 "$limit_s" "$@" </dev/null; fi
+}
+
+made_native=no work=
+if [ $force_uml = no ] && [ -z "$slowed" ] && native; then
+    here "$@"
+    exit $?
+fi
+uml "$@"
+status=$?
+if [ $status -eq $unavailable ] && [ ! -e "$work/ready" ]; then
+    if [ $force_uml = no ] && [ -n "$slowed" ] && native; then
+        say "with this kernel's vcan instead, and with this machine's time"
+        here "$@"
+        exit $?
+    fi
+    say "no SocketCAN to be had: this kernel has no vcan, and user-mode-linux is not to be had either"
+fi
+exit $status

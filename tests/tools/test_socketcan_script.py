@@ -52,3 +52,18 @@ def test_a_compiler_that_fails_is_said_and_the_kernel_tried_as_it_is(run_with) -
     assert done.returncode == UNAVAILABLE
     assert "no such header" in done.stderr
     assert "preload=\n" in done.stderr
+
+
+def test_an_hour_of_idleness_is_not_waited_for() -> None:
+    """Time is the guest's own: a machine that takes the processor away does not show in it."""
+    slept = "cat /proc/uptime; sleep 3600; cat /proc/uptime"
+    done = subprocess.run(
+        [SCRIPT, "--uml", "--timeout", "120", "--slowed", "50", "sh", "-c", slept],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode == UNAVAILABLE:
+        pytest.skip(done.stderr.splitlines()[-1])
+    before, after = (float(line.split()[0]) for line in done.stdout.splitlines())
+    assert 3600.0 <= after - before < 3601.0
