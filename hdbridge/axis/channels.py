@@ -6,10 +6,11 @@ how long the last one is held. `hdbridge.drive.channels` follows them on line.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
+from hdbridge.effects.base import MEASURED
 from hdbridge.files.yamlfile import wrong
 
 
@@ -24,7 +25,6 @@ class Scale(NamedTuple):
     at_zero: float
     least: float
     greatest: float
-    unit: str
 
 
 class ChannelSource(_Part):
@@ -61,7 +61,7 @@ class LoadTorque(_Part):
     def scale(self) -> Scale:
         """Newton metres at the load, positive forward."""
         limit = self.maximum_nm
-        return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit, "Nm")
+        return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit)
 
 
 class Temperature(_Part):
@@ -99,9 +99,48 @@ class Temperature(_Part):
     @property
     def scale(self) -> Scale:
         """Degrees Celsius."""
-        return Scale(
-            self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius, "C"
-        )
+        return Scale(self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius)
 
 
-MeasuredChannel = LoadTorque | Temperature
+class Quantity(_Part):
+    """Any other channel of the table, in its unit there."""
+
+    source: ChannelSource = Field(description="the object that tells it")
+    per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
+    at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="what a reading of zero means, in its unit")
+    minimum: float = Field(-1e9, description="below this a reading is not believed")
+    maximum: float = Field(1e9, description="above this a reading is not believed")
+    every_cycles: int = Field(1, ge=1, le=240, description="it comes with every n-th SYNC")
+    hold_ms: float = Field(
+        100.0,
+        gt=0,
+        le=600_000,
+        description="how long the last reading is held when none comes; then it is lost",
+    )
+
+    @property
+    def scale(self) -> Scale:
+        """In its unit."""
+        return Scale(self.per_count, self.at_zero, self.minimum, self.maximum)
+
+
+MeasuredChannel = LoadTorque | Temperature | Quantity
+BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
+"""The channels that the axis file can have, by their key there."""
+
+OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
+if TYPE_CHECKING:
+
+    class OtherChannels(_Part):
+        """The channels of the table that `AxisConfig` does not spell out."""
+
+else:
+    OtherChannels = create_model(
+        "OtherChannels",
+        __base__=_Part,
+        **{
+            key: (Quantity | None, Field(None, description=f"{each.about}, {each.unit}"))
+            for key, each in BY_KEY.items()
+            if key not in OWN_KEYS
+        },
+    )

@@ -14,7 +14,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
-from hdbridge.axis.channels import LoadTorque, MeasuredChannel, Temperature
+from hdbridge.axis.channels import BY_KEY, LoadTorque, MeasuredChannel, OtherChannels, Temperature
 from hdbridge.axis.encoders import INT32_MAX, LoadEncoder, MotorEncoder, NodeId
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
@@ -204,7 +204,7 @@ class CompensationConfig(_Part):
     ramp_s: float = Field(0.5, gt=0, le=60, description="time in which it is switched on or off")
 
 
-class AxisConfig(_Part):
+class AxisConfig(OtherChannels):
     """An axis: bus, drive, encoders, gear, limits and compensation."""
 
     schema_: Literal["hdbridge.axis/1"] = Field(alias="schema", description="kind and version of this file")
@@ -303,7 +303,7 @@ class AxisConfig(_Part):
     @property
     def channels(self) -> dict[str, MeasuredChannel]:
         """The measured channels that the axis has, by their key."""
-        given = {"load_torque": self.load_torque, "temperature": self.temperature}
+        given = {key: getattr(self, key) for key in BY_KEY}
         return {key: channel for key, channel in given.items() if channel is not None}
 
     def on_bus(self, **changes: str | int | None) -> Self:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, pstdev
 from typing import TYPE_CHECKING
 
+from hdbridge.axis.channels import BY_KEY
 from hdbridge.bringup.checks import Verdict, failed, passed
 from hdbridge.bringup.scale import SOURCE, Turned
 from hdbridge.units import ARCSEC_PER_DEG
@@ -57,13 +58,13 @@ def judge_channels(
         channel = axis.channels[key]
         name = key.replace("_", " ")
         if value is not None:
-            text += f"; {name} {value:.4g} {channel.scale.unit}"
-            figures["load_torque_nm" if key == "load_torque" else "temperature_c"] = value
+            text += f"; {name} {value:.4g} {BY_KEY[key].unit}"
+            figures[BY_KEY[key].value] = value
         elif 2 * channel.every_cycles * axis.drive.cycle_s < waited_s:
             text += f"; no {name}"
             remedies.append(
                 f"{axis.where(key)}: nothing comes that can be believed (within {channel.scale.least:g} to "
-                f"{channel.scale.greatest:g} {channel.scale.unit}); check the sensor, the object and its unit"
+                f"{channel.scale.greatest:g} {BY_KEY[key].unit}); check the sensor, the object and its unit"
             )
     return failed(text, *remedies, **figures) if remedies else passed(text, **figures)
 

@@ -15,8 +15,10 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.control.sensed import Sensed
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
@@ -30,7 +32,6 @@ from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
 
 Outcome = TypeVar("Outcome")
-KEYS = {Channel.LOAD_TORQUE: "load_torque", Channel.TEMPERATURE: "temperature"}
 """The channels that an axis need not have, and their keys in the axis file."""
 _AT_REST = Moment()
 
@@ -55,14 +56,12 @@ class Run(Generic[Outcome]):
 
 def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
     """What `Bench` can tell the effects in each cycle."""
-    return frozenset(each for each in Channel if KEYS.get(each, "") in {"", *axis.channels})
+    return frozenset(each for each in Channel if each.axis_key in {"", *axis.channels})
 
 
 def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
     """The axis file's keys of the channels that a record of `Bench` does without."""
-    return tuple(
-        key for channel, key in KEYS.items() if key in axis.channels and channel.value not in record.columns
-    )
+    return tuple(key for key in axis.channels if BY_KEY[key].value not in record.columns)
 
 
 def axis_view(axis: AxisConfig) -> AxisView:
@@ -87,7 +86,7 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     """
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
         lacking = sorted(channels, key=lambda each: each.value)
-        keys = " and ".join(f"'{KEYS[each]}'" for each in lacking)
+        keys = " and ".join(f"'{each.axis_key}'" for each in lacking)
         raise InputError(
             f"the effect '{name}' needs {', '.join(each.value for each in lacking)}, which this axis does "
             f"not have: add {keys} to {axis.path}, or leave the effect out of the model that compensates"
@@ -95,46 +94,6 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     caps = axis.compensation
     limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
     return Compensation(model, limits, axis.drive.cycle_s)
-
-
-def _with_channels(sample: Sample, feedback: Feedback) -> Sample:
-    load_torque_nm, temperature_c = feedback.load_torque_nm, feedback.temperature_c
-    return Sample(
-        *sample[:-2],
-        math.nan if load_torque_nm is None else load_torque_nm,
-        math.nan if temperature_c is None else temperature_c,
-    )
-
-
-_KNOWN = {
-    (torque, heat): frozenset({Channel.LOAD_TORQUE} if torque else ())
-    | frozenset({Channel.TEMPERATURE} if heat else ())
-    for torque in (True, False)
-    for heat in (True, False)
-}
-
-
-class _Sensed:
-    """What is known of the channels that can be lost, cycle by cycle; the last value is held."""
-
-    __slots__ = ("known", "load_torque_nm", "temperature_c")
-
-    def __init__(self) -> None:
-        self.known = _KNOWN[True, True]
-        self.load_torque_nm = _AT_REST.load_torque_nm
-        self.temperature_c = _AT_REST.temperature_c
-
-    def take(self, feedback: Feedback) -> bool:
-        """One cycle's; whether other channels are known than before."""
-        load_torque_nm, temperature_c = feedback.load_torque_nm, feedback.temperature_c
-        if load_torque_nm is not None:
-            self.load_torque_nm = load_torque_nm
-        if temperature_c is not None:
-            self.temperature_c = temperature_c
-        known = _KNOWN[load_torque_nm is not None, temperature_c is not None]
-        changed = known is not self.known
-        self.known = known
-        return changed
 
 
 class Bench:
@@ -168,9 +127,8 @@ class Bench:
         self._image = drive.image
         self._compensation = compensation or compensation_for(axis, TransmissionModel(axis.gear.ratio))
         self._interrupted = interrupted
-        self._torque_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
         self._observer = Observer()
-        self._sensed = _Sensed()
+        self._sensed = Sensed(axis)
         self._place = 0.0
         self._measured: list[list[Sample]] = []
         self._legs: list[Leg] = []
@@ -209,12 +167,14 @@ class Bench:
         """
         # Made into arrays only here: between two legs there is no time for it on a real bus.
         rows = [sample for samples in self._measured for sample in samples]
-        table = np.array(rows, dtype=np.float64).reshape(-1, len(Sample._fields))
-        columns = dict(zip(Sample._fields, table.T, strict=True))
+        names = Sample._fields[:-1]
+        table = np.array([row[:-1] for row in rows], dtype=np.float64).reshape(-1, len(names))
+        columns = dict(zip(names, table.T, strict=True))
         columns.pop("load_target_deg")
-        for channel, key in KEYS.items():
-            if key not in self._image.axis.channels or np.isnan(columns[channel.value]).any():
-                columns.pop(channel.value)
+        for place, key in enumerate(self._image.axis.channels):
+            reading = np.array([row.readings[place] for row in rows], dtype=np.float64)  # None: NaN
+            if not np.isnan(reading).any():
+                columns[BY_KEY[key].value] = reading
         return Record(columns)
 
     @property
@@ -231,16 +191,14 @@ class Bench:
         motor_deg = self._image.motor_deg(feedback.motor_counts)
         self._place = motor_deg / self.view.ratio
         self._observer = Observer()
-        self._sensed = _Sensed()
+        self._sensed.reset()
         self._sensed.take(feedback)
         self._compensation.know(self._sensed.known)
         self._compensation.reset(
             motor_deg,
             Moment(
                 time_s=feedback.time_s,
-                load_torque_nm=self._sensed.load_torque_nm,
-                motor_torque_nm=feedback.torque_permille * self._torque_nm,
-                temperature_c=self._sensed.temperature_c,
+                measured=self._sensed.measured(feedback),
                 load_deg=self._place,
             ),
         )
@@ -291,7 +249,7 @@ class Bench:
             self._compensation.hold,
             image.target_counts_for,
         )
-        motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._torque_nm
+        motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._sensed.torque_nm
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
         observe, ratio = self._observer.moment, self.view.ratio
         compensation, sensed = self._compensation, self._sensed
@@ -310,9 +268,7 @@ class Bench:
                 moment = observe(
                     ratio * target_deg,
                     feedback.time_s,
-                    load_torque_nm=sensed.load_torque_nm,
-                    motor_torque_nm=feedback.torque_permille * torque_nm,
-                    temperature_c=sensed.temperature_c,
+                    measured=sensed.measured(feedback),
                     load_deg=target_deg,
                 )
             return counts_for(command(target_deg, moment) if feedback.fresh else hold(target_deg, moment))
@@ -321,15 +277,17 @@ class Bench:
             while True:
                 target_deg = at(elapsed_s)
                 feedback = tick(answer)
-                sample = Sample(
-                    feedback.time_s,
-                    target_deg,
-                    motor_deg(feedback.demand_counts),
-                    motor_deg(feedback.motor_counts),
-                    load_deg(feedback.load_counts),
-                    feedback.torque_permille * torque_nm,
+                samples.append(
+                    Sample(
+                        feedback.time_s,
+                        target_deg,
+                        motor_deg(feedback.demand_counts),
+                        motor_deg(feedback.motor_counts),
+                        load_deg(feedback.load_counts),
+                        feedback.torque_permille * torque_nm,
+                        feedback.readings,
+                    )
                 )
-                samples.append(_with_channels(sample, feedback) if has_channels else sample)
                 self._place = target_deg
                 if interrupted():
                     raise KeyboardInterrupt

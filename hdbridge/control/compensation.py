@@ -23,7 +23,7 @@ import math
 from dataclasses import dataclass, replace
 
 from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
-from hdbridge.effects.base import Memoryless
+from hdbridge.effects.base import MEASURED, Memoryless
 from hdbridge.errors import InputError
 from hdbridge.model import ModelTracker, TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
@@ -33,7 +33,7 @@ _STEEPEST_FALL = 0.9
 _SAFE = 0.9
 """Of that, what is used where the choice is ours."""
 _NOWHERE = Moment()
-LOSABLE = frozenset({Channel.LOAD_TORQUE, Channel.TEMPERATURE})
+LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
 """The channels that come from sensors of their own."""
 
 

@@ -183,7 +183,7 @@ class Cycle:
                 feedback = self._last = new_tuple(Feedback, (
                     count, count * self.period_s, image.statusword or 0, image.motor_counts,
                     image.load_counts, image.demand_counts, image.torque_permille, True,
-                    image.load_torque_nm, image.temperature_c,
+                    image.readings,
                 ))  # fmt: skip
                 self._good_cycle = count
             else:

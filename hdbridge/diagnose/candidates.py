@@ -116,11 +116,10 @@ def _orders(base: Sequence[Effect], ratio: float) -> Iterator[Effect]:
 
 def _torques(evidence: Evidence) -> dict[Channel, float]:
     motion = evidence.points.motion
-    given = {Channel.LOAD_TORQUE: motion.load_torque_nm, Channel.MOTOR_TORQUE: motion.motor_torque_nm}
     return {
-        name: float(np.quantile(np.abs(values), 0.98))
-        for name, values in given.items()
-        if values is not None and float(np.ptp(values)) > 0.0
+        channel: float(np.quantile(np.abs(values), 0.98))
+        for channel in (Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE)
+        if (values := motion.measured.get(channel)) is not None and float(np.ptp(values)) > 0.0
     }
 
 
@@ -148,7 +147,7 @@ def _with_torque(
 
 
 def _warm(evidence: Evidence, base: Sequence[Effect], modulated: bool) -> Iterator[Effect]:
-    temperature = evidence.points.motion.temperature_c
+    temperature = evidence.points.motion.measured.get(Channel.TEMPERATURE)
     driven = "temperature" if temperature is not None and float(np.ptp(temperature)) > 0.3 else "time"
     time_s = evidence.points.motion.time_s
     assert time_s is not None

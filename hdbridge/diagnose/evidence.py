@@ -207,9 +207,7 @@ def _series(
     motion = Motion(
         motor_deg=driving,
         time_s=time,
-        load_torque_nm=record.load_torque_nm,
-        motor_torque_nm=record.motor_torque_nm,
-        temperature_c=record.temperature_c,
+        measured=record.measured,
         motor_speed_deg_s=speed,
         motor_acceleration_deg_s2=acceleration,
         load_deg=driving / ratio,
@@ -280,12 +278,12 @@ def _averaged(full: Series, run: int) -> Series:
     channels = {
         name: None if (value := getattr(motion, name)) is None else mean(value)
         for name in (
-            "motor_deg", "time_s", "load_torque_nm", "motor_torque_nm", "temperature_c",
-            "motor_speed_deg_s", "motor_acceleration_deg_s2", "load_deg",
+            "motor_deg", "time_s", "motor_speed_deg_s", "motor_acceleration_deg_s2", "load_deg",
         )
     }  # fmt: skip
+    measured = {channel: mean(values) for channel, values in motion.measured.items()}
     return Series(
-        Motion(**channels),  # type: ignore[arg-type]
+        Motion(**channels, measured=measured),  # type: ignore[arg-type]
         mean(full.error_arcsec),
         np.sqrt(mean(full.sigma_arcsec**2) / size),
         mean(full.usable.astype(np.float64)) > 0.999,

@@ -18,6 +18,7 @@ from hdbridge.diagnose.result import Diagnosis, Finding, Traces
 from hdbridge.diagnose.seeing import BoolArray, Coordinate, Spacing, coordinates
 from hdbridge.effects import (
     AmplitudeDrift,
+    Channel,
     Effect,
     FloatArray,
     Hysteresis,
@@ -157,7 +158,7 @@ def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
     if isinstance(effect, AmplitudeDrift):
         name = "temperature"
     elif name == "load torque":
-        name = getattr(effect, "torque", "load_torque_nm").removesuffix("_nm").replace("_", " ")
+        name = Channel(getattr(effect, "torque", "load_torque_nm")).title
     home = known.get(name) or known["time"]
     return home if name != "load angle" else replace(home, bins=120)
 
@@ -187,8 +188,8 @@ def _own_coordinate(effect: Effect | None, traces: Traces, ratio: float) -> Coor
             "speed, forward or backward", "motor deg/s", np.abs(traces.speed_deg_s), False, Spacing.FILLED
         )
     if isinstance(effect, TorqueModulation):
-        torque = getattr(motion, effect.torque)[rows]
-        name = effect.torque.removesuffix("_nm").replace("_", " ")
+        channel = Channel(effect.torque)
+        torque, name = motion.channel(channel, effect.name)[rows], channel.title
         values = torque if effect.signed else np.abs(torque)
         return Coordinate(
             name if effect.signed else f"{name}, either way", "Nm", values, False, Spacing.FILLED

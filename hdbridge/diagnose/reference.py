@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import AmplitudeDrift, FloatArray, RateDependence, Synchronous
+from hdbridge.effects import AmplitudeDrift, Channel, FloatArray, RateDependence, Synchronous
 from hdbridge.effects.base import Effect
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
@@ -29,7 +29,7 @@ def as_calibrated(workshop: Workshop, fitted: Fitted, given: tuple[Effect, ...])
 
     As it was, where there is no such temperature near those of the record.
     """
-    temperature = workshop.motion.temperature_c
+    temperature = workshop.motion.measured.get(Channel.TEMPERATURE)
     if temperature is None:
         return fitted
     coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K

@@ -19,6 +19,7 @@ from hdbridge.diagnose.screen import Score, Screen, score_of
 from hdbridge.diagnose.theory import LOOPS, Fitted, Theory, Workshop
 from hdbridge.effects import (
     AmplitudeDrift,
+    Channel,
     ChannelSkew,
     Compliance,
     CountLoss,
@@ -245,7 +246,7 @@ class Search:
         At a reference that is far away the line may have no amplitude left of which to tell a share.
         """
         place = next(i for i, each in enumerate(trial.theory.effects) if isinstance(each, AmplitudeDrift))
-        temperature = self.workshop.motion.temperature_c
+        temperature = self.workshop.motion.measured.get(Channel.TEMPERATURE)
         effect = trial.theory.effects[place]
         if not effect.violations() or temperature is None:
             return trial

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.diagnose.result import Diagnosis, Traces
-from hdbridge.effects import FloatArray, Motion
+from hdbridge.effects import Channel, FloatArray, Motion
+from hdbridge.effects.base import MEASURED
 from hdbridge.effects.hysteresis import branches
 from hdbridge.units import DEG_PER_TURN
 
@@ -184,12 +185,10 @@ def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
     ]
     for name, unit, values in (
         ("acceleration", "motor deg/s\N{SUPERSCRIPT TWO}", motion.motor_acceleration_deg_s2),
-        ("load torque", "Nm", motion.load_torque_nm),
-        ("motor torque", "Nm", motion.motor_torque_nm),
-        ("temperature", "\N{DEGREE SIGN}C", motion.temperature_c),
+        *((each.title, each.unit, motion.measured.get(each)) for each in MEASURED),
     ):
         if values is not None:
-            spacing = Spacing.EVEN if name == "temperature" else Spacing.FILLED
+            spacing = Spacing.EVEN if name == Channel.TEMPERATURE.title else Spacing.FILLED
             found.append(Coordinate(name, unit, values[rows], spacing=spacing, bins=40))
     return {each.name: each for each in found if _varies(each.values)}
 

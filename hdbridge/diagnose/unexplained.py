@@ -243,13 +243,9 @@ def _coordinates(workshop: Workshop) -> Iterator[tuple[str, NDArray[np.intp], Fl
         yield "time since the last stop or start", *_ranged(np.log10(_since_change(workshop) + 0.02), 40)
     if motion.motor_acceleration_deg_s2 is not None:
         yield "acceleration", *_quantiles(motion.motor_acceleration_deg_s2[index], 40)
-    for name, values in (
-        ("load torque", motion.load_torque_nm),
-        ("motor torque", motion.motor_torque_nm),
-        ("temperature", motion.temperature_c),
-    ):
-        if values is not None and float(np.ptp(values)) > 0.0:
-            yield name, *_quantiles(values[index], 40)
+    for channel, values in motion.measured.items():
+        if float(np.ptp(values)) > 0.0:
+            yield channel.title, *_quantiles(values[index], 40)
 
 
 def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[NDArray[np.intp], FloatArray]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from hdbridge.axis.channels import BY_KEY
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.supervision import Fault
 
@@ -35,7 +36,8 @@ class ChannelFollower:
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
         """``key`` is that of the axis file."""
         self.key = key
-        self._per_count, self._at_zero, least, greatest, self._unit = channel.scale
+        self._per_count, self._at_zero, least, greatest = channel.scale
+        self._unit = BY_KEY[key].unit
         # The ends of a signed type, and the top of any, are what a sensor says that is broken or saturated.
         kind = IntegerType.named(channel.source.type)
         ends = sorted((self._of(kind.minimum + kind.signed), self._of(kind.maximum - 1)))

@@ -19,7 +19,5 @@ class Feedback(NamedTuple):
     torque_permille: int
     fresh: bool
     """False when a TPDO was missing or not believed: the values are the last good ones."""
-    load_torque_nm: float | None = None
-    """Last reading that was believed; None where the axis has none, or none is known (any more)."""
-    temperature_c: float | None = None
-    """Of the gear; None as with the load torque."""
+    readings: tuple[float | None, ...] = ()
+    """Of each channel of the axis file the last reading that was believed; None where none is known."""

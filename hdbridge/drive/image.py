@@ -149,10 +149,8 @@ class ProcessImage:
         }
         for layout in self.channel_tpdos:
             self._handlers[layout.can_id] = partial(self._accept_channels, layout)
-        self.load_torque_nm: float | None = None
-        """Last load torque that was believed; None where the axis has none, or none is known (any more)."""
-        self.temperature_c: float | None = None
-        """Last temperature of the gear that was believed; None as with the load torque."""
+        self.readings: tuple[float | None, ...] = (None,) * len(self.channels)
+        """Of each of ``channels`` the last reading that was believed; None where none is known (any more)."""
         self._unwrap_motor = Unwrap()
         self._unwrap_demand = Unwrap()
         self._unwrap_load = Unwrap(source.wraps_at_counts)
@@ -221,20 +219,14 @@ class ProcessImage:
             fault = follower.step()
             if fault is not None:
                 faults.append(fault)
-            self._publish(follower)
+        self.readings = tuple([follower.value for follower in self.channels])
         return faults
 
     def forget_channels(self) -> None:
         """Nothing is known of the channels: the cycle begins, or has rested."""
         for follower in self.channels:
             follower.reset()
-            self._publish(follower)
-
-    def _publish(self, follower: ChannelFollower) -> None:
-        if follower.key == "load_torque":
-            self.load_torque_nm = follower.value
-        else:
-            self.temperature_c = follower.value
+        self.readings = (None,) * len(self.channels)
 
     def check_target(self, counts: int) -> None:
         """`InputError` unless ``counts`` is an integer within the position limits."""

@@ -3,6 +3,8 @@
 from hdbridge.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.effects.backlash import Backlash
 from hdbridge.effects.base import (
+    MEASURED,
+    SLOT,
     Cause,
     Channel,
     Compensable,
@@ -13,6 +15,7 @@ from hdbridge.effects.base import (
     Shape,
     Start,
     Tracker,
+    readings,
     unmet,
 )
 from hdbridge.effects.carried import Loop, loop_of, orders_of
@@ -89,6 +92,8 @@ def aliases_of(name: str) -> tuple[str, ...]:
 __all__ = [
     "CATALOGUE",
     "CAUSES",
+    "MEASURED",
+    "SLOT",
     "AmplitudeDrift",
     "Backlash",
     "Cause",
@@ -138,6 +143,7 @@ __all__ = [
     "loop_of",
     "moments",
     "orders_of",
+    "readings",
     "refreshed",
     "unmet",
 ]

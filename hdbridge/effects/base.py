@@ -16,9 +16,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,40 @@ FloatArray = NDArray[np.float64]
 
 
 class Channel(Enum):
-    """A quantity that an effect needs to know besides the motor angle."""
+    """A quantity that an effect needs to know besides the motor angle; its value is its column in a record.
+
+    This is the one table of measured channels: a row here is read from the drive, recorded, handed to effects
+    and offered to a diagnosis without any further edit.
+    """
+
+    _value_: str
+    about: str
+    """A measured one in words; empty for all others."""
+    unit: str
+    at_rest: float
+    """What stands in where a measured one is not known."""
+    axis_key: str
+    """The key of the axis file that says where it comes from; empty where every drive tells it."""
+
+    def __new__(
+        cls, column: str, about: str = "", unit: str = "", at_rest: float = 0.0, axis_key: str = ""
+    ) -> Self:
+        """A row of the table; derived channels have a column only."""
+        self = object.__new__(cls)
+        self._value_, self.about, self.unit, self.at_rest, self.axis_key = (
+            column,
+            about,
+            unit,
+            at_rest,
+            axis_key,
+        )
+        return self
+
+    LOAD_TORQUE = "load_torque_nm", "torque at the load", "Nm", 0.0, "load_torque"
+    MOTOR_TORQUE = "motor_torque_nm", "torque of the motor", "Nm"
+    TEMPERATURE = "temperature_c", "temperature of the gear", "\N{DEGREE SIGN}C", 20.0, "temperature"
 
     TIME = "time_s"
-    LOAD_TORQUE = "load_torque_nm"
-    MOTOR_TORQUE = "motor_torque_nm"
-    TEMPERATURE = "temperature_c"
     SPEED = "motor_speed_deg_s"
     """Of the command; derived from angle and time where it is not given."""
     ACCELERATION = "motor_acceleration_deg_s2"
@@ -44,6 +72,24 @@ class Channel(Enum):
     """Sign of the last motion of the command, held at rest; always derived."""
     LOAD_ANGLE = "load_deg"
     """Predicted load angle: motor angle / N plus the model's error (never the noisy measured one)."""
+
+    @property
+    def title(self) -> str:
+        """Its name in words, without the unit."""
+        return str(self.value).rpartition("_")[0].replace("_", " ")
+
+
+MEASURED: Final = tuple(each for each in Channel if each.about)
+"""The measured channels, in the order in which a `Moment` has them."""
+SLOT: Final[Mapping[Channel, int]] = {each: slot for slot, each in enumerate(MEASURED)}
+"""Where each measured channel stands in `Moment.measured`."""
+AT_REST: Final = tuple(each.at_rest for each in MEASURED)
+"""Readings where none is known."""
+
+
+def readings(known: Mapping[Channel, float]) -> tuple[float, ...]:
+    """`Moment.measured` of what is known; the rest as at rest."""
+    return tuple(known.get(each, each.at_rest) for each in MEASURED)
 
 
 class Start(Enum):
@@ -65,9 +111,8 @@ class Moment(NamedTuple):
     """
 
     time_s: float = 0.0
-    load_torque_nm: float = 0.0
-    motor_torque_nm: float = 0.0
-    temperature_c: float = 20.0
+    measured: tuple[float, ...] = AT_REST
+    """Readings of the channels in `MEASURED`, in that order; `SLOT` says where each stands."""
     motor_speed_deg_s: float = 0.0
     motor_acceleration_deg_s2: float = 0.0
     direction: int = 0
@@ -87,9 +132,8 @@ class Motion:
     motor_deg: FloatArray
     """Motor angle, degrees, multi-turn, shape (n,)."""
     time_s: FloatArray | None = None
-    load_torque_nm: FloatArray | None = None
-    motor_torque_nm: FloatArray | None = None
-    temperature_c: FloatArray | None = None
+    measured: Mapping[Channel, FloatArray] = field(default_factory=dict)
+    """The measured channels that are known (`MEASURED`), each of shape (n,)."""
     motor_speed_deg_s: FloatArray | None = None
     """Given where something better is known than differences of a quantised angle."""
     motor_acceleration_deg_s2: FloatArray | None = None
@@ -102,7 +146,7 @@ class Motion:
 
     def available(self) -> frozenset[Channel]:
         """The channels that these arrays give, derived ones included."""
-        found = {each for each in Channel if getattr(self, each.value, None) is not None}
+        found = {each for each in Channel if self._given(each) is not None}
         found.add(Channel.DIRECTION)
         if self.time_s is not None:
             found |= {Channel.SPEED, Channel.ACCELERATION}
@@ -110,10 +154,22 @@ class Motion:
 
     def channel(self, channel: Channel, effect: str) -> FloatArray:
         """A channel as given, shape (n,); InputError where it is not, naming the effect that asks."""
-        values: FloatArray | None = getattr(self, channel.value, None)
+        values = self._given(channel)
         if values is None:
             raise missing_error(effect, frozenset({channel}))
         return values
+
+    def _given(self, channel: Channel) -> FloatArray | None:
+        if channel in SLOT:
+            return self.measured.get(channel)
+        values: FloatArray | None = getattr(self, channel.value, None)
+        return values
+
+
+def measured_by_all(parts: Sequence[Mapping[Channel, FloatArray]]) -> dict[Channel, FloatArray]:
+    """The measured channels that every part has, the parts one after the other."""
+    common = [each for each in MEASURED if all(each in part for part in parts)]
+    return {each: np.concatenate([part[each] for part in parts]) for each in common}
 
 
 def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:

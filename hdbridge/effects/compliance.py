@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hdbridge.effects.base import (
+    SLOT,
     Cause,
     Channel,
     Compensable,
@@ -138,7 +139,7 @@ class Compliance(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_torque")
+    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_slot")
 
     def __init__(self, effect: Compliance) -> None:
         self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
@@ -146,10 +147,10 @@ class _Tracker(Memoryless):
         self._high = effect.torque2_nm
         self._limit = effect.limit_nm
         self._sense = effect.sense
-        self._torque = effect.torque
+        self._slot = SLOT[Channel(effect.torque)]
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        given: float = getattr(moment, self._torque)
+        given = moment.measured[self._slot]
         torque = min(abs(given), self._limit)
         first, second, third = self._c
         error = first * min(torque, self._low)

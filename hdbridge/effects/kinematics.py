@@ -18,7 +18,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hdbridge.effects.base import Channel, FloatArray, Moment, Motion, Start, missing_error
+from hdbridge.effects.base import AT_REST, MEASURED, Channel, FloatArray, Moment, Motion, Start, missing_error
 
 
 def speed_of(motion: Motion, effect: str) -> FloatArray:
@@ -77,12 +77,13 @@ class Observer:
         motor_deg: float,
         time_s: float,
         *,
-        load_torque_nm: float = 0.0,
-        motor_torque_nm: float = 0.0,
-        temperature_c: float = 20.0,
+        measured: tuple[float, ...] = AT_REST,
         load_deg: float = 0.0,
     ) -> Moment:
-        """One call per cycle; ``motor_deg`` is the uncompensated command, N times the load target."""
+        """One call per cycle; ``motor_deg`` is the uncompensated command, N times the load target.
+
+        ``measured`` is `Moment.measured`.
+        """
         speed = acceleration = 0.0
         if self._count:
             step = time_s - self._time
@@ -95,27 +96,23 @@ class Observer:
                 self._direction = 1 if moved > 0.0 else -1
         self._count += 1
         self._angle, self._time, self._speed = motor_deg, time_s, speed
-        return Moment(
-            time_s, load_torque_nm, motor_torque_nm, temperature_c,
-            speed, acceleration, self._direction, load_deg,
-        )  # fmt: skip
+        return Moment(time_s, measured, speed, acceleration, self._direction, load_deg)
 
 
 def moments(motion: Motion) -> Iterator[Moment]:
     """A record as the control loop would have seen it, sample by sample (channels not there: defaults)."""
     here = motion.available()
     zeros = np.zeros(len(motion))
+    known = [motion.measured.get(each, zeros + each.at_rest).tolist() for each in MEASURED]
+    measured = zip(*known, strict=True)
     columns = (
-        _or(motion.time_s, zeros),
-        _or(motion.load_torque_nm, zeros),
-        _or(motion.motor_torque_nm, zeros),
-        _or(motion.temperature_c, zeros + 20.0),
         speed_of(motion, "") if Channel.SPEED in here else zeros,
         acceleration_of(motion, "") if Channel.ACCELERATION in here else zeros,
         direction_of(motion).astype(np.int64),
         _or(motion.load_deg, zeros),
     )
-    yield from map(Moment, *(each.tolist() for each in columns))
+    time_s = _or(motion.time_s, zeros).tolist()
+    yield from map(Moment, time_s, measured, *(each.tolist() for each in columns))
 
 
 def _or(values: FloatArray | None, default: FloatArray) -> FloatArray:

@@ -7,12 +7,14 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from hdbridge.effects.base import Channel, FloatArray, Moment, Motion
+from hdbridge.effects.base import SLOT, Channel, FloatArray, Moment, Motion
 
 TorqueChannel = Annotated[
     Literal["load_torque_nm", "motor_torque_nm"],
     Field(description="the channel that the torque is taken from"),
 ]
+_SLOT = {each.value: slot for each, slot in SLOT.items()}
+
 TorqueLimit = Annotated[
     float,
     Field(
@@ -40,7 +42,7 @@ class TorqueGrowth(BaseModel):
 
     def load_at_nm(self, moment: Moment) -> float:
         """The torque that counts at one moment."""
-        torque: float = getattr(moment, self.torque)
+        torque = moment.measured[_SLOT[self.torque]]
         torque = min(max(torque, -self.limit_nm), self.limit_nm)
         return torque if self.signed else abs(torque)
 

@@ -8,8 +8,10 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from hdbridge.effects.base import Channel, Effect, FloatArray, Moment, Motion, Shape
+from hdbridge.effects.base import SLOT, Channel, Effect, FloatArray, Moment, Motion, Shape
 from hdbridge.effects.recurrence import lagged
+
+_TEMPERATURE = SLOT[Channel.TEMPERATURE]
 
 
 class Warmed(Effect):
@@ -87,6 +89,6 @@ class WarmthState:
 
     def _followed(self, moment: Moment) -> float:
         if self._start is None:
-            return moment.temperature_c
+            return moment.measured[_TEMPERATURE]
         decay = math.exp(-max(moment.time_s - self._time, 0.0) / self._tau)
-        return decay * self._temperature + (1.0 - decay) * moment.temperature_c
+        return decay * self._temperature + (1.0 - decay) * moment.measured[_TEMPERATURE]

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Motion, Start
-from hdbridge.effects.base import Memoryless
+from hdbridge.effects.base import Memoryless, measured_by_all
 from hdbridge.effects.hysteresis import branches
 from hdbridge.identify.blocks import Blocks
 from hdbridge.identify.samples import IntArray, Samples
 
 PART_SAMPLES = 50_000
-CHANNELS = ("time_s", "load_torque_nm", "motor_torque_nm", "temperature_c")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,23 +200,21 @@ def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray
 
 
 def _picked(motion: Motion, index: IntArray) -> Motion:
-    channels = {name: getattr(motion, name) for name in CHANNELS}
     return Motion(
         motion.motor_deg[index],
-        **{name: None if values is None else values[index] for name, values in channels.items()},
+        None if motion.time_s is None else motion.time_s[index],
+        {channel: values[index] for channel, values in motion.measured.items()},
     )
 
 
 def _joined(motions: Sequence[Motion]) -> Motion:
     if len(motions) == 1:
         return motions[0]
-    parts = {name: [getattr(each, name) for each in motions] for name in CHANNELS}
+    times = [each.time_s for each in motions if each.time_s is not None]
     return Motion(
         np.concatenate([each.motor_deg for each in motions]),
-        **{
-            name: None if any(each is None for each in values) else np.concatenate(values)
-            for name, values in parts.items()
-        },
+        np.concatenate(times) if len(times) == len(motions) else None,
+        measured_by_all([each.measured for each in motions]),
     )
 
 

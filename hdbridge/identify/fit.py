@@ -224,4 +224,4 @@ def _hold_what_is_unknown(
 
 
 def _has(samples: Samples, channel: Channel) -> bool:
-    return all(getattr(chain.motion, channel.value) is not None for chain in samples.chains)
+    return all(channel in chain.motion.available() for chain in samples.chains)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.effects import FloatArray, Motion, Start
+from hdbridge.effects.base import measured_by_all
 from hdbridge.effects.hysteresis import branches
 from hdbridge.errors import InputError
 from hdbridge.identify.driving import driving_angle, quantum_deg
@@ -162,9 +163,7 @@ def _motion(segments: Sequence[Segment]) -> Motion:
     return Motion(
         driving_angle(motor, joined("position_deg"), commanded),
         np.concatenate([each.time_s for each in segments]),
-        joined("load_torque_nm"),
-        joined("motor_torque_nm"),
-        joined("temperature_c"),
+        measured_by_all([each.measured for each in segments]),
     )
 
 

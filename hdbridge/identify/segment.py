@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from enum import Enum
 
 import numpy as np
 
-from hdbridge.effects import FloatArray, Start
+from hdbridge.effects import Channel, FloatArray, Start
 from hdbridge.errors import InputError
 
 MINIMUM_SAMPLES = 8
@@ -52,9 +53,8 @@ class Segment:
     """Measured motor angle beside the commanded one, multi-turn degrees."""
     commanded: bool = True
     """False where ``motor_deg`` is measured: its chatter is then kept away from the hysteresis."""
-    load_torque_nm: FloatArray | None = None
-    motor_torque_nm: FloatArray | None = None
-    temperature_c: FloatArray | None = None
+    measured: Mapping[Channel, FloatArray] = field(default_factory=dict)
+    """The measured channels that it has."""
     start: Start | None = None
     """The elastic state at the first sample where it is known and does not follow from the segment before."""
     zero: int = 0
@@ -65,19 +65,20 @@ class Segment:
     def __post_init__(self) -> None:
         """InputError where the arrays do not fit together or hold what cannot be computed with."""
         count = len(self.time_s)
-        for each in fields(self):
-            value = getattr(self, each.name)
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        arrays.update((channel.value, values) for channel, values in self.measured.items())
+        for name, value in arrays.items():
             if not isinstance(value, np.ndarray):
                 continue
             if value.shape != (count,):
                 raise InputError(
-                    f"{self.name}: {each.name} has shape {value.shape}, expected ({count},) like time_s; "
+                    f"{self.name}: {name} has shape {value.shape}, expected ({count},) like time_s; "
                     "give every channel one value per sample"
                 )
             bad = np.flatnonzero(~np.isfinite(value))
             if len(bad):
                 raise InputError(
-                    f"{self.name}: {each.name} of sample {bad[0]} is {value[bad[0]]}; expected a finite "
+                    f"{self.name}: {name} of sample {bad[0]} is {value[bad[0]]}; expected a finite "
                     "number: remove the sample or repair the file"
                 )
         back = np.flatnonzero(np.diff(self.time_s) < 0)

@@ -45,10 +45,8 @@ class Sample(NamedTuple):
     motor_position_deg: float
     load_position_deg: float
     motor_torque_nm: float
-    load_torque_nm: float = math.nan
-    """NaN where it is not known."""
-    temperature_c: float = math.nan
-    """NaN where it is not known."""
+    readings: tuple[float | None, ...] = ()
+    """Of each channel of the axis file the last reading that was believed; None where none is known."""
 
 
 class Path(NamedTuple):

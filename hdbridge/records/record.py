@@ -14,7 +14,8 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from hdbridge.effects import FloatArray, Motion
+from hdbridge.effects import Channel, FloatArray, Motion
+from hdbridge.effects.base import MEASURED
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import Column, line_of_row, read_columns, write_columns
 from hdbridge.units import ARCSEC_PER_DEG
@@ -29,9 +30,7 @@ REQUIRED: Final[Mapping[str, str]] = MappingProxyType(
 OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
     {
         "motor_target_deg": "commanded motor angle, multi-turn",
-        "load_torque_nm": "torque at the load",
-        "motor_torque_nm": "torque of the motor",
-        "temperature_c": "temperature of the gear",
+        **{each.value: each.about for each in MEASURED},
     }
 )
 MINIMUM_SAMPLES: Final = 2
@@ -128,19 +127,9 @@ class Record:
         return self.columns.get("motor_target_deg")
 
     @property
-    def load_torque_nm(self) -> FloatArray | None:
-        """Torque at the load."""
-        return self.columns.get("load_torque_nm")
-
-    @property
-    def motor_torque_nm(self) -> FloatArray | None:
-        """Torque of the motor."""
-        return self.columns.get("motor_torque_nm")
-
-    @property
-    def temperature_c(self) -> FloatArray | None:
-        """Temperature of the gear."""
-        return self.columns.get("temperature_c")
+    def measured(self) -> dict[Channel, FloatArray]:
+        """The measured channels that it has, each of shape (n,)."""
+        return {each: self.columns[each.value] for each in MEASURED if each.value in self.columns}
 
     def transmission_error_arcsec(self, ratio: float) -> FloatArray:
         """theta_L - theta_M / N in arcsec at the load, shape (n,), from the measured angles.
@@ -156,9 +145,7 @@ class Record:
         return Motion(
             motor_deg=self.motor_position_deg if target is None else target,
             time_s=self.time_s,
-            load_torque_nm=self.load_torque_nm,
-            motor_torque_nm=self.motor_torque_nm,
-            temperature_c=self.temperature_c,
+            measured=self.measured,
         )
 
     def load_turns_per_motor_turn(self) -> float | None:

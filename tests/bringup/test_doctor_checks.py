@@ -188,7 +188,7 @@ CHANNELS = {
 def test_what_load_torque_and_temperature_tell(case: Callable[..., Any]) -> None:
     verdicts = case(axis=CHANNELS).run(until="rest")
     assert failures(verdicts) == []
-    assert "; load torque 0 Nm; temperature 22 C" in verdicts["rest"].measured
+    assert "; load torque 0 Nm; temperature 22 \N{DEGREE SIGN}C" in verdicts["rest"].measured
     assert verdicts["rest"].figures["temperature_c"] == 22.0
 
 
@@ -198,7 +198,7 @@ def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None
 
     verdicts = case(axis=CHANNELS, spoil=unplug).run(until="hold")
     assert failures(verdicts) == ["rest"]
-    assert "; no load torque; temperature 22 C" in verdicts["rest"].measured
+    assert "; no load torque; temperature 22 \N{DEGREE SIGN}C" in verdicts["rest"].measured
     assert "axis.yaml:42:1: load_torque: nothing comes that can be believed" in verdicts["rest"].remedies[0]
     assert verdicts["hold"].outcome is NOT_POSSIBLE
 

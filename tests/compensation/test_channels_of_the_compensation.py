@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from hdbridge.control.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
-from hdbridge.effects import CATALOGUE, Channel, Compliance, Moment, Observer, Start, compensable, extended
+from hdbridge.effects import (
+    CATALOGUE,
+    Channel,
+    Compliance,
+    Moment,
+    Observer,
+    Start,
+    compensable,
+    extended,
+    readings,
+)
 from hdbridge.model import TransmissionModel
 
 PERIOD = 0.004
@@ -29,9 +39,13 @@ def moments(loads):
         yield observer.moment(
             50.0 * load,
             time_s,
-            load_torque_nm=8.0 * math.sin(3.0 * load),
-            motor_torque_nm=0.2 * math.cos(2.0 * load),
-            temperature_c=25.0 + 2.0 * time_s,
+            measured=readings(
+                {
+                    Channel.LOAD_TORQUE: 8.0 * math.sin(3.0 * load),
+                    Channel.MOTOR_TORQUE: 0.2 * math.cos(2.0 * load),
+                    Channel.TEMPERATURE: 25.0 + 2.0 * time_s,
+                }
+            ),
             load_deg=load,
         )
 
@@ -65,7 +79,7 @@ def test_what_an_inverse_needs_is_said():
 
 def engaged(torque_nm: float) -> tuple[Compensation, Moment]:
     compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
-    moment = Moment(load_torque_nm=torque_nm)
+    moment = Moment(measured=readings({Channel.LOAD_TORQUE: torque_nm}))
     compensation.reset(0.0, moment)
     compensation.engage()
     for load in np.arange(0.0, 5.0, 10.0 * PERIOD):
@@ -113,5 +127,5 @@ def test_a_compensation_that_begins_without_the_channel_begins_without_the_effec
     compensation.reset(0.0)
     compensation.engage()
     for _ in range(200):
-        compensation.command(0.0, Moment(load_torque_nm=50.0))
+        compensation.command(0.0, Moment(measured=readings({Channel.LOAD_TORQUE: 50.0})))
     assert abs(compensation.correction_arcsec) < 40

@@ -29,20 +29,18 @@ def follower(**changes: Any) -> ChannelFollower:
 
 def test_both_come_as_values_with_their_units(build_axis: Build) -> None:
     image = ProcessImage(build_axis(load_torque=TORQUE | {"direction": -1}, temperature=TEMPERATURE))
-    assert (image.load_torque_nm, image.temperature_c) == (None, None)
+    assert image.readings == (None, None)
     assert image.accept(0x381, struct.pack("<i", 1500))
     assert image.accept(0x481, struct.pack("<h", -35))
     assert not image.step_channels()
-    assert image.load_torque_nm == pytest.approx(-1.5)
-    assert image.temperature_c == pytest.approx(-3.5)
+    assert image.readings == pytest.approx((-1.5, -3.5))
 
 
 def test_what_comes_equally_often_shares_a_pdo(build_axis: Build) -> None:
     image = ProcessImage(build_axis(load_torque=TORQUE, temperature=TEMPERATURE | {"every_cycles": 1}))
     assert image.accept(0x381, struct.pack("<ih", 1500, 215))
     image.step_channels()
-    assert image.load_torque_nm == pytest.approx(1.5)
-    assert image.temperature_c == pytest.approx(21.5)
+    assert image.readings == pytest.approx((1.5, 21.5))
 
 
 def test_a_temperature_may_be_in_kelvin() -> None:

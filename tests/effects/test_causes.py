@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from hdbridge.effects import (
     AmplitudeDrift,
     Backlash,
+    Channel,
     ChannelSkew,
     Compliance,
     CountLoss,
@@ -39,6 +40,7 @@ from hdbridge.effects import (
     Wear,
     ZeroDrift,
     moments,
+    readings,
 )
 
 ORDER_4 = MotorOrder(order=4, amplitude_arcsec=10, phase_deg=30)
@@ -63,7 +65,7 @@ def test_a_record_that_knows_its_speed_better_is_believed():
         np.zeros(3), np.arange(3.0), motor_speed_deg_s=np.array([5.0, 0.0, -5.0]),
         motor_acceleration_deg_s2=np.array([1.0, 2.0, 3.0]),
     )  # fmt: skip
-    assert [each[4:7] for each in moments(motion)] == [(5, 1, 1), (0, 2, 1), (-5, 3, -1)]
+    assert [each[2:5] for each in moments(motion)] == [(5, 1, 1), (0, 2, 1), (-5, 3, -1)]
 
 
 # ---- orders ----------------------------------------------------------------------------------
@@ -126,14 +128,14 @@ def test_ripple_grows_with_the_magnitude_of_the_torque_up_to_the_limit():
     effect = TorqueModulation(orders=(ORDER_4,), growth_percent_per_nm=2, limit_nm=10)
     ripple = Synchronous(orders=(ORDER_4,)).predict(Motion(np.array([5.0])))[0]
     torque = np.array([0.0, 5.0, -5.0, 1000.0])
-    error = effect.predict(Motion(np.full(4, 5.0), load_torque_nm=torque))
+    error = effect.predict(Motion(np.full(4, 5.0), measured={Channel.LOAD_TORQUE: torque}))
     np.testing.assert_allclose(error, ripple * np.array([0, 0.1, 0.1, 0.2]))
 
 
 def test_wind_up_stiffens_at_two_torques():
     effect = Compliance.candidate(50.0)
     torque = np.array([0.0, 1.0, 7.0, 10.0, 25.0, 30.0, -10.0])
-    error = effect.predict(Motion(np.zeros(7), load_torque_nm=torque))
+    error = effect.predict(Motion(np.zeros(7), measured={Channel.LOAD_TORQUE: torque}))
     at = [0, 15.9, 111.3, 111.3 + 3 * 11.5, 111.3 + 18 * 11.5, 111.3 + 18 * 11.5 + 5 * 9]
     np.testing.assert_allclose(error, [*at, -at[3]])
     assert effect.stiffness_nm_per_rad()[0] == pytest.approx(1.3e4, rel=0.01)
@@ -320,7 +322,9 @@ def test_short_moves_strain_a_viscoelastic_gear_little():
 def test_the_zero_follows_the_temperature_with_its_time_constant():
     effect = ZeroDrift(drift_arcsec_per_k=2, tau_s=600, reference_c=20)
     time_s = np.array([0.0, 600.0, 1200.0, 9000.0])
-    error = effect.predict(Motion(np.zeros(4), time_s, temperature_c=np.array([20.0, 30.0, 30.0, 30.0])))
+    error = effect.predict(
+        Motion(np.zeros(4), time_s, {Channel.TEMPERATURE: np.array([20.0, 30.0, 30.0, 30.0])})
+    )
     np.testing.assert_allclose(error, 20 * (1 - np.exp(-time_s / 600)), atol=1e-9)
 
 
@@ -339,7 +343,9 @@ def test_ripple_and_loop_change_with_warmth():
         tau_s=60,
         reference_c=20,
     )
-    motion = Motion(np.array([0.0, 100.0]), np.array([0.0, 1.0]), temperature_c=np.array([30.0, 30.0]))
+    motion = Motion(
+        np.array([0.0, 100.0]), np.array([0.0, 1.0]), {Channel.TEMPERATURE: np.array([30.0, 30.0])}
+    )
     ripple = Synchronous(orders=(ORDER_4,)).predict(motion)
     np.testing.assert_allclose(effect.predict(motion, Start.FORWARD), 0.1 * ripple - 0.2 * 40)
 
@@ -350,10 +356,12 @@ def test_a_lag_over_a_long_record_keeps_its_digits():
     time_s = np.cumsum(np.where(np.arange(count) % 2, 1e-3, 1e3))
     temperature = 20.0 + np.sin(np.arange(count))
     effect = ZeroDrift(drift_arcsec_per_k=1, tau_s=1.0)
-    error = effect.predict(Motion(np.zeros(count), time_s, temperature_c=temperature))
+    error = effect.predict(Motion(np.zeros(count), time_s, {Channel.TEMPERATURE: temperature}))
     tracker = effect.tracker()
     for i in range(2000):
-        on_line = tracker.advance(0.0, Moment(time_s=float(time_s[i]), temperature_c=float(temperature[i])))
+        on_line = tracker.advance(
+            0.0, Moment(float(time_s[i]), readings({Channel.TEMPERATURE: float(temperature[i])}))
+        )
         assert error[i] == pytest.approx(on_line, abs=1e-9)
 
 

@@ -8,8 +8,10 @@ import pytest
 from hdbridge.control.compensation import Inverse
 from hdbridge.effects import (
     CATALOGUE,
+    SLOT,
     AmplitudeDrift,
     Backlash,
+    Channel,
     CountLoss,
     DirectionPhase,
     Hysteresis,
@@ -29,6 +31,7 @@ from hdbridge.effects import (
     conflicts,
     extended,
     fall_bound,
+    readings,
     refreshed,
 )
 from hdbridge.model import TransmissionModel
@@ -54,7 +57,9 @@ def test_a_ripple_that_is_loaded_and_warm_has_changed_by_both():
     synchronous, _, growth, drift = refreshed([*BASE, growth, drift])
     time_s = np.linspace(0.0, 100.0, 500)
     torque, temperature = np.linspace(-9.0, 9.0, 500), np.full(500, 26.0)
-    motion = Motion(7.0 * time_s, time_s=time_s, load_torque_nm=torque, temperature_c=temperature)
+    motion = Motion(
+        7.0 * time_s, time_s=time_s, measured={Channel.LOAD_TORQUE: torque, Channel.TEMPERATURE: temperature}
+    )
     total = sum(each.predict(motion) for each in (synchronous, growth, drift))
     expected = synchronous.predict(motion) * (1.0 + 0.04 * np.abs(torque)) * (1.0 - 0.02 * 6.0)
     np.testing.assert_allclose(total, expected, atol=1e-9)
@@ -148,7 +153,9 @@ def test_the_compensation_puts_the_load_on_its_target_whatever_the_cause(name):
         time_s = 0.01 * i
         target = 4.0 * round(math.sin(3.0 * time_s), 1) + 0.2 * math.sin(9.0 * time_s)
         moment = observer.moment(
-            RATIO * target, time_s, load_torque_nm=20 * math.sin(time_s), temperature_c=20 + time_s
+            RATIO * target,
+            time_s,
+            measured=readings({Channel.LOAD_TORQUE: 20 * math.sin(time_s), Channel.TEMPERATURE: 20 + time_s}),
         )
         motor = inverse.solve(target, moment) if i else RATIO * target
         inverse.advance(motor, moment)
@@ -158,8 +165,7 @@ def test_the_compensation_puts_the_load_on_its_target_whatever_the_cause(name):
     motion = Motion(
         np.array(issued),
         np.array([each.time_s for each in seen]),
-        load_torque_nm=np.array([each.load_torque_nm for each in seen]),
-        temperature_c=np.array([each.temperature_c for each in seen]),
+        {channel: np.array([each.measured[slot] for each in seen]) for channel, slot in SLOT.items()},
         motor_speed_deg_s=np.array([each.motor_speed_deg_s for each in seen]),
         motor_acceleration_deg_s2=np.array([each.motor_acceleration_deg_s2 for each in seen]),
     )

@@ -13,6 +13,7 @@ from support.effect_examples import EXAMPLES, motions, starts
 from hdbridge.effects import (
     CATALOGUE,
     CAUSES,
+    MEASURED,
     Channel,
     Effect,
     Moment,
@@ -20,6 +21,7 @@ from hdbridge.effects import (
     Start,
     Synchronous,
     moments,
+    readings,
     unmet,
 )
 from hdbridge.errors import InputError
@@ -151,7 +153,7 @@ def test_nothing_moved_and_nothing_recorded_is_no_trouble(name, data):
     effect = data.draw(EXAMPLES[name])
     for count in (0, 1):
         zeros = np.zeros(count)
-        motion = Motion(zeros, zeros, zeros, zeros, zeros, load_deg=zeros)
+        motion = Motion(zeros, zeros, dict.fromkeys(MEASURED, zeros), load_deg=zeros)
         assert effect.predict(motion).shape == (count,)
 
 
@@ -162,7 +164,8 @@ def test_memory_of_a_tracker_does_not_grow(name):
     sizes = []
     for i in range(2000):
         angle = (-1) ** i * (2000 - i) * 0.0049
-        tracker.advance(angle, Moment(time_s=0.1 * i, motor_speed_deg_s=angle, temperature_c=20 + 0.01 * i))
+        warm = readings({Channel.TEMPERATURE: 20 + 0.01 * i})
+        tracker.advance(angle, Moment(0.1 * i, warm, motor_speed_deg_s=angle))
         sizes.append(len(pickle.dumps(tracker)))
     assert sizes[-1] <= max(sizes[:600])
 

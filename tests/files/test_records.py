@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.effects import Channel
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
 
@@ -151,8 +152,8 @@ def test_a_model_follows_the_commanded_angle_where_there_is_one():
     assert record(motor_target_deg=target).motion().motor_deg.tolist() == target.tolist()
     one = record(load_torque_nm=np.ones(101))
     assert one.motion().motor_deg.tolist() == one.motor_position_deg.tolist()
-    assert one.motion().load_torque_nm is not None
-    assert one.motion().temperature_c is None
+    assert Channel.LOAD_TORQUE in one.motion().measured
+    assert Channel.TEMPERATURE not in one.motion().measured
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from hdbridge.diagnose import Diagnosis, Figures, Finding, Identifiability, Para
 from hdbridge.effects import (
     CATALOGUE,
     CAUSES,
+    Channel,
     CountLoss,
     Hysteresis,
     Motion,
@@ -54,9 +55,11 @@ def motion(count=6000):
     return Motion(
         motor_deg=motor,
         time_s=time,
-        load_torque_nm=5.0 * np.cos(np.radians(7.3 * load)),
-        motor_torque_nm=0.1 * np.sign(speed),
-        temperature_c=20.0 + 8.0 * time / time[-1],
+        measured={
+            Channel.LOAD_TORQUE: 5.0 * np.cos(np.radians(7.3 * load)),
+            Channel.MOTOR_TORQUE: 0.1 * np.sign(speed),
+            Channel.TEMPERATURE: 20.0 + 8.0 * time / time[-1],
+        },
         motor_speed_deg_s=speed,
         motor_acceleration_deg_s2=np.gradient(speed, time),
         load_deg=load,

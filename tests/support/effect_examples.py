@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from hdbridge.effects import (
     AmplitudeDrift,
     Backlash,
+    Channel,
     ChannelSkew,
     Compliance,
     CountLoss,
@@ -171,9 +172,11 @@ def _motion(first, steps, seed, even):
     return Motion(
         angle,
         time_s=draw.uniform(-5, 5) + np.cumsum(period),
-        load_torque_nm=draw.normal(0, 30, count),
-        motor_torque_nm=draw.normal(0, 1, count),
-        temperature_c=np.clip(25 + np.cumsum(draw.normal(0, 2, count)), -20, 90),
+        measured={
+            Channel.LOAD_TORQUE: draw.normal(0, 30, count),
+            Channel.MOTOR_TORQUE: draw.normal(0, 1, count),
+            Channel.TEMPERATURE: np.clip(25 + np.cumsum(draw.normal(0, 2, count)), -20, 90),
+        },
         load_deg=angle / 50 + draw.normal(0, 0.01, count),
     )
 

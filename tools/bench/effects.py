@@ -10,7 +10,7 @@ import timeit
 
 import numpy as np
 
-from hdbridge.effects import CATALOGUE, Moment, Motion, Start
+from hdbridge.effects import CATALOGUE, Channel, Moment, Motion, Start
 
 RATIO = 50.0
 
@@ -24,11 +24,10 @@ def main() -> None:
     record = Motion(
         angle,
         time_s,
-        load_torque_nm=20.0 * np.sin(time_s),
-        temperature_c=20.0 + 1e-3 * time_s,
+        {Channel.LOAD_TORQUE: 20.0 * np.sin(time_s), Channel.TEMPERATURE: 20.0 + 1e-3 * time_s},
         load_deg=angle / RATIO,
     )
-    moment = Moment(10.0, 5.0, 0.1, 25.0, 100.0, 50.0, 1, 3.0)
+    moment = Moment(10.0, (5.0, 0.1, 25.0), 100.0, 50.0, 1, 3.0)
     print(f"{'effect':28} {'peek us':>8} {'advance us':>10} {'1e6 samples: predict s':>24} {'columns s':>10}")
     for name, kind in CATALOGUE.items():
         effect = kind.candidate(RATIO, base)

@@ -1,0 +1,107 @@
+"""A measured channel more is one row of one table: from the drive's object to the record and the effects."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROW = '    HUMIDITY = "humidity_percent", "humidity of the grease", "%", 40.0, "humidity"\n'
+USE = """
+import sys
+from typing import ClassVar
+
+import numpy as np
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import BY_KEY
+from hdbridge.control.bench import Bench, compensation_for
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Channel
+from hdbridge.effects.base import Compensable, Linear, Memoryless, SLOT
+from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.record import Record
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+
+
+class Swelling(Linear):
+    name: ClassVar = "swelling"
+    linear: ClassVar = ("swelling_arcsec_per_percent",)
+    channels: ClassVar = frozenset({Channel.HUMIDITY})
+    compensable: ClassVar = Compensable(True, "the load moves")
+    swelling_arcsec_per_percent: float
+
+    def columns(self, motion, start=None):
+        return motion.channel(Channel.HUMIDITY, self.name)[:, None]
+
+    def tracker(self, start=None):
+        class Follower(Memoryless):
+            def peek(_, motor_deg, moment):
+                return self.swelling_arcsec_per_percent * moment.measured[SLOT[Channel.HUMIDITY]]
+
+        return Follower()
+
+    def bound_arcsec(self):
+        return 100.0 * abs(self.swelling_arcsec_per_percent)
+
+    def slope_bound_arcsec_per_deg(self):
+        return 0.0
+
+
+file = bundled_profile("article") / "axis.yaml"
+text = file.read_text()
+bare = AxisConfig.from_text(text, file)
+lines = "\\nhumidity:\\n  source: {index: 0x2100, type: int16}\\n  per_count: 0.1\\n"
+axis = AxisConfig.from_text(text + lines, file)
+assert list(axis.channels) == ["humidity"]
+model = TransmissionModel(axis.gear.ratio, (Swelling(swelling_arcsec_per_percent=10.0),))
+try:
+    compensation_for(bare, model)
+except InputError as error:
+    print("refused:", error)
+truth = Truth.load(file.parent)
+compensation = compensation_for(axis, model)
+with (
+    simulated_bench(truth, axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
+    Drive(bus, axis, clock) as drive,
+):
+    drive.boot()
+    run = Bench(drive, compensation).run(Stepping(count=2))
+run.record.write_csv(sys.argv[1])
+record = Record.read_csv(sys.argv[1])
+print("column:", float(np.median(record.columns["humidity_percent"])))
+print("motion:", Channel.HUMIDITY in record.motion().available())
+print("correction:", compensation.correction_arcsec)
+"""
+
+
+def test_a_channel_more_is_one_row(tmp_path):
+    package = tmp_path / "hdbridge"
+    shutil.copytree(ROOT / "hdbridge", package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("eds", "profiles"):
+        shutil.copytree(ROOT / folder, package / "_bundled" / folder)
+    table = package / "effects" / "base.py"
+    text = table.read_text(encoding="utf-8")
+    last = next(line for line in text.splitlines(keepends=True) if line.startswith("    TEMPERATURE = "))
+    table.write_text(text.replace(last, last + ROW), encoding="utf-8")
+
+    done = subprocess.run(
+        [sys.executable, "-c", USE, str(tmp_path / "record.csv")],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    said = dict(line.split(": ", 1) for line in done.stdout.splitlines())
+    assert "add 'humidity' to" in said["refused"]
+    assert float(said["column"]) > 20.0  # what the simulated drive's object 2100h says, here as per cent
+    assert said["motion"] == "True"
+    assert float(said["correction"]) == pytest.approx(10.0 * float(said["column"]), rel=0.02)
