@@ -9,11 +9,12 @@ from hdbridge.axis.config import (
     Gear,
     Identity,
     Limits,
+    RealtimeConfig,
     Teeth,
 )
 from hdbridge.axis.encoders import Encoder, LoadEncoder, MotorEncoder, Source
 
 __all__ = [
     "AxisConfig", "BusConfig", "CompensationConfig", "DriveConfig", "Encoder", "Gear", "Identity", "Limits",
-    "LoadEncoder", "LoadTorque", "MotorEncoder", "Source", "Teeth", "Temperature",
+    "LoadEncoder", "LoadTorque", "MotorEncoder", "RealtimeConfig", "Source", "Teeth", "Temperature",
 ]  # fmt: skip

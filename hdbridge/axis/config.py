@@ -204,6 +204,25 @@ class CompensationConfig(_Part):
     ramp_s: float = Field(0.5, gt=0, le=60, description="time in which it is switched on or off")
 
 
+class RealtimeConfig(_Part):
+    """How the master's process runs on its machine while it moves the axis over a real bus."""
+
+    priority: int = Field(
+        50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: that of ordinary work"
+    )
+    cpus: tuple[Annotated[int, Field(ge=0, le=4095)], ...] = Field(
+        (), description="numbers of the processors that the control loop may run on; none: any"
+    )
+
+    @field_validator("cpus")
+    @classmethod
+    def _each_once(cls, cpus: tuple[int, ...]) -> tuple[int, ...]:
+        for place, cpu in enumerate(cpus):
+            if cpu in cpus[:place]:
+                raise wrong(f"processor {cpu} stands twice; expected it once", place)
+        return cpus
+
+
 class AxisConfig(OtherChannels):
     """An axis: bus, drive, encoders, gear, limits and compensation."""
 
@@ -225,6 +244,9 @@ class AxisConfig(OtherChannels):
     limits: Limits = Field(description="what the axis may do")
     compensation: CompensationConfig = Field(
         default_factory=CompensationConfig, description="how far and how fast the compensation may act"
+    )
+    realtime: RealtimeConfig = Field(
+        default_factory=RealtimeConfig, description="how the master runs on its machine"
     )
 
     _document: Document | None = PrivateAttr(None)

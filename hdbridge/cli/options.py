@@ -113,7 +113,8 @@ def connected(
             raise InputError("--truth says what a simulated axis is like: give --simulate with it")
         if axis.bus.interface == "virtual":
             notes.print("the bus 'virtual' ends in this process; --simulate puts a simulated drive there")
-        with prepare_realtime() as conditions, open_bus(axis.bus) as bus:
+        wanted = axis.realtime
+        with prepare_realtime(wanted.priority, wanted.cpus) as conditions, open_bus(axis.bus) as bus:
             notes.print(f"this process: {conditions}")
             yield bus, MonotonicClock()
         return

@@ -1,4 +1,4 @@
-"""What a process can do for a punctual loop: no garbage collection, real-time priority, memory kept in RAM.
+"""What a process can do for a punctual loop: no garbage collection, real-time priority, locked memory.
 
 Everything is put back on the way out. What the system does not permit is reported, not insisted on: the
 loop then runs with what it got, and its lateness histogram tells how well.
@@ -7,17 +7,23 @@ loop then runs with what it got, and its lateness histogram tells how well.
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PRIORITY: Final = 50
-"""SCHED_FIFO priority: above ordinary work, below the kernel's own interrupt threads (50 on PREEMPT_RT)."""
+"""SCHED_FIFO priority: above all ordinary work, and level with the kernel's interrupt threads.
+
+Linux gives threaded interrupts (under PREEMPT_RT nearly all are) SCHED_FIFO 50 as well: half of the 100, see
+sched_set_fifo. Of equals on one processor the one that runs goes on until it sleeps. So neither interrupts
+the other: the loop may wait for an interrupt thread, and the one that brings frames runs meanwhile.
+"""
 
 SWITCH_INTERVAL_S: Final = 0.0002
 
@@ -30,14 +36,27 @@ class Realtime:
     """None when the thread has SCHED_FIFO, else why not."""
     memory: str | None
     """None when the memory is locked, else why not."""
+    affinity: str | None = None
+    """None when the thread is bound to the processors that were asked for (or none were), else why not."""
+    priority: int = PRIORITY
+    """The SCHED_FIFO priority asked for; 0: none."""
+    cpus: tuple[int, ...] = ()
+    """The processors asked for; none: any."""
 
     def __str__(self) -> str:
         """One line for a person."""
         parts = ["garbage collection off"]
-        parts.append(
-            "SCHED_FIFO" if self.scheduling is None else f"no real-time priority ({self.scheduling})"
-        )
+        if not self.priority:
+            parts.append("ordinary priority")
+        elif self.scheduling is None:
+            parts.append(f"SCHED_FIFO {self.priority}")
+        else:
+            parts.append(f"no real-time priority ({self.scheduling})")
         parts.append("memory locked" if self.memory is None else f"memory not locked ({self.memory})")
+        if self.cpus:
+            cpus = ", ".join(map(str, self.cpus))
+            bound = f"on processor {cpus}"
+            parts.append(bound if self.affinity is None else f"not {bound} ({self.affinity})")
         return ", ".join(parts)
 
 
@@ -48,27 +67,32 @@ def _lock_memory(flags: int) -> str | None:
 
 
 @contextmanager
-def prepare_realtime(priority: int = PRIORITY) -> Iterator[Realtime]:
+def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> Iterator[Realtime]:
     """Make the calling thread and its process punctual for as long as the block lasts.
+
+    ``priority`` is that of SCHED_FIFO, 1 to 99, or 0 to leave the scheduling alone; ``cpus`` are the numbers
+    of the processors that the thread may run on, none for any.
 
     Never around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it would
     take a whole processor from everything else.
     """
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    allowed = os.sched_getaffinity(0)
     collecting, switching_s = gc.isenabled(), sys.getswitchinterval()
     # Another thread (a progress bar's) gives the interpreter back within this time when the loop wakes up.
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        scheduling = None
-    except OSError as error:
-        scheduling = error.strerror or str(error)
+    affinity = _why_not(lambda: _bind(cpus)) if cpus else None
+    scheduling = (
+        _why_not(lambda: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority)))
+        if priority
+        else None
+    )
     memory = _lock_memory(_MCL_CURRENT | _MCL_FUTURE)
     gc.collect()
     gc.freeze()
     gc.disable()
     try:
-        yield Realtime(scheduling, memory)
+        yield Realtime(scheduling, memory, affinity, priority, tuple(sorted(cpus)))
     finally:
         sys.setswitchinterval(switching_s)
         gc.unfreeze()
@@ -76,5 +100,24 @@ def prepare_realtime(priority: int = PRIORITY) -> Iterator[Realtime]:
             gc.enable()
         if memory is None:
             _lock_memory(0)
-        if scheduling is None:
+        if priority and scheduling is None:
             os.sched_setscheduler(0, policy, parameter)
+        if cpus and affinity is None:
+            os.sched_setaffinity(0, allowed)
+
+
+def _why_not(attempt: Callable[[], None]) -> str | None:
+    """The system's reason for refusing; None when it did not."""
+    try:
+        attempt()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def _bind(cpus: Collection[int]) -> None:
+    """Linux takes those of the processors that exist and says nothing of the others."""
+    here = set(range(os.cpu_count() or 1))
+    if missing := set(cpus) - here:
+        raise OSError(errno.EINVAL, f"there is no processor {min(missing)}, the last one is {max(here)}")
+    os.sched_setaffinity(0, cpus)

@@ -10,12 +10,13 @@ import pytest
 from hdbridge.control.realtime import prepare_realtime
 
 
-def state() -> tuple[int, int, bool, int]:
+def state() -> tuple[int, int, bool, int, set[int]]:
     return (
         os.sched_getscheduler(0),
         os.sched_getparam(0).sched_priority,
         gc.isenabled(),
         gc.get_freeze_count(),
+        os.sched_getaffinity(0),
     )
 
 
@@ -44,3 +45,22 @@ def test_what_is_not_permitted_is_reported_and_not_insisted_on(monkeypatch: pyte
     with prepare_realtime() as realtime:
         assert realtime.scheduling == "Operation not permitted"
         assert "no real-time priority" in str(realtime)
+
+
+def test_it_runs_on_the_processors_that_were_asked_for() -> None:
+    before = state()
+    first = min(os.sched_getaffinity(0))
+    with prepare_realtime(priority=0, cpus=[first]) as realtime:
+        assert os.sched_getaffinity(0) == {first}
+        assert os.sched_getscheduler(0) == before[0]
+        assert f"ordinary priority, memory {'' if realtime.memory is None else 'not '}locked" in str(realtime)
+        assert str(realtime).endswith(f"on processor {first}")
+    assert state() == before
+
+
+def test_a_processor_that_is_not_there_is_reported() -> None:
+    before = state()
+    with prepare_realtime(priority=0, cpus=[0, 4095]) as realtime:
+        assert "not on processor 0, 4095 (there is no processor 4095" in str(realtime)
+        assert state()[-1] == before[-1]
+    assert state() == before

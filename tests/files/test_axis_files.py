@@ -53,6 +53,7 @@ def test_a_good_file_gives_nested_values_and_defaults(folder):
     assert (axis.name, axis.drive.cycle_s, axis.drive.interpolation_period) == ("test", 0.004, (4, -3))
     assert (axis.drive.heartbeat_ms, axis.drive.master_node_id, axis.drive.quick_stop_option) == (50, 127, 6)
     assert (axis.load_encoder.source.index, axis.load_encoder.source.wraps_at_counts) == (0x60E4, 2**32)
+    assert (axis.realtime.priority, axis.realtime.cpus) == (50, ())
     assert (axis.compensation.maximum_arcsec, axis.compensation.slew_arcsec_s, axis.compensation.ramp_s) == (
         300,
         20000,
@@ -79,6 +80,9 @@ TEETH = GOOD + "gear:\n  ratio: {}\n  teeth: {{flexspline: {}, circular_spline: 
         ("cycle_ms: 4", "cycle_ms: 4.25", "8:13: drive.cycle_ms: 60C2h cannot express 4.25 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
         ("cycle_ms: 4", "cycle_ms: 25.6", "8:13: drive.cycle_ms: 60C2h cannot express 25.6 ms: expected 1 to 255 whole milliseconds, or 0.5 to 25.5 ms with one decimal"),
         ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms does not go with a cycle of 40 ms; expected heartbeat_ms of at least 80"),
+        ("limits:", "realtime: {priority: 100}\nlimits:", "15:22: realtime.priority: found 100; expected an integer from 0 to 99 (SCHED_FIFO priority of the control loop; 0: that of ordinary work)"),
+        ("limits:", "realtime: {cpus: [0, -1]}\nlimits:", "15:22: realtime.cpus[1]: found -1; expected an integer from 0 to 4095"),
+        ("limits:", "realtime: {cpus: [3, 2, 3]}\nlimits:", "15:25: realtime.cpus[2]: processor 3 stands twice; expected it once"),
         ("cycle_ms: 4", "cycle_sm: 4", "8:3: drive.cycle_sm: unknown key; did you mean 'cycle_ms'?"),
         ("cycle_ms: 4", "master_node_id: 1\n  cycle_ms: 4", "8:19: drive.master_node_id: node 1 is the drive (drive.node_id); expected another"),
         ("node_id: 1", "node_id: 0", "5:12: drive.node_id: found 0; expected an integer from 1 to 127 (CANopen node id of the drive)"),

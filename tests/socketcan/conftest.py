@@ -34,6 +34,7 @@ from hdbridge.errors import HdbridgeError, SafetyStop
 ARTICLE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 CHANNEL = "vcan0"
 STEP_COUNTS = 10
+
 UNHURRIED = {"cycle_ms": 20, "heartbeat_ms": 200, "following_error_time_ms": 100}
 """The article's axis for a machine that may stall for some milliseconds: no test assumes a fast one."""
 
@@ -50,7 +51,7 @@ def unhurried_profile() -> Path:
     for key, value in UNHURRIED.items():
         text, found = re.subn(rf"^(  {key}: ).*$", rf"\g<1>{value}", text, flags=re.MULTILINE)
         assert found == 1, key
-    axis.write_text(text, encoding="utf-8")
+    axis.write_text(f"{text}\nrealtime: {{priority: 7, cpus: [0]}}\n", encoding="utf-8")
     return folder
 
 

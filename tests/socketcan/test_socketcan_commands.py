@@ -31,6 +31,8 @@ def test_step_masters_the_simulated_drive_in_another_process(interface, profile,
         if done.returncode != SafetyStop.exit_status:
             break
     assert done.returncode == 0, done.stderr
+    remarks = " ".join(done.stderr.split())
+    assert "on processor 0 booted" in remarks  # as the axis file says
     figures = json.loads(result.read_text())
     assert figures["none"]["cw"]["mean_arcsec"] > 30
     assert figures["none"]["ccw"]["mean_arcsec"] < -30
