@@ -30,8 +30,13 @@ Made from the command line by `python tools/command_reference.py`; a test compar
 
 **PROFILE** is the folder of an axis (`axis.yaml` and what belongs to it), an axis file, or the name of a
 bundled profile: `article`, `demo`. Tables and results go to standard output, progress and remarks to the
-standard error. `--json FILE` writes the result for machines. Whether results can be written is checked before
-anything moves.
+standard error. `--json FILE` writes the result for machines.
+
+**Outputs destroy nothing.** Before anything is read or moves, each output is checked: a result replaces only
+a result of its kind, never an input, another output, or a file of a profile or a recording; a folder for
+measurements is new or empty. A model goes to a profile as `PROFILE/pending.yaml`, and is used after
+`hdbridge model commit`. Pipes and character devices are written straight through; `-` is the standard output,
+and what is printed for a person then goes to the standard error.
 
 **Ctrl-C** (and SIGTERM) lets the control cycle end its period and stops the axis; what was measured is kept.
 The third one ends the program at once.

@@ -54,9 +54,14 @@ because some need a second or two for that.
 
 
 def load(name: str) -> typer.Typer:
-    """Import a command: an app with nothing but what its file registers."""
+    """Import a command: an app with nothing but what its file registers, which checks its outputs first."""
+    guarded = import_module(f"{__name__}.outputs").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
     import_module(f"{__name__}.{name}").register(loaded)
+    groups = (each.typer_instance for each in loaded.registered_groups)
+    for each in (loaded, *(group for group in groups if group is not None)):
+        for command in each.registered_commands:
+            command.callback = guarded(command.callback)
     return loaded
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
@@ -20,17 +20,12 @@ def booted(
     simulate: bool,
     truth: Path | None,
     seed: int,
-    around: AbstractContextManager[object] | None = None,
 ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-    """The booted drive, and a function that tells whether somebody wishes to end.
-
-    ``around`` is entered on the connected drive before it boots.
-    """
+    """The booted drive, and a function that tells whether somebody wishes to end."""
     with (
         deferred_interrupt() as interrupted,
         connected(axis, profile, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
         Drive(bus, axis, clock) as drive,
-        around or nullcontext(),
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")

@@ -28,6 +28,7 @@ from hdbridge.cli.options import (
     notes,
     write_json,
 )
+from hdbridge.files.outputs import Kind
 
 
 def register(app: typer.Typer) -> None:
@@ -38,7 +39,7 @@ def register(app: typer.Typer) -> None:
 def command(
     profile: ProfileArgument,
     plan: PlanOption = "quick",
-    out: Annotated[Path | None, out_option("Where the recording goes")] = None,
+    out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
     resume: Annotated[
         Path | None, resume_option("Go on with an interrupted calibration: what its plan still lacks.")
     ] = None,
@@ -60,8 +61,10 @@ def command(
     axis = load_axis(files, interface, channel)
     work = Measurement.asked(axis, plan, out, resume)
     work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
-    kept = kept_in(work.folder)
-    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, around=kept) as (drive, interrupted):
+    with (
+        kept_in(work.folder),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+    ):
         journal = work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = calibrate(

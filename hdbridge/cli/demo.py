@@ -9,6 +9,8 @@ import typer
 
 from hdbridge.cli.options import Profile, console, load_axis, write_json
 from hdbridge.cli.step import print_result, run_comparison, write_page
+from hdbridge.files.atomic import make_folder, new_folder
+from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
 
@@ -19,9 +21,11 @@ def register(app: typer.Typer) -> None:
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Where the results go.")] = Path(
-        "demo-output"
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
+        Kind.FOLDER,
+    ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=2000, help="Steps each way.")] = 240,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")] = 0,
 ) -> None:
@@ -34,6 +38,7 @@ def demo(
     files = Profile.find("article")
     axis = load_axis(files, None, None)
     stepping = Stepping(count=count)
+    folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
     comparison = run_comparison(
         axis,
         files,
@@ -43,11 +48,12 @@ def demo(
         simulate=True,
         truth=None,
         seed=seed,
-        record=out,
+        record=folder,
     )
-    write_json(out / "stepping.json", comparison.as_dict())
-    write_page(out / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
+    write_json(folder / "stepping.json", comparison.as_dict())
+    write_page(folder / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
     print_result(axis, comparison)
     console.print(
-        f"\nopen {out / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md", soft_wrap=True
+        f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md",
+        soft_wrap=True,
     )

@@ -17,6 +17,7 @@ from hdbridge.diagnose.planned import plan_report
 from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.foreign import check_records, zeros_apart_arcsec
@@ -44,7 +45,9 @@ def run(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     extend: Annotated[
-        Path | None, typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model.")
+        Path | None,
+        typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
+        Kind.MODEL,
     ] = None,
     independent_zeros: Annotated[
         bool,

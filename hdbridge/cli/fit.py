@@ -13,6 +13,7 @@ from hdbridge.calibration import conclude
 from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
 from hdbridge.errors import InputError
+from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.records.foreign import check_records
 from hdbridge.records.recording import Recording
@@ -46,7 +47,7 @@ def command(
         bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file.")
+        Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,

@@ -29,6 +29,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import Kind
 from hdbridge.improvement import Improvement, Source, improve
 from hdbridge.improvement.trial import trial_s
 from hdbridge.model import TransmissionModel
@@ -67,7 +68,7 @@ def command(
     rounds: Annotated[
         int, typer.Option("--rounds", min=1, max=20, help="With --auto: so many experiments at most.")
     ] = 3,
-    out: Annotated[Path | None, out_option("Where the recordings go")] = None,
+    out: Annotated[Path | None, out_option("Where the recordings go"), Kind.FOLDER] = None,
     resume: Annotated[
         Path | None, resume_option("Go on with an interrupted improvement: what it still lacks.")
     ] = None,
@@ -90,17 +91,19 @@ def command(
     active = _active(files)
     if given and resume is not None:
         raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
-    work = Measurement.asked(axis, plan, out, resume)
     recordings = tuple(given or ())
     for each in recordings:
         Recording.load(each)  # refused before anything is connected
+    work = Measurement.asked(axis, plan, out, resume)
     trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"
     if recordings:
         notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
     else:
         work.announce(trial)
-    kept = kept_in(work.folder)
-    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, around=kept) as (drive, interrupted):
+    with (
+        kept_in(work.folder),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+    ):
         journal = None if recordings else work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = improve(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from hdbridge.calibration.measure import identity_of, outlook
 from hdbridge.cli.options import notes, progress_bar
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.procedures.plan import Plan
 
 PlanOption = Annotated[
@@ -49,11 +50,16 @@ class Measurement:
 
     @classmethod
     def asked(cls, axis: AxisConfig, plan: str, out: Path | None, resume: Path | None) -> Self:
-        """As the options say; InputError where they contradict each other, or the recording or the axis."""
+        """As the options say; InputError where they contradict each other, or the recording or the axis.
+
+        The folder is made here: a place that cannot be written is refused before a drive is connected.
+        """
         date = datetime.now().astimezone()
         if resume is None:
-            folder = out or Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
-            return cls(axis, Plan.load(plan), folder, date, None)
+            loaded = Plan.load(plan)
+            outlook(loaded, axis)  # refused before a folder is made
+            default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
+            return cls(axis, loaded, make_folder(out) if out else new_folder(default), date, None)
         if out is not None:
             raise InputError("--resume goes on in its own folder: leave out --out")
         journal = Journal.open(resume)
@@ -83,13 +89,16 @@ class Measurement:
 
 @contextmanager
 def kept_in(folder: Path) -> Iterator[None]:
-    """Say where the record is when the measurement does not come to its end."""
+    """Say where the record is when the measurement does not come to its end; a folder left empty goes."""
     try:
         yield
     except BaseException:
         if (folder / "recording.yaml").exists():
             notes.print(f"what was measured is kept; go on with --resume {folder}", soft_wrap=True)
         raise
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 @contextmanager

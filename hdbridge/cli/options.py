@@ -22,21 +22,15 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.realtime import prepare_realtime
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import check_writable, write_atomically
+from hdbridge.files.atomic import is_stream, write_atomically
 from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.outputs import Kind
 from hdbridge.sim.lockstep import simulated_bench
 
 console = Console(highlight=False)
 """Tables for people: standard output."""
 notes = Console(stderr=True, highlight=False)
 """Progress and remarks: standard error, so that they do not get into a pipe."""
-
-
-def _writable(path: Path | None) -> Path | None:
-    """Refuse a result file that cannot be written before anything is measured, not after."""
-    if path is not None:
-        check_writable(path)
-    return path
 
 
 ProfileArgument = Annotated[
@@ -66,13 +60,13 @@ InterfaceOption = Annotated[
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
 JsonOption = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Write the result for machines.", callback=_writable),
+    typer.Option("--json", metavar="FILE", help="Write the result for machines; - is standard output."),
+    Kind.JSON,
 ]
 HtmlOption = Annotated[
     Path | None,
-    typer.Option(
-        "--html", metavar="FILE", help="Write a page that opens without a network.", callback=_writable
-    ),
+    typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
+    Kind.PAGE,
 ]
 
 
@@ -160,4 +154,5 @@ def write_json(path: Path | None, result: dict[str, Any]) -> None:
     """The result for machines, where asked for."""
     if path is not None:
         write_atomically(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
-        notes.print(f"wrote {path}")
+        if not is_stream(path):
+            notes.print(f"wrote {path}", soft_wrap=True)

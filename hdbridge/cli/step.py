@@ -33,6 +33,7 @@ from hdbridge.errors import InputError
 from hdbridge.evaluation.comparison import Comparison, compare_schemes
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.report.page import render
@@ -68,6 +69,7 @@ def step(
     record: Annotated[
         Path | None,
         typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        Kind.FOLDER,
     ] = None,
 ) -> None:
     """Step the axis both ways under each compensation scheme; print what the load encoder measured.

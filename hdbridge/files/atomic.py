@@ -1,31 +1,43 @@
-"""Files that are either the old one or the new one, whatever happens while they are written."""
+"""Files that are either the old one or the new one, whatever happens while they are written.
+
+Pipes and character devices hold nothing that could be kept: they are written straight through, and never
+replaced by a file.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
+import re
+import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from hdbridge.errors import InputError
 
+_STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
+_DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
+
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
     """Replace the file's content, text as UTF-8: temporary file beside it, fsync, rename, fsync the folder.
 
-    A reader, or a power cut, finds the old content or the new one. InputError when the folder cannot be
-    written; the old file then stands.
+    A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
+    straight through. InputError when the place cannot be written; the old file then stands.
     """
     data = content.encode() if isinstance(content, str) else content
-    target = Path(path).resolve()  # through a link, or the rename would replace the link
     try:
+        if is_stream(path):
+            _write_through(Path(path), data)
+            return
+        target = Path(path).resolve()  # through a link, or the rename would replace the link
         with _temporary(target) as descriptor:
             try:
                 os.ftruncate(descriptor, 0)
-                written = 0
-                while written < len(data):
-                    written += os.write(descriptor, data[written:])
+                _write_all(descriptor, data)
                 os.fsync(descriptor)
                 _temporary_name(target).rename(target)
             except OSError:  # a full disk needs its space back
@@ -36,22 +48,91 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+    except BrokenPipeError:  # who reads has had enough
+        raise
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
 
 
 def check_writable(path: Path | str) -> None:
-    """InputError unless a file may be written there: for before a long measurement, instead of after it."""
-    target = Path(path).resolve()
-    if target.is_dir():
-        raise InputError(f"{path}: cannot be written: it is a folder; expected the name of a file")
-    if not target.parent.is_dir():
-        raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
-    if not os.access(target.parent, os.W_OK | os.X_OK):
-        raise InputError(f"{path}: cannot be written: the folder {target.parent} does not permit it")
+    """InputError unless a file may be written there: for before a long measurement, instead of after it.
+
+    It is tried out: a file system that is read-only, and a name that is too long, are noticed too.
+    """
+    try:
+        if is_stream(path):
+            number = descriptor_of(path)
+            if (
+                not os.access(path, os.W_OK)
+                if number is None
+                else fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+            ):
+                raise InputError(f"{path}: cannot be written: it does not permit it")
+            return
+        target = Path(path).resolve()
+        if target.is_dir():
+            raise InputError(f"{path}: cannot be written: it is a folder; expected the name of a file")
+        if target.exists() and not target.is_file():
+            raise InputError(
+                f"{path}: cannot be written: it is neither a file nor a pipe nor a character device"
+            )
+        if not target.parent.is_dir():
+            raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
+        if not os.access(target.parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written: the folder {target.parent} does not permit it")
+        with _temporary(target):
+            _temporary_name(target).unlink()
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
+    except RuntimeError:  # Python 3.11 and 3.12 say it so
+        raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
 
 
-def make_folder(path: Path | str) -> None:
+def descriptor_of(path: Path | str) -> int | None:
+    """The number of the open file of this process that a path like ``/dev/stdout`` or ``/dev/fd/3`` names."""
+    if str(path) in _STANDARD:
+        return _STANDARD.index(str(path))
+    found = _DESCRIPTOR.fullmatch(str(path))
+    return int(found[1]) if found else None
+
+
+def is_stream(path: Path | str) -> bool:
+    """Whether it is written straight through: a pipe, a character device, an open file of this process."""
+    if descriptor_of(path) is not None:
+        return True
+    try:
+        mode = os.stat(path).st_mode  # noqa: PTH116 - through links such as those in /proc, which do not resolve
+    except OSError:
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode)
+
+
+def _write_through(path: Path, data: bytes) -> None:
+    number = descriptor_of(path)
+    if number == 1:  # after what was printed, not before it
+        sys.stdout.flush()
+        buffer = getattr(sys.stdout, "buffer", None)
+        if buffer is not None:
+            buffer.write(data)
+            buffer.flush()
+            return
+    if number is not None:
+        _write_all(number, data)
+        return
+    descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOCTTY)
+    try:
+        _write_all(descriptor, data)
+    finally:
+        os.close(descriptor)
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    written = 0
+    while written < len(data):
+        written += os.write(descriptor, data[written:])
+
+
+def make_folder(path: Path | str) -> Path:
     """The folder, with its parents where they are missing. InputError where it cannot be made or written."""
     folder = Path(path)
     try:
@@ -59,6 +140,25 @@ def make_folder(path: Path | str) -> None:
     except OSError as problem:
         raise InputError(f"{path}: cannot make this folder: {problem.strerror}") from None
     check_writable(folder / "a file")
+    return folder
+
+
+def new_folder(path: Path) -> Path:
+    """A folder that was not there before: this one, else the next free number behind its name.
+
+    Two processes that ask at one time get two folders.
+    """
+    make_folder(path.parent)
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        except OSError as problem:
+            raise InputError(f"{folder}: cannot make this folder: {problem.strerror}") from None
+        return folder
+    raise AssertionError("numbers do not end")
 
 
 def _temporary_name(target: Path) -> Path:

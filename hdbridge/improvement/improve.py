@@ -252,7 +252,7 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
 
 def _kept(folder: Path, result: Improvement) -> Improvement:
     """Result and models beside the recording; nothing where nothing new was measured."""
-    if folder.is_dir():
+    if folder.is_dir() and any(folder.iterdir()):
         if result.diagnosis.findings:
             result.extension.model.save(folder / MODEL_NAME)
         result.active.save(folder / ACTIVE_NAME)

@@ -1,0 +1,214 @@
+"""Where results may go: never over what a person, or another command, would miss.
+
+A result may replace a result of its own kind, and nothing else: no input of the command, no other output, no
+file that makes a folder a profile or a recording. Pipes and character devices are written straight through
+(`write_atomically`); sockets, disks and folders are refused. All of it is checked before anything moves.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import check_writable, descriptor_of, is_stream
+
+_HEAD_BYTES: Final = 4096
+
+
+class Kind(Enum):
+    """What an output is; a file is known by how it begins."""
+
+    JSON = r'\s*\{\s*"schema": "hdbridge\.'
+    PAGE = r"(?s).*<!doctype html>"
+    MODEL = r"(?sm).*^schema: hdbridge\.model/"
+    FOLDER = "a folder"
+
+    @property
+    def words(self) -> str:
+        """For complaints."""
+        return {Kind.JSON: "a result of hdbridge", Kind.PAGE: "a page", Kind.MODEL: "a model file"}[self]
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """One place that a command writes to."""
+
+    option: str
+    """What names it, for complaints: ``--json``."""
+    path: Path
+    kind: Kind
+
+
+_PROFILE: Final = frozenset({"axis.yaml", "model.yaml", "pending.yaml", "truth.yaml"})
+_RECORDING: Final = frozenset(
+    {"recording.yaml", "model.yaml", "active.yaml", "calibration.json", "improvement.json"}
+)
+_SAMPLES: Final = (".csv", ".csv.gz")
+
+
+def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> None:
+    """InputError unless each output can be written and nothing is lost by it.
+
+    ``inputs`` are the files and folders that the command reads.
+    """
+    read = [each for each in inputs if _status(each) is not None]
+    redirected = _redirected()
+    for number, output in enumerate(outputs):
+        if output.kind is Kind.FOLDER:
+            _check_folder(output, read)
+        else:
+            _check_file(output, read, redirected)
+        for other in outputs[:number]:
+            if not _endless(output.path) and _same(output.path, other.path):
+                raise InputError(
+                    f"{output.path}: {other.option} and {output.option} both go there; expected a place for "
+                    "each"
+                )
+
+
+def _check_file(
+    output: Output, inputs: Sequence[Path], redirected: Sequence[tuple[str, os.stat_result]]
+) -> None:
+    path = output.path
+    check_writable(path)
+    if descriptor_of(path) is not None or _endless(path):
+        return
+    for each in inputs:
+        if _same(path, each):
+            raise InputError(
+                f"{path}: {output.option} would overwrite {each}, which this command reads; expected another "
+                "file"
+            )
+    found = _status(path)
+    if found is None:
+        pass
+    elif stat.S_ISREG(found.st_mode):
+        for name, status in redirected:
+            if os.path.samestat(found, status):
+                raise InputError(
+                    f"{path}: {name} goes there already; expected another file, or {output.option} - for the "
+                    "standard output"
+                )
+    else:
+        return  # a pipe
+    _check_belongs_to_no_folder(output)
+    if found is not None and found.st_size and not re.match(output.kind.value, _head(path)):
+        raise InputError(
+            f"{path}: {output.option} would overwrite this file, which is not {output.kind.words}; expected "
+            "a new file, or one that may be replaced: remove it first"
+        )
+
+
+def _check_belongs_to_no_folder(output: Output) -> None:
+    """Of a profile or a recording only a pending model may be written, or a first one."""
+    path = _resolved(output.path)
+    folder, name = path.parent, path.name.casefold()
+    profile = folder.parent if folder.name.casefold() == "history" else folder
+    if (profile / "axis.yaml").exists() and (profile != folder or name in _PROFILE):
+        if output.kind is Kind.MODEL and profile == folder:
+            if name == "pending.yaml" or (name == "model.yaml" and not path.exists()):
+                return
+            raise InputError(
+                f"{output.path}: {output.option} would overwrite a file of a profile; write the model to "
+                f"{folder / 'pending.yaml'}, then use it: hdbridge model commit {folder}"
+            )
+        raise InputError(
+            f"{output.path}: {output.option} would write in place of a file of the profile {profile}; "
+            "expected another file"
+        )
+    if (folder / "recording.yaml").exists() and (
+        name in _RECORDING or (path.exists() and name.endswith(_SAMPLES))
+    ):
+        raise InputError(
+            f"{output.path}: {output.option} would write in place of a file of the recording {folder}; "
+            "expected another file"
+        )
+
+
+def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
+    """A folder for measurements is new or empty: what was measured is never replaced."""
+    folder = output.path
+    with suppress(OSError):
+        if folder.is_dir():
+            first = min((each.name for each in folder.iterdir()), default=None)
+            if first is not None:
+                raise InputError(
+                    f"{folder}: {output.option} would write into a folder that is not empty (it has "
+                    f"{first}); expected a new or an empty one"
+                )
+    for each in inputs:
+        if _same(folder, each):
+            raise InputError(f"{folder}: {output.option} is what this command reads; expected a new folder")
+    existing = _resolved(folder)
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{folder}: cannot make this folder: {existing} is not a folder")
+    check_writable(existing / "a file")
+
+
+def _redirected() -> list[tuple[str, os.stat_result]]:
+    """The files that the shell reads from and writes to for this process."""
+    found = []
+    for descriptor, name in enumerate(("standard input", "standard output", "standard error")):
+        with suppress(OSError):
+            status = os.fstat(descriptor)
+            if stat.S_ISREG(status.st_mode):
+                found.append((name, status))
+    return found
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two paths name one file: by links of either kind, by another spelling, by other case.
+
+    Of files that are not there yet case is no difference: on some file systems it is none.
+    """
+    mine, its = descriptor_of(one), descriptor_of(other)
+    if mine is not None or its is not None:
+        return mine == its
+    found, its_found = _status(one), _status(other)
+    if found and its_found:
+        return os.path.samestat(found, its_found)
+    if found or its_found:
+        return False
+    one, other = _resolved(one), _resolved(other)
+    return one.name.casefold() == other.name.casefold() and (
+        one.parent == other.parent or (one.parent.exists() and _same(one.parent, other.parent))
+    )
+
+
+def _endless(path: Path) -> bool:
+    """A character device takes what it is given; several outputs may share one."""
+    found = _status(path)
+    return found is not None and stat.S_ISCHR(found.st_mode) and descriptor_of(path) is None
+
+
+def _status(path: Path) -> os.stat_result | None:
+    """Of what would be written: ``missing/../file`` is the file, although no such path can be opened."""
+    try:
+        return _resolved(path).stat()
+    except OSError:
+        return None
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return path if is_stream(path) else path.resolve()
+    except (OSError, RuntimeError):  # a loop of links
+        raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
+
+
+def _head(path: Path) -> str:
+    try:
+        with _resolved(path).open("rb") as file:
+            return file.read(_HEAD_BYTES).decode(errors="replace")
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be read: {problem.strerror}") from None

@@ -1,0 +1,233 @@
+"""An output destroys nothing: refused before anything is computed, or written straight through."""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import threading
+import typing
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.cli import PANELS, load
+from hdbridge.errors import InputError
+from hdbridge.files.outputs import Kind, Output, check_outputs
+from hdbridge.model import TransmissionModel
+
+RECORD = "time_s,motor_position_deg,load_position_deg\n" + "".join(
+    f"{0.01 * n},{n},{n / 50}\n" for n in range(200)
+)
+
+
+@pytest.fixture
+def bench(tmp_path, profile):
+    """A folder with a profile, a record and a recording, and a function that says whether they stand."""
+    (tmp_path / "one.csv").write_text(RECORD)
+    (tmp_path / "other.csv").write_text(RECORD)
+    shutil.copytree(profile.folder, tmp_path / "p")
+    shutil.rmtree(profile.folder)
+    history = tmp_path / "p" / "history"
+    history.mkdir()
+    shutil.copy(tmp_path / "p" / "model.yaml", history / "0001.yaml")
+    shutil.copy(tmp_path / "p" / "model.yaml", tmp_path / "p" / "pending.yaml")
+    kept = tmp_path / "rec"
+    kept.mkdir()
+    (kept / "recording.yaml").write_text("schema: hdbridge.recording/1\n")
+    (kept / "sweep.csv").write_text(RECORD)
+    before = {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()}
+
+    def stands() -> bool:
+        return before == {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()}
+
+    return stands
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("fit one.csv --ratio 50 --json one.csv", "--json would overwrite one.csv, which this command reads"),
+        ("fit one.csv --ratio 50 --html sub/../one.csv", "--html would overwrite one.csv"),
+        ("fit one.csv --ratio 50 --json other.csv", "which is not a result of hdbridge"),
+        ("fit one.csv --ratio 50 --out out --json out", "--out and --json both go there"),
+        ("fit one.csv --ratio 50 --out Out --json out", "both go there"),
+        ("fit one.csv --ratio 50 --out p/model.yaml", "hdbridge model commit"),
+        ("fit one.csv --ratio 50 --out p/axis.yaml", "file of a profile"),
+        ("fit rec --ratio 50 --json rec/sweep.csv", "of the recording"),
+        ("fit rec --ratio 50 --json rec/calibration.json", "of the recording"),
+        ("diagnose one.csv --model p/model.yaml --extend p/model.yaml", "which this command reads"),
+        ("check p --json p/axis.yaml", "of the profile"),
+        ("check p --json p/history/0002.yaml", "of the profile"),
+        ("check p/axis.yaml --json p/pending.yaml", "of the profile"),
+        ("model log p --json p/history/0001.yaml", "of the profile"),
+        ("calibrate p --simulate --out p", "not empty"),
+        ("calibrate p --simulate --out p/history", "not empty"),
+        ("calibrate p --simulate --out one.csv/x", "one.csv is not a folder"),
+        ("step p --simulate --count 2 --record rec", "not empty"),
+        ("demo --count 2 --out rec", "not empty"),
+    ],
+)  # fmt: skip
+def test_what_would_destroy_something_is_refused_before_anything_is_read(here, bench, line, words):
+    done = here(*line.split())
+    assert done.returncode == 2, done.stderr
+    assert words in done.stderr
+    assert (done.stderr.count("\n"), done.stdout) == (1, "")
+    assert bench()
+
+
+def test_a_second_result_takes_the_place_of_the_first(here, tmp_path):
+    for _ in range(2):
+        assert here("check", "article", "--json", "out.json").returncode == 0
+    (tmp_path / "empty").touch()  # as mktemp makes it
+    assert here("check", "article", "--json", "empty").returncode == 0
+    assert json.loads((tmp_path / "empty").read_text())["axis"] == "article"
+
+
+def test_a_model_may_wait_in_a_profile(tmp_path, bench):
+    for name in ("pending.yaml", "first/model.yaml"):
+        (tmp_path / "p" / "first").mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "p" / "axis.yaml", tmp_path / "p" / "first")
+        check_outputs([Output("--out", tmp_path / "p" / name, Kind.MODEL)])
+
+
+def test_stepping_twice_into_one_folder_keeps_the_first(hdbridge, tmp_path):
+    command = ("step", "article", "--simulate", "--count", 2, "--scheme", "none", "--record", "kept")
+    assert hdbridge(*command).returncode == 0
+    first = (tmp_path / "kept" / "stepping-none.csv.gz").read_bytes()
+    again = hdbridge(*command, "--seed", 1)
+    assert again.returncode == 2
+    assert "kept: --record would write into a folder that is not empty" in again.stderr
+    assert (tmp_path / "kept" / "stepping-none.csv.gz").read_bytes() == first
+
+
+def test_a_minus_is_the_standard_output_and_tables_then_go_to_the_standard_error(hdbridge, tmp_path):
+    for place in ("-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
+        done = hdbridge("check", "article", "--json", place)
+        assert json.loads(done.stdout if place == "-" else done.stdout.split("\n}\n")[0] + "}")
+        assert "all right" in (done.stderr if place == "-" else done.stderr + done.stdout)
+    assert not (tmp_path / "-").exists()
+    assert hdbridge("fit", "x.csv", "--json", "-", "--html", "/dev/stdout").returncode == 2
+
+
+def test_a_pipe_is_written_straight_through(hdbridge, tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    read = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
+    reader.start()
+    done = hdbridge("check", "article", "--json", "pipe")
+    reader.join(60)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(read[0])["axis"] == "article"
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_device_is_never_replaced(here, tmp_path):
+    """A node of its own, as root; for others the terminal's will do, which they cannot replace anyway."""
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        device.open("w").close()
+    except OSError:
+        device = Path("/dev/null")
+        if os.geteuid() == 0:
+            pytest.skip("device nodes do not work here")
+    done = here("fit", "article", "--json", device)
+    assert done.returncode == 2
+    assert here("check", "article", "--json", device).returncode == 0
+    assert here("model", "log", "article", "--json", device).returncode == 0
+    TransmissionModel(50.0).save(device)
+    assert stat.S_ISCHR(device.stat().st_mode)
+
+
+def test_a_socket_is_no_place_for_a_result(here, tmp_path, monkeypatch):
+    import socket
+
+    monkeypatch.chdir(tmp_path)
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind("place")
+        done = here("check", "article", "--json", "place")
+    assert done.returncode == 2
+    assert "neither a file nor a pipe nor a character device" in done.stderr
+
+
+def test_a_file_that_the_shell_writes_to_already_is_refused(tmp_path):
+    with (tmp_path / "out").open("w") as out:
+        done = subprocess.run(
+            [sys.executable, "-m", "hdbridge", "check", "article", "--json", "out"],
+            cwd=tmp_path, stdout=out, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert "standard output goes there already" in done.stderr
+
+
+def test_names_that_lead_nowhere_are_one_line(here, tmp_path):
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    for place, words in (("circle", "circle"), ("x" * 300, "too long"), ("one/two", "no folder")):
+        done = here("check", "article", "--json", place)
+        assert done.returncode == 2
+        assert words in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["circle"]
+
+
+SPELLINGS = {
+    "same": lambda path: path,
+    "relative": lambda path: Path(os.path.relpath(path)),
+    "roundabout": lambda path: path.parent / "missing" / ".." / "." / path.name,
+    "symbolic link": lambda path: _linked(path, os.symlink),
+    "link of a link": lambda path: _linked(_linked(path, os.symlink), os.symlink),
+    "hard link": lambda path: _linked(path, os.link),
+    "link of its folder": lambda path: _linked(path.parent, os.symlink) / path.name,
+}
+OF_A_FILE_TO_BE = sorted({*SPELLINGS, "other case"} - {"hard link"})
+
+
+def _linked(path: Path, link: typing.Callable[[Path, Path], None]) -> Path:
+    place = path.with_name(f"link-{len(list(path.parent.iterdir()))}-{path.name}")
+    link(path, place)
+    return place
+
+
+def _is_seen_to_be_one(one: Path, other: Path) -> None:
+    with pytest.raises(InputError, match="both go there"):
+        check_outputs([Output("--json", one, Kind.JSON), Output("--html", other, Kind.JSON)])
+    check_outputs([Output("--json", one, Kind.JSON), Output("--html", other.parent / "two", Kind.PAGE)])
+
+
+@given(st.tuples(*2 * [st.sampled_from(sorted(SPELLINGS))]))
+def test_a_file_is_known_by_any_name(tmp_path_factory, names):
+    file = tmp_path_factory.mktemp("names") / "one.json"
+    file.write_text('{"schema": "hdbridge.check/1"}')
+    one, other = (SPELLINGS[each](file) for each in names)
+    with pytest.raises(InputError, match="which this command reads"):
+        check_outputs([Output("--json", one, Kind.JSON)], [other])
+    _is_seen_to_be_one(one, other)
+
+
+@given(st.tuples(*2 * [st.sampled_from(OF_A_FILE_TO_BE)]))
+def test_a_file_that_is_not_there_yet_is_known_by_any_name(tmp_path_factory, names):
+    file = tmp_path_factory.mktemp("names") / "one.json"
+    more = {**SPELLINGS, "other case": lambda path: path.with_name("ONE.json")}
+    _is_seen_to_be_one(*(more[each](file) for each in names))
+
+
+def test_every_option_that_writes_is_guarded():
+    """`--json` and `--html` everywhere; whatever else names what it writes, by the word in its help."""
+    for name in (name for panel in PANELS.values() for name in panel):
+        loaded = load(name)
+        groups = [each.typer_instance for each in loaded.registered_groups]
+        for command in (each for app in (loaded, *groups) for each in app.registered_commands):
+            hints = typing.get_type_hints(command.callback, include_extras=True)
+            for parameter, hint in hints.items():
+                info = next(
+                    (each for each in getattr(hint, "__metadata__", ()) if hasattr(each, "help")), None
+                )
+                says = (info.help or "") if info else ""
+                writes = says.startswith(("Write", "Keep what", "Where the re"))
+                guarded = any(isinstance(each, Kind) for each in getattr(hint, "__metadata__", ()))
+                assert writes == guarded, (name, parameter, says)
