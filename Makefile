@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: help demo test unit check format test-socketcan blind clean
+.PHONY: help demo test unit check format test-socketcan blind bench-realtime clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -42,6 +42,11 @@ BLIND_CASES ?= single=4,power=1,pair=20,triple=10,none=20,other_law=20,unknown=2
 blind: $(READY)  ## a blind suite of diagnoses into build/blind (hours; BLIND_SEED, BLIND_CASES)
 	$(BIN)/python tools/blind/generate.py --out build/blind --seed $(BLIND_SEED) --cases $(BLIND_CASES)
 	$(BIN)/python tools/blind/score.py build/blind --json build/blind/verdicts.json | tee build/blind/figures.md
+
+bench-realtime: $(READY)  ## what a cycle of 1 ms costs on PREEMPT_RT, in instructions (some ten minutes; root, QEMU)
+	@mkdir -p build/realtime
+	$(CC) -O2 -o build/realtime/master tools/bench/master.c
+	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_cycle.py --master build/realtime/master --json build/realtime/figures.json
 
 clean:           ## remove the environment and what the commands made
 	rm -rf $(VENV) demo-output dist build

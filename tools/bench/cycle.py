@@ -43,6 +43,7 @@ from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.image import ProcessImage
@@ -184,9 +185,11 @@ def answering_kernel(channel: str, node_id: int) -> Iterator[None]:
 class Variants:
     """The loops under test: each call is one cycle."""
 
-    def __init__(self, bus: can.BusABC, axis: AxisConfig, model: TransmissionModel) -> None:
+    def __init__(
+        self, bus: can.BusABC, axis: AxisConfig, model: TransmissionModel, clock: Clock | None = None
+    ) -> None:
         self.bus, self.axis = bus, axis
-        self.clock = NeverSleeping()
+        self.clock = clock if clock is not None else NeverSleeping()
         self.period_s = axis.drive.cycle_s
         self.heartbeat_s = axis.drive.heartbeat_ms / 2e3
         self.heartbeat_due_s = 0.0

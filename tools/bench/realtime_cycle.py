@@ -1,0 +1,156 @@
+"""What a cycle of 1 ms costs on a PREEMPT_RT kernel, in instructions, and whether one is ever missed.
+
+    make bench-realtime
+    tools/realtime/run.sh .venv/bin/python tools/bench/realtime_cycle.py --master build/realtime/master
+
+Runs on the kernel of `tools/realtime/run.sh`, on which an instruction is a nanosecond and nothing else runs:
+one commit can be compared with another. The exchanges are those of `cycle.py` and one in C (`master.c`). The
+kernel's gateway answers as the drive. Each has SCHED_FIFO, locked memory and absolute deadlines.
+
+  late    from the deadline to the first instruction of the cycle
+  busy    from there to its last one, system calls included
+  missed  cycles that began more than half a period late or were busy beyond the next deadline
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import can
+import numpy as np
+from cycle import PROFILE, Variants, answering_kernel
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.realtime import prepare_realtime
+from hdbridge.model import TransmissionModel
+
+WARM_UP = 50
+
+
+class Waking:
+    """The machine's clock; it keeps when it woke up last and how late that was."""
+
+    now = staticmethod(time.monotonic)
+
+    def __init__(self) -> None:
+        self.woke_s = 0.0
+        self.late_s = 0.0
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Sleep to the absolute deadline."""
+        delay_s = deadline_s - time.monotonic()
+        if delay_s > 0.0:
+            time.sleep(delay_s)
+        self.woke_s = time.monotonic()
+        self.late_s = self.woke_s - deadline_s
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one kind of cycle; times in microseconds."""
+
+    name: str
+    busy_median_us: float
+    busy_999_us: float
+    busy_most_us: float
+    late_999_us: float
+    missed: int
+    cycles: int
+
+    @classmethod
+    def of(cls, name: str, late_us: np.ndarray, busy_us: np.ndarray, period_us: float) -> Figures:
+        missed = (late_us > 0.5 * period_us) | (late_us + busy_us > period_us)
+        return cls(
+            name,
+            *(float(each) for each in np.percentile(busy_us, [50.0, 99.9, 100.0])),
+            float(np.percentile(late_us, 99.9)),
+            int(missed.sum()),
+            len(busy_us),
+        )
+
+
+def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, period_s: float) -> Figures:
+    """So many cycles, each on its deadline."""
+    late_s, busy_s = np.zeros(cycles), np.zeros(cycles)
+    for _ in range(WARM_UP):
+        cycle()
+    for place in range(cycles):
+        cycle()
+        busy_s[place] = time.monotonic() - clock.woke_s
+        late_s[place] = clock.late_s
+    return Figures.of(name, 1e6 * late_s, 1e6 * busy_s, 1e6 * period_s)
+
+
+def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
+    """The same exchange in C."""
+    command = [str(master), channel, f"{1e6 * period_s:.0f}", str(cycles)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
+    return Figures.of("a master in C", 1e-3 * late_ns, 1e-3 * busy_ns, 1e6 * period_s)
+
+
+def table(figures: list[Figures], period_s: float) -> str:
+    """One line for each, the ratios to the bare exchange."""
+    bare = next(each for each in figures if each.name.startswith("bare"))
+    head = (
+        f"{'':<28} {'busy us':>8} {'99.9 %':>8} {'most':>8} {'late 99.9 %':>12} {'missed':>14} {'x bare':>7}"
+    )
+    lines = [f"Cycles of {1e3 * period_s:g} ms on PREEMPT_RT, 1 us = 1000 instructions:", "", head]
+    lines += [
+        f"{each.name:<28} {each.busy_median_us:>8.1f} {each.busy_999_us:>8.1f} {each.busy_most_us:>8.1f} "
+        f"{each.late_999_us:>12.1f} {f'{each.missed} of {each.cycles}':>14} "
+        f"{each.busy_median_us / bare.busy_median_us:>7.2f}"
+        for each in figures
+    ]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--channel", default="vcan0")
+    parser.add_argument("--cycles", type=int, default=20_000)
+    parser.add_argument("--master", type=Path, help="the compiled master.c")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    axis = AxisConfig.load(PROFILE)
+    axis = axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": 1.0})})
+    model = TransmissionModel.load(PROFILE / "model.yaml")
+    period_s, node_id = axis.drive.cycle_s, axis.drive.node_id
+    clock = Waking()
+    figures: list[Figures] = []
+    with (
+        answering_kernel(options.channel, node_id),
+        can.Bus(interface="socketcan", channel=options.channel, ignore_config=True) as bus,
+    ):
+        variants = Variants(bus, axis, model, clock)
+        loops: dict[str, Callable[[], object]] = {
+            "bare python-can exchange": variants.bare,
+            "hdbridge cycle": variants.plain,
+            "hdbridge cycle, compensated": variants.compensated,
+            "canopen's PDO objects": variants.with_canopen,
+        }
+        for name, loop in loops.items():
+            with prepare_realtime():
+                variants.start()
+                figures.append(timed(name, loop, clock, options.cycles, period_s))
+            print(f"measured: {name}", flush=True)
+        if options.master is not None:
+            figures.append(in_c(options.master, options.channel, options.cycles, period_s))
+    print(table(figures, period_s))
+    if options.json is not None:
+        options.json.write_text(json.dumps([asdict(each) for each in figures], indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
