@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -107,7 +108,10 @@ def run(
     write_json(json_file, result.as_dict() | {"seen_over": shares})
     if html_file is not None:
         page = diagnosis_page(
-            result, title=_title(recording, records), provenance=_provenance(recording, records, model)
+            result,
+            title=_title(recording, records),
+            provenance=_provenance(recording, records, model),
+            command=shlex.join(["hdbridge", "diagnose", *map(str, records), "--model", str(model)]),
         )
         write_atomically(html_file, render(page))
         notes.print(f"wrote {html_file}", soft_wrap=True)

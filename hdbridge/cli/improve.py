@@ -162,13 +162,13 @@ def write_page(path: Path, result: Improvement) -> None:
         "recorded": result.date or "not known",
         "plan": result.plan,
         **{f"round {number}": each.about for number, each in enumerate(result.rounds, 1)},
-        "outcome": result.offer.reason,
     }
     page = diagnosis_page(
         result.diagnosis,
         title=f"Improvement of axis '{result.axis}'",
         provenance=provenance,
         stepping=result.trial.stepping if result.trial else None,
+        offer=result.offer,
     )
     write_atomically(path, render(page))
 

@@ -195,7 +195,7 @@ def write_page(
         comparison.results,
         comparison.quantisation_floor_arcsec,
         facts,
-        beside_article=axis.name == "article",
+        with_article=axis.name == "article",
     )
     write_atomically(path, render(page))
     notes.print(f"wrote {path}")

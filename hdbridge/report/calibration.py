@@ -15,8 +15,22 @@ from hdbridge.calibration.result import unit_of
 from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
 from hdbridge.model.difference import diff
-from hdbridge.report.page import Block, Chart, Facts, Grid, Mark, Page, Section, Series, Table, histogram
+from hdbridge.report.page import (
+    Block,
+    Chart,
+    Command,
+    Facts,
+    Grid,
+    Mark,
+    Page,
+    Section,
+    Series,
+    Status,
+    Table,
+    histogram,
+)
 from hdbridge.report.validation import stepping_sections
+from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, figure, sentence, with_interval
 from hdbridge.units import DEG_PER_TURN
 
@@ -43,7 +57,7 @@ def calibration_page(result: Calibration) -> Page:
         Section(
             "Transmission error",
             "What the load encoder showed beyond the motor angle divided by the ratio, the zero taken off; "
-            "dots are means over short stretches. Drag to enlarge a chart, double-click to go back.",
+            "dots are means over short stretches.",
             [Grid([*_by_angle(traces, result.model.ratio)])],
         ),
     ]
@@ -59,8 +73,8 @@ def calibration_page(result: Calibration) -> Page:
         Section(
             "Spectrum",
             "Amplitudes by least squares at the true angles, without hysteresis and zero. Bars: the orders "
-            "fitted together; those below the threshold cannot be told from noise. Line: each order alone, "
-            "which shows the side lobes of its neighbours too.",
+            "fitted together; those below the threshold cannot be distinguished from noise. Line: each order "
+            "alone, which shows the side lobes of its neighbours too.",
             [_spectrum(result)],
         ),
         Section("What the model leaves", sentence(result.fit.held_out.text), [*_residual(result)]),
@@ -68,14 +82,26 @@ def calibration_page(result: Calibration) -> Page:
     if len(result.drift) > 1:
         sections.append(Section("Reference pose", _drift_text(result), [_drift(result)]))
     sections.append(Section("Where it comes from", "", [_provenance(result)]))
+    status, commands = _status(result)
     return Page(
         title=f"Calibration of axis '{result.axis}'"
         if result.axis
         else "Fit of " + ", ".join(result.recordings),
         verdict=_verdict(result),
+        status=status,
+        commands=commands,
         sections=sections,
         footer=f"hdbridge {__version__}. Errors are arcseconds at the load; {SIGMA} is three standard "
         "deviations about the mean; intervals are of 95 %.",
+    )
+
+
+def _status(result: Calibration) -> tuple[Status, tuple[Command, ...]]:
+    if result.offer is not None:
+        return of_offer(result.offer)
+    records = " ".join(result.recordings)
+    return Status.MEASURED, (
+        Command(f"hdbridge diagnose {records} --model MODEL.yaml", "says what the fitted model still lacks"),
     )
 
 
@@ -176,8 +202,8 @@ def _spectrum(result: Calibration) -> Chart:
         orders = [each.order.per_motor_turn for each in chosen]
         series.append(Series("in the model", orders, [each.amplitude_arcsec for each in chosen], Mark.POINTS))
     caption = (
-        f"Orders per motor turn; {spectrum.resolution.turns:.0f} motor turns tell orders apart that are "
-        f"{spectrum.resolution.nearest_orders:.3f} or more from each other"
+        f"Orders per motor turn; {spectrum.resolution.turns:.0f} motor turns distinguish orders that are "
+        f"{spectrum.resolution.nearest_orders:.3f} or more apart"
     )
     return Chart(caption, "order, per motor turn", "amplitude, arcsec", series, y_log=True)
 
@@ -256,7 +282,7 @@ def _parameters(result: Calibration) -> Iterator[Block]:
             for each in result.fit.nuisances
         ]
         yield Table(
-            ["beside the model", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"],
+            ["in addition to the model", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"],
             fitted,
             "Fitted too, so that it does not bend the parameters; not part of the model.",
         )

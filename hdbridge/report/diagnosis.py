@@ -6,14 +6,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from hdbridge import __version__
+from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
 from hdbridge.diagnose import Diagnosis, Finding
 from hdbridge.diagnose.portrait import portrait
 from hdbridge.diagnose.seeing import Seen, see
 from hdbridge.effects import CATALOGUE
-from hdbridge.report.page import Block, Facts, Grid, Page, Section, Table
+from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
 from hdbridge.report.residuals import beside_charts, portrait_chart, residual_charts
 from hdbridge.report.validation import stepping_sections
+from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, sentence, with_interval
 
 SURE: Final = 0.9
@@ -30,15 +32,20 @@ def diagnosis_page(
     title: str,
     provenance: Mapping[str, str] | Sequence[tuple[str, str]] = (),
     stepping: Validation | None = None,
+    offer: Offer | None = None,
+    command: str = "hdbridge diagnose RECORD... --model MODEL.yaml",
 ) -> Page:
     """The page of a diagnosis.
 
     ``provenance`` says in names and values where records and model come from. ``stepping`` is the stepping
     test under the old and the extended model, where there was one: it goes before everything else.
+    ``offer`` is what became of the extended model, where it was proposed for commit.
+    ``command`` is the diagnosis as it was asked for.
     """
     seen = see(diagnosis)
+    verdict = _verdict(diagnosis, stepping)
     given = provenance.items() if isinstance(provenance, Mapping) else provenance
-    sections = [_to_do(diagnosis, tried=stepping is not None)]
+    sections = [_to_do(diagnosis)]
     if stepping is not None:
         sections += stepping_sections(stepping)
     if diagnosis.findings:
@@ -47,9 +54,9 @@ def diagnosis_page(
     sections += [
         _figures(diagnosis),
         Section(
-            "Simulation beside measurement",
+            "Model and measurement",
             "The transmission error on the same trajectory: load encoder less motor angle over the ratio, "
-            "the zero taken off. Drag to enlarge a chart, double-click to go back.",
+            "the zero taken off.",
             [Grid([*beside_charts(diagnosis.traces)], columns=1)],
         ),
         _over(seen),
@@ -57,12 +64,31 @@ def diagnosis_page(
     ]
     if facts := [*_remarks(diagnosis), *given]:
         sections.append(Section("Where it comes from", "", [Facts(facts)]))
+    if offer is not None:
+        status, commands = of_offer(offer)
+    else:
+        status, commands = _status(diagnosis), _commands(diagnosis, command)
     return Page(
         title=title,
-        verdict=_verdict(diagnosis, stepping),
+        verdict=f"{sentence(offer.reason)} {verdict}" if offer is not None else verdict,
+        status=status,
+        commands=commands,
         sections=sections,
         footer=f"hdbridge {__version__}. Errors are arcseconds at the load; rms is the root mean square, "
         f"{SIGMA} three standard deviations; intervals are of 95 %.",
+    )
+
+
+def _status(diagnosis: Diagnosis) -> Status:
+    return Status.FOUND if diagnosis.findings else Status.NOTHING_FOUND
+
+
+def _commands(diagnosis: Diagnosis, command: str) -> tuple[Command, ...]:
+    if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
+        return ()
+    return (
+        Command(f"{command} --extend NEW_MODEL.yaml", "writes the extended model"),
+        Command("hdbridge improve PROFILE", "tries it on the axis, and keeps it as pending if it is better"),
     )
 
 
@@ -73,14 +99,14 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
     noise = f"the noise of a reading is {_two(diagnosis.noise_floor_arcsec)}"
     if not diagnosis.findings:
         text = (
-            f"Nothing found: simulation and measurement are {given} arcsec (rms) apart, which noise and an "
+            f"Model and measurement are {given} arcsec (rms) apart, which noise and an "
             f"everyday calibration account for; {noise}."
         )
     else:
         causes = _listed([_claim(each) for each in diagnosis.findings[:TOLD]])
         if more := len(diagnosis.findings[TOLD:]):
             causes += f"; and {more} more"
-        text = f"The simulation is off by {given} arcsec (rms): {causes}."
+        text = f"The model is off by {given} arcsec (rms): {causes}."
         if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
             text += f" No cause of the catalogue fits it; {noise}."
         else:
@@ -95,7 +121,7 @@ def _claim(finding: Finding) -> str:
     """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
         size = f"{_two(finding.before_arcsec)} arcsec rms beyond the noise"
-        return f"something unexplained that lives in the {finding.lives_in or 'time'}, {size}"
+        return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
     name = _title(finding.cause)
     if finding.aliases:
         name = _listed([name, *map(_title, finding.aliases)], "or")
@@ -103,7 +129,7 @@ def _claim(finding: Finding) -> str:
     return f"{doubt}{name}, up to {_two(finding.peak_arcsec)} arcsec"
 
 
-def _to_do(diagnosis: Diagnosis, tried: bool) -> Section:
+def _to_do(diagnosis: Diagnosis) -> Section:
     if not diagnosis.findings:
         return Section(
             "What to do",
@@ -118,13 +144,6 @@ def _to_do(diagnosis: Diagnosis, tried: bool) -> Section:
         rows.append((f"{number}. {_name(each.cause)}", sentence(remedy)))
         if each.experiment:
             rows.append(("measure next", sentence(each.experiment)))
-    if not tried and any(each.cause != UNEXPLAINED for each in diagnosis.findings):
-        rows.append(
-            (
-                "extended model",
-                "'hdbridge diagnose --extend FILE' writes it; 'hdbridge improve' tries it on the axis.",
-            )
-        )
     return Section("What to do", "", [Facts(rows)])
 
 
@@ -142,13 +161,20 @@ def _found(diagnosis: Diagnosis) -> Section:
                 f"{100.0 * gained:.0f} %",
             ]
         )
-    header = ["cause", "probability", "size", "held out, without", "with", "gain"]
+    header: list[str | Heading] = [
+        "cause",
+        Heading("probability", ""),
+        Heading("size"),
+        Heading("held out, without"),
+        Heading("with"),
+        Heading("gain", "of the squares"),
+    ]
     return Section(
         "What was found",
         "Size: half the span of what it does in this record. Held out: residual (rms) on stretches of time "
         "that the fit has not seen, everything else refitted (of something unexplained: beyond the noise). "
         "Gain: the share of the mean square that goes.",
-        [Table(header, rows, "arcsec at the load")],
+        [Table(header, rows)],
     )
 
 
@@ -168,7 +194,7 @@ def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
         text = "What no cause accounts for. Dots are means, bars the spread of the readings in them."
     else:
         text = (
-            "Everything else that was found is in the simulation, so this is the finding alone, with the "
+            "Everything else that was found is in the model, so this is the finding alone, with the "
             "noise. Dots are means, bars the spread of the readings in them, lines what the finding does."
         )
     return Section(f"{number}. {sentence(title).rstrip('.')}", text, blocks)
@@ -195,12 +221,12 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
         "what else it could be",
         _listed([*map(_title, finding.aliases)], "or")
         if finding.aliases
-        else "of the catalogue nothing that these data cannot tell from it"
+        else "of the catalogue nothing that these data cannot distinguish from it"
         if about
         else "the catalogue has nothing that fits",
     )
     if finding.lives_in:
-        yield "lives in", finding.lives_in
+        yield "depends on", finding.lives_in
     if about:
         yield "how it shows", sentence(about.signature)
         yield "what it does", sentence(about.consequence)
@@ -215,7 +241,7 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
 def _sure(finding: Finding) -> str:
     if finding.cause == UNEXPLAINED:
         return f"{finding.probability:.2f} that there is something which the catalogue does not have"
-    others = ", or one that it cannot be told from," if finding.aliases else ""
+    others = ", or one that it cannot be distinguished from," if finding.aliases else ""
     return f"{finding.probability:.2f} that this cause{others} is there"
 
 
@@ -235,10 +261,10 @@ def _figures(diagnosis: Diagnosis) -> Section:
     ]
     return Section(
         "Figures",
-        "How far simulation and measurement are apart: overall, by kind of motion and by direction.",
+        "How far model and measurement are apart: overall, by kind of motion and by direction.",
         [
-            Table(["overall", "rms", SIGMA], stages, "arcsec"),
-            Table(["motion", "as given, rms", SIGMA, "extended, rms", SIGMA], kinds, "arcsec"),
+            Table(["overall", Heading("rms"), Heading(SIGMA)], stages),
+            Table(["motion", *map(Heading, ("as given, rms", SIGMA, "extended, rms", SIGMA))], kinds),
         ],
     )
 
@@ -250,12 +276,15 @@ def _over(seen: Seen) -> Section:
     ]
     return Section(
         "What is left, over everything",
-        "Measurement less simulation; lines are means over bins, grey dots readings less the model as given, "
+        "Measurement less model; lines are means over bins, grey dots readings less the model as given, "
         "all charts to one scale, the most telling first.\n\nThe table says which share of the mean square "
-        "such means foretell on stretches of time that they were not taken from.",
+        "such means predict on stretches of time that they were not taken from.",
         [
             Grid([*residual_charts(seen)]),
-            Table(["over the", "as given", "extended"], rows),
+            Table(
+                ["over the", Heading("as given", "of the squares"), Heading("extended", "of the squares")],
+                rows,
+            ),
         ],
     )
 
@@ -279,7 +308,7 @@ def _could(diagnosis: Diagnosis) -> Section:
         "What this record could show",
         "From which peak on each cause would be named, and what it would be taken for; or why it cannot be "
         "seen.",
-        [Table(["cause", "from, arcsec", "not told from, or why not"], rows)],
+        [Table(["cause", Heading("from"), "not distinguished from, or why not"], rows)],
     )
 
 

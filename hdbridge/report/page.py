@@ -94,10 +94,18 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
+class Heading:
+    """Of a column of figures: what it holds, and its unit, which stands below."""
+
+    name: str
+    unit: str = "arcsec"
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
     """Rows of cells. Columns of figures are aligned to the right; numbers are shown with two decimals."""
 
-    header: Sequence[str]
+    header: Sequence[str | Heading]
     rows: Sequence[Sequence[str | float]]
     caption: str = ""
 
@@ -121,14 +129,38 @@ class Section:
     blocks: Sequence[Block] = field(default_factory=tuple)
 
 
+class Status(Enum):
+    """What became of what the page reports: the first word of its verdict."""
+
+    OFFERED = "offered"
+    """The model is better; whether it was committed since, the profile knows."""
+    PENDING = "pending"
+    """The model is better and waits to be committed."""
+    REFUSED = "refused"
+    """The model is not offered; the active one stays."""
+    FOUND = "found"
+    NOTHING_FOUND = "nothing found"
+    MEASURED = "measured"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command that comes next, and what it does."""
+
+    line: str
+    purpose: str
+
+
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The whole page; ``verdict`` is the one sentence that a reader in a hurry needs."""
+    """The whole page; ``verdict`` is what a reader in a hurry needs, after the one word of ``status``."""
 
     title: str
     verdict: str
     sections: Sequence[Section]
     footer: str = ""
+    status: Status = Status.MEASURED
+    commands: Sequence[Command] = ()
 
 
 def render(page: Page) -> str:
@@ -138,6 +170,8 @@ def render(page: Page) -> str:
         page=page,
         kind=lambda block: type(block).__name__.lower(),
         number=charts.index,
+        unit_of=lambda heading: heading.unit if isinstance(heading, Heading) else "",
+        name_of=lambda heading: heading.name if isinstance(heading, Heading) else heading,
         is_words=_is_words,
         text_of=_text_of,
         charts=Markup(_script_safe([_chart_data(chart) for chart in charts])),

@@ -121,7 +121,7 @@ def residual_charts(seen: Seen) -> Iterator[Chart]:
 
 
 def beside_charts(traces: Traces) -> Iterator[Chart]:
-    """Simulation beside measurement on the same trajectory: the whole, and where they are farthest apart."""
+    """Model and measurement on the same trajectory: the whole, and where they are farthest apart."""
     whole = np.arange(len(traces.time_s))
     given = (traces.measured_arcsec - traces.model_arcsec) ** 2
     left = (traces.measured_arcsec - traces.extended_arcsec) ** 2

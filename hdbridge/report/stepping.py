@@ -8,9 +8,21 @@ from typing import Final
 
 from hdbridge import __version__
 from hdbridge.evaluation.stepping import Scheme, SchemeResult
-from hdbridge.report.page import Chart, Facts, Grid, Level, Mark, Page, Section, Series, Table, histogram
+from hdbridge.report.page import (
+    Chart,
+    Facts,
+    Grid,
+    Heading,
+    Level,
+    Mark,
+    Page,
+    Section,
+    Series,
+    Table,
+    histogram,
+)
+from hdbridge.report.words import SCATTER, SIGMA
 
-SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "load error, arcsec"
 NAMES: Final = {
@@ -36,9 +48,9 @@ def stepping_page(
     floor_arcsec: float,
     facts: Mapping[str, str],
     *,
-    beside_article: bool = False,
+    with_article: bool = False,
 ) -> Page:
-    """The page; ``beside_article`` sets the article's Table 3 beside the result."""
+    """The page; ``with_article`` adds the article's Table 3 to the result."""
     best = _best(results)
     reach = 1.08 * max(
         abs(stand.error_arcsec)
@@ -49,13 +61,12 @@ def stepping_page(
         title=f"Stepping test of axis '{axis_name}'",
         verdict=_verdict(results, floor_arcsec),
         sections=[
-            Section("Figures", blocks=[_table(results, beside_article)]),
+            Section("Figures", blocks=[_table(results, with_article)]),
             Section(
                 "Load error at rest",
-                "Each point is one step: what the load encoder read at rest, minus the target. The way there "
-                "and the way back are apart where the gear's hysteresis is not compensated; the wave along "
-                "the angle is the synchronous error. All schemes are drawn to one scale. Drag to enlarge a "
-                "chart, double-click to go back.",
+                "Each point is one step: what the load encoder read at rest, minus the target. The two "
+                "directions are apart where the gear's hysteresis is not compensated; the wave along the "
+                "angle is the synchronous error. All schemes are drawn to one scale.",
                 [Grid([_errors(scheme, result, reach) for scheme, result in results.items()])],
             ),
             Section(
@@ -97,8 +108,8 @@ def _verdict(results: Mapping[Scheme, SchemeResult], floor_arcsec: float) -> str
 def _errors(scheme: Scheme, result: SchemeResult, reach_arcsec: float) -> Chart:
     pooled = result.pooled
     caption = (
-        f"{_name(scheme).capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f}, "
-        f"mean {_signed(pooled.mean_arcsec)}"
+        f"{_name(scheme).capitalize()}: {SIGMA} {pooled.three_sigma_arcsec:.1f} arcsec, "
+        f"mean {_signed(pooled.mean_arcsec)} arcsec"
     )
     return Chart(
         caption, X_LABEL, Y_LABEL, _by_way(result), height_px=250, y_range=(-reach_arcsec, reach_arcsec)
@@ -128,22 +139,22 @@ def _signed(value: float) -> str:
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
 
-def _table(results: Mapping[Scheme, SchemeResult], beside_article: bool) -> Table:
-    header = ["compensation", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean", f"pooled {SIGMA}", "mean"]
-    if beside_article:
-        header += [f"article {SIGMA}", "mean"]
+def _table(results: Mapping[Scheme, SchemeResult], with_article: bool) -> Table:
+    header: list[str | Heading] = ["compensation", *(Heading(each) for each in SCATTER)]
+    if with_article:
+        header += [Heading(f"article {SIGMA}"), Heading("mean")]
     rows: list[list[str | float]] = []
     for scheme, result in results.items():
         row: list[str | float] = [scheme.value]
-        for part in (result.cw, result.ccw, result.pooled):
+        for part in (result.pooled, result.cw, result.ccw):
             row += [part.three_sigma_arcsec, part.mean_arcsec]
-        if beside_article:
+        if with_article:
             row += ARTICLE_TABLE_3.get(scheme.value, ("", ""))
         rows.append(row)
-    caption = "arcsec at the load"
-    if beside_article:
-        caption += (
-            "; the article's Table 3 beside it. Its own Tables 1 and 2, which this axis has, cannot give it: "
-            "see docs/article-table-3.md"
+    caption = ""
+    if with_article:
+        caption = (
+            "On the right the article's Table 3. Its own Tables 1 and 2, which this axis has, cannot give "
+            "it: see docs/article-table-3.md"
         )
     return Table(header, rows, caption)

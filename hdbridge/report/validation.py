@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from hdbridge.calibration.validation import Validation
-from hdbridge.report.page import Block, Chart, Grid, Mark, Section, Series, Table, histogram
-from hdbridge.report.words import SIGMA
+from hdbridge.report.page import Block, Chart, Grid, Heading, Mark, Section, Series, Table, histogram
+from hdbridge.report.words import SCATTER, SIGMA
 
 X_LABEL: Final = "load target, deg"
 Y_LABEL: Final = "error, arcsec"
@@ -52,7 +52,7 @@ def _stepping(checked: Validation) -> Iterator[Block]:
     )
     for when, each in (("before", checked.before), ("after", checked.after)):
         row: list[str | float] = [f"{when}: {each.model}"]
-        for part in (each.cw, each.ccw, each.pooled):
+        for part in (each.pooled, each.cw, each.ccw):
             row += [part.three_sigma_arcsec, part.mean_arcsec]
         rows.append(row)
         series = [
@@ -63,9 +63,7 @@ def _stepping(checked: Validation) -> Iterator[Block]:
         charts.append(Chart(caption, X_LABEL, Y_LABEL, series, height_px=240, y_range=(-reach, reach)))
         remains = {one.label: one.y for one in series}
     after = Chart("After, enlarged", X_LABEL, Y_LABEL, charts[-1].series, height_px=240)
-    yield Table(
-        ["with", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean", f"pooled {SIGMA}", "mean"], rows, "arcsec"
-    )
+    yield Table(["with", *(Heading(each) for each in SCATTER)], rows)
     yield Grid([*charts, after, histogram("After: how often which error", Y_LABEL, remains, height_px=240)])
 
 
@@ -80,7 +78,8 @@ def _iso_section(checked: Validation) -> list[Section]:
     rows = [[when, *(getattr(each, name) for name, _ in ISO_FIGURES)] for when, each in given]
     tested = given[-1][1]
     text = (
-        f"The figures of ISO 230-2 for a rotary axis, arcsec: {tested.targets} targets, each approached "
+        f"The figures of ISO 230-2 for a rotary axis: {tested.targets} targets, each approached "
         f"{tested.runs} times from either side."
     )
-    return [Section("Accuracy and repeatability", text, [Table(["", *(w for _, w in ISO_FIGURES)], rows)])]
+    headings = [Heading(words) for _, words in ISO_FIGURES]
+    return [Section("Accuracy and repeatability", text, [Table(["with", *headings], rows)])]

@@ -6,6 +6,8 @@ import math
 from typing import Final
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
+SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
+"""Columns of a stepping test. Pooled is the result, so it comes first: a telephone shows two columns."""
 
 
 def sentence(text: str) -> str:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,7 +180,29 @@ def test_before_and_after_are_drawn_to_one_scale():
     assert "2.00 times that" in text
     assert charts["Before: no compensation"]["y_range"] == charts["After: the new model"]["y_range"]
     assert charts["After, enlarged"]["y_range"] is None
-    assert '<p class="verdict">Stepping 3 sigma 90 to 5.68 arcsec. Read the note' in text
+    assert "Offered.</strong> Stepping 3 sigma 90 to 5.68 arcsec. Read the note" in text
+
+
+@pytest.mark.parametrize(
+    ("offer", "word", "commands"),
+    [
+        (
+            Offer(True, "3 to 1 arcsec", Path("my-axis/pending.yaml")),
+            "Pending.",
+            ["hdbridge model diff my-axis", "hdbridge model commit my-axis"],
+        ),
+        (Offer(True, "3 to 1 arcsec"), "Offered.", ["hdbridge model log PROFILE"]),
+        (Offer(False, "not offered: no gain"), "Refused.", []),
+        (None, "Measured.", ["hdbridge diagnose rec --model MODEL.yaml"]),
+    ],
+    ids=["pending", "offered", "refused", "fitted"],
+)
+def test_the_verdict_begins_with_what_became_of_the_model_and_names_the_next_command(offer, word, commands):
+    text, _ = read(result(axis="demo", offer=offer))
+    verdict = text[text.index('<div class="verdict') : text.index("<section>")]
+    assert re.search(r'class="status">(.*?)</strong>', verdict)[1] == word
+    assert re.findall(r"<code>(.*?)</code>", verdict) == commands
+    assert text.index("<h1>") < text.index('<div class="verdict') < text.index("<h2>")
 
 
 def test_a_fit_without_stepping_and_reference_pose_has_a_page_too(plain):

@@ -5,10 +5,12 @@ import html
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.diagnose import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
 from hdbridge.effects import (
@@ -197,16 +199,19 @@ def test_it_says_cause_size_gain_and_what_else_it_could_be(plain):
     assert "off by 3.10 arcsec (rms): load order (once or twice per load turn) or compliance" in text
     assert "up to 4.00 arcsec" in text
     assert "0.61 remain, without it 2.90 at best; the noise of a reading is 0.50" in text
-    assert "or one that it cannot be told from" in text
+    assert "or one that it cannot be distinguished from" in text
     row = re.search(r"1\. load order</th>(.*?)</tr>", plain).group(1)
     assert re.findall(r">([^<>]+)</td>", row) == ["0.97", "4.00", "3.00", "0.50", "97 %"]
+    header = plain[: plain.index("1. load order</th>")].rpartition("<thead>")[2]
+    units = dict(re.findall(r'>([\w ,]+) <span class="unit">([\w ]+)<', header))
+    assert units["size"] == units["with"] == "arcsec"
 
 
 def test_it_says_what_to_do_and_to_measure_next(plain):
     text = words(plain)
     assert "measure next Two slow load turns both ways." in text
     assert "Centre the load encoder" in text
-    assert "hdbridge diagnose --extend" in text
+    assert "hdbridge diagnose RECORD... --model MODEL.yaml --extend NEW_MODEL.yaml" in text
 
 
 def test_parameters_stand_with_their_interval(plain):
@@ -278,7 +283,7 @@ def test_a_change_of_orders_is_drawn_from_its_parameters():
 def test_something_unexplained_has_no_name_and_no_curve():
     text = page(unexplained())
     said = words(text)
-    assert "something unexplained that lives in the load angle and direction" in said
+    assert "something unexplained that depends on the load angle and direction" in said
     assert "No cause of the catalogue fits it" in said
     assert "Do not correct what has no name" in said
     assert "--extend" not in said
@@ -335,7 +340,11 @@ def test_a_stepping_test_says_what_was_gained_on_the_axis():
     targets, errors = ((1.0, 2.0), (2.0, 1.0)), ((3.0, 1.0), (-1.0, -3.0))
     before = Stepped("the active model", *[Scatter(12.0, 1.0)] * 3, errors, targets)
     after = Stepped("the extended model", *[Scatter(3.2, 0.1)] * 3, errors, targets)
-    said = words(page(finding(), stepping=Validation(before, after, Floor(2.84, 0.0))))
+    offer = Offer(True, "offered for commit: stepping 12 to 3.2 arcsec", Path("my-axis/pending.yaml"))
+    text = page(finding(), stepping=Validation(before, after, Floor(2.84, 0.0)), offer=offer)
+    said = words(text)
+    assert "Pending. Offered for commit: stepping 12 to 3.2 arcsec. The model is off by" in said
+    assert "hdbridge model commit my-axis" in said
     assert "On the axis, stepping went from 3σ = 12.00 to 3.20 arcsec." in said
     assert "before: the active model 12.00" in said
     assert "--extend" not in said

@@ -207,7 +207,7 @@ def test_the_stepping_page_says_the_result_in_one_sentence():
         Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36])),
         Scheme.BOTH: SchemeResult.of(outcome([1, -1], [0.5, -0.5])),
     }
-    text = render(stepping_page("a<b", results, 2.8, {"gear ratio": "50"}, beside_article=True))
+    text = render(stepping_page("a<b", results, 2.8, {"gear ratio": "50"}, with_article=True))
     words = " ".join(Reader(text).text)
     assert "the load's error at rest is 2.37 arcsec (3σ) about a mean of 0.00" in words
     assert "0.85 times the 2.80" in words
@@ -219,6 +219,17 @@ def test_the_stepping_page_says_the_result_in_one_sentence():
     assert none["series"][1]["y"] == [-40, -36]
     assert [each["value"] for each in remaining["levels"]] == pytest.approx([1.6166, -1.6166], abs=1e-4)
     assert sum(counts["series"][0]["y"]) == 2
+
+
+def test_the_pooled_figures_come_first_and_every_column_of_figures_has_its_unit():
+    results = {Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36]))}
+    text = render(stepping_page("a", results, 2.8, {}))
+    header = re.search(r"<thead>(.*?)</thead>", text)[1]
+    columns = re.findall(r'<th scope="col">(.*?) <span class="unit">(.*?)</span></th>', header)
+    assert columns[:2] == [("pooled 3σ", "arcsec"), ("mean", "arcsec")]
+    assert len(columns) == header.count("<th") - 1
+    row = re.search(r"<tbody>(.*?)</tbody>", text, re.DOTALL)[1]
+    assert re.findall(r"<td>(.*?)</td>", row)[0] == "120.15"
 
 
 def test_without_compensation_the_verdict_speaks_of_none():

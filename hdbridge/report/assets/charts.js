@@ -1,10 +1,11 @@
 "use strict";
 // Each series has its own x (uPlot's mode 2), so that loops, whose x goes back and forth, and clouds of points
-// are drawn as they are. Drag enlarges, double-click goes back, the nearest point is read out.
+// are drawn as they are. The nearest point is read out. Enlarging: drag (mouse), pinch (touch), + and - (keyboard) or
+// the buttons; a double click or tap, 0 or Escape goes back.
 (function () {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   let printing = false;
-  // Okabe and Ito's palette: told apart by colour-blind readers too.
+  // Okabe and Ito's palette: distinguished by colour-blind readers too.
   const palette = () => dark.matches && !printing
     ? ["#56b4e9", "#e69f00", "#2fbf94", "#cc79a7", "#f0e442", "#d55e00"]
     : ["#0072b2", "#d55e00", "#009e73", "#b0568a", "#8a6d00", "#2b8fc9"];
@@ -184,6 +185,92 @@
     tip.style.top = `${py > 34 ? py - 34 : py + 10}px`;
   }
 
+  // Enlarging by any means. ``home``: the ranges of the whole chart; places are shares of the plot, from the left and
+  // from below. Never beyond the whole: the chart cannot be lost.
+  function zoom(u, chart, home, state) {
+    const log = { x: chart.x_log, y: chart.y_log };
+    const flat = (key, values) => log[key] ? values.map(Math.log) : values;
+    const range = (key, factor, place, shift) => {
+      const [first, last] = flat(key, home[key]), whole = last - first;
+      const [low, high] = flat(key, [u.scales[key].min, u.scales[key].max]);
+      const span = Math.min((high - low) / factor, whole);
+      let from = low + place * (high - low - span) - shift * (high - low);
+      from = Math.max(first, Math.min(from, last - span));
+      const to = [from, from + span];
+      return { whole: span >= whole * 0.999, ends: log[key] ? to.map(Math.exp) : to };
+    };
+    const set = (x, y) => u.batch(() => {
+      u.setScale("x", { min: x[0], max: x[1] });
+      u.setScale("y", { min: y[0], max: y[1] });
+    });
+    const reset = () => { state.enlarged = false; set(home.x, home.y); };
+    const change = (factor, place = [0.5, 0.5], shift = [0, 0]) => {
+      const x = range("x", factor, place[0], shift[0]), y = range("y", factor, place[1], shift[1]);
+      if (x.whole && y.whole) return reset();
+      state.enlarged = true;
+      set(x.ends, y.ends);
+    };
+    const key = event => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      const arrow = { ArrowLeft: [0.2, 0], ArrowRight: [-0.2, 0], ArrowUp: [0, -0.2], ArrowDown: [0, 0.2] }[event.key];
+      if (event.key === "+" || event.key === "=") change(1.6);
+      else if (event.key === "-") change(1 / 1.6);
+      else if (event.key === "0" || event.key === "Escape") reset();
+      else if (arrow && state.enlarged) change(1, [0.5, 0.5], arrow);
+      else return;
+      event.preventDefault();
+    };
+    return { change, reset, key };
+  }
+
+  // Two fingers enlarge and move; one moves an enlarged chart sideways, up and down it scrolls the page as elsewhere.
+  function touch(over, zooming, state) {
+    const fingers = new Map();
+    let box, before;
+    const seen = () => {
+      const places = [...fingers.values()].slice(0, 2).map(({ x, y }) => [(x - box.left) / box.width, 1 - (y - box.top) / box.height]);
+      const mean = i => places.reduce((sum, place) => sum + place[i], 0) / places.length;
+      const [a, b] = [...fingers.values()];
+      return { centre: [mean(0), mean(1)], apart: b ? Math.max(Math.hypot(a.x - b.x, a.y - b.y), 10) : 1, count: fingers.size };
+    };
+    const change = event => {
+      if (event.pointerType === "mouse") return;
+      if (event.type === "pointerdown") {
+        over.setPointerCapture(event.pointerId);
+        box = over.getBoundingClientRect();
+      } else if (!fingers.has(event.pointerId)) return;
+      if (event.type === "pointerup" || event.type === "pointercancel") fingers.delete(event.pointerId);
+      else fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      if (!fingers.size) return;
+      const now = seen();
+      if (event.type === "pointermove" && before.count === now.count && (now.count > 1 || state.enlarged)) {
+        const shift = [0, 1].map(i => now.count > 1 || i === 0 ? now.centre[i] - before.centre[i] : 0);
+        zooming.change(now.apart / before.apart, now.centre, shift);
+      }
+      before = now;
+    };
+    for (const name of ["pointerdown", "pointermove", "pointerup", "pointercancel"]) over.addEventListener(name, change);
+  }
+
+  function buttons(holder) {
+    const row = document.createElement("span");
+    row.className = "zoom";
+    for (const [sign, words, act] of [
+      ["+", "enlarge", zooming => zooming.change(1.6)],
+      ["\u2212", "make smaller", zooming => zooming.change(1 / 1.6)],
+      ["\u21ba", "whole chart", zooming => zooming.reset()],
+    ]) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = sign;
+      button.title = words;
+      button.setAttribute("aria-label", words);
+      button.addEventListener("click", () => act(holder.zooming));
+      row.append(button);
+    }
+    return row;
+  }
+
   function plot(holder) {
     const chart = CHARTS[holder.dataset.chart];
     const colours = coloured(chart), ink = css("--faint"), line = css("--line");
@@ -200,10 +287,13 @@
     const tip = document.createElement("div"), dot = document.createElement("div");
     tip.className = "tip";
     dot.className = "dot";
-    holder.replaceChildren(legend(chart, colours));
+    const head = legend(chart, colours);
+    head.append(buttons(holder));
+    holder.drawn?.destroy();
+    holder.replaceChildren(head);
     holder.width_drawn = holder.clientWidth;
-    let enlarged = false;
-    return new uPlot({
+    const state = { enlarged: false };
+    holder.drawn = new uPlot({
       mode: 2,
       width: holder.clientWidth,
       height: chart.height,
@@ -211,8 +301,8 @@
       cursor: { drag: { x: true, y: true, uni: 12 }, points: { show: false } },
       legend: { show: false },
       scales: {
-        x: { time: false, distr: chart.x_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : xRange },
-        y: { distr: chart.y_log ? 3 : 1, range: (u, low, high) => enlarged ? [low, high] : yRange },
+        x: { time: false, distr: chart.x_log ? 3 : 1, range: (u, low, high) => state.enlarged ? [low, high] : xRange },
+        y: { distr: chart.y_log ? 3 : 1, range: (u, low, high) => state.enlarged ? [low, high] : yRange },
       },
       axes: [{ ...axis(chart.x_label), values, ...(chart.x_log ? logarithmic : {}), size: 28 }, { ...axis(chart.y_label), values, ...(chart.y_log ? logarithmic : {}), size: 52 }],
       series: [null, ...chart.series.map((series, i) => ({
@@ -223,18 +313,14 @@
         paths: draw(series, colours[i], chart.y_log ? yRange[0] : 0),
       }))],
       hooks: {
-        setSelect: [u => { enlarged = u.select.width > 0 || u.select.height > 0; }],
+        setSelect: [u => { state.enlarged = u.select.width > 0 || u.select.height > 0; }],
         setCursor: [u => readout(u, chart, tip, dot)],
         draw: [u => drawLevels(u, chart.levels)],
         ready: [u => {
           u.over.append(tip, dot);
-          u.over.addEventListener("dblclick", () => {
-            enlarged = false;
-            u.batch(() => {
-              u.setScale("x", { min: xRange[0], max: xRange[1] });
-              u.setScale("y", { min: yRange[0], max: yRange[1] });
-            });
-          });
+          holder.zooming = zoom(u, chart, { x: xRange, y: yRange }, state);
+          u.over.addEventListener("dblclick", holder.zooming.reset);
+          touch(u.over, holder.zooming, state);
         }],
       },
     }, [null, ...chart.series.map(series => [series.x, series.y])], holder);
@@ -242,6 +328,7 @@
 
   const holders = [...document.querySelectorAll("[data-chart]")];
   const plotAll = () => holders.forEach(plot);
+  for (const holder of holders) holder.addEventListener("keydown", event => holder.zooming.key(event));
   let pending = 0;
   new ResizeObserver(() => {
     clearTimeout(pending);

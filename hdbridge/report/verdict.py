@@ -1,0 +1,21 @@
+"""The first word of a page, and the command that comes next."""
+
+from __future__ import annotations
+
+from hdbridge.calibration.result import Offer
+from hdbridge.report.page import Command, Status
+
+
+def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
+    """What became of a model that was measured for commit."""
+    if not offer.made:
+        return Status.REFUSED, ()
+    if offer.pending is None:
+        return Status.OFFERED, (
+            Command("hdbridge model log PROFILE", "says whether this model waits, or was committed since"),
+        )
+    profile = offer.pending.parent
+    return Status.PENDING, (
+        Command(f"hdbridge model diff {profile}", "shows what would change"),
+        Command(f"hdbridge model commit {profile}", "makes it the active model"),
+    )
