@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: help demo test unit check format test-socketcan blind bench-realtime clean
+.PHONY: help demo test unit check format test-socketcan blind bench-realtime docs clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -47,6 +47,14 @@ bench-realtime: $(READY)  ## what a cycle of 1 ms costs on PREEMPT_RT, in instru
 	@mkdir -p build/realtime
 	$(CC) -O2 -o build/realtime/master tools/bench/master.c
 	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_cycle.py --master build/realtime/master --json build/realtime/figures.json
+
+$(VENV)/.docs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/.docs  ## the guides and the API reference as a site with search, into build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "open build/site/index.html"
 
 clean:           ## remove the environment and what the commands made
 	rm -rf $(VENV) demo-output dist build

@@ -1,0 +1,68 @@
+"""What the site of `make docs` has beyond the pages in docs/: MkDocs calls these functions (mkdocs.yml).
+
+The API reference is made from the docstrings of what `import hdbridge` gives. CONTRIBUTING.md and
+CHANGELOG.md stand at the top of the project, where one looks for them; the site takes them in.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import hdbridge
+
+ROOT = Path(__file__).resolve().parents[1]
+FROM_THE_TOP = {"contributing.md": "CONTRIBUTING.md", "changes.md": "CHANGELOG.md"}
+REFERENCE = """# API reference
+
+Made from the docstrings of what `import hdbridge` gives. How these work together, with examples:
+[library](api.md).
+"""
+
+
+def reference() -> str:
+    """The page of the API: every public name, the errors last."""
+    public = {name: getattr(hdbridge, name) for name in getattr(hdbridge, "__all__", ())}
+    errors = {name for name, each in public.items() if isinstance(each, type) and issubclass(each, Exception)}
+    groups = (
+        ("Classes and functions", [name for name in public if name not in errors]),
+        ("Errors", sorted(errors)),
+    )
+    parts = [REFERENCE]
+    for title, names in groups:
+        parts.append(f"## {title}\n")
+        parts += [f"::: {public[name].__module__}.{public[name].__qualname__}\n" for name in names]
+    return "\n".join(parts)
+
+
+def generated() -> dict[str, str]:
+    """Pages by their path in the site, as Markdown."""
+    pages = {
+        page: (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
+        for page, source in FROM_THE_TOP.items()
+    }
+    return pages | {"reference.md": reference()}
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the generated pages."""
+    from mkdocs.structure.files import File  # noqa: PLC0415  the tests of this file need no MkDocs
+
+    for path, text in generated().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links to the top of the project lead to where the site has those pages."""
+    for page, source in FROM_THE_TOP.items():
+        markdown = markdown.replace(f"](../{source})", f"]({page})")
+    return markdown
+
+
+def on_post_template(output_content: str, **_: Any) -> str:
+    """The same for what is no page of docs/ (404.html)."""
+    return on_post_page(output_content)
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """The one script that the theme would fetch, which lets the search run from files, is with the site."""
+    return output.replace("https://unpkg.com/iframe-worker/shim", "assets/iframe-worker.js")
