@@ -193,9 +193,8 @@ def _orders(
         weight += abs(apart) ** 2
     if not changed:
         return None
-    seen = 0.5 * float(
-        np.ptp(workshop.columns(now, fitted.theory.start) @ (now.coefficients() - given.coefficients()))
-    )
+    change = now.fitted(now.coefficients() - given.coefficients())
+    seen = 0.5 * float(np.ptp(workshop.does(change, fitted.theory.start)))
     if max(each.amplitude_arcsec for each in changed) > EXTRAPOLATED * seen:
         return None  # on an arc of their turn orders take any size
     low = {each.order for each in changed} <= {1, 2}

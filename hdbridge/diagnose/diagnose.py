@@ -133,9 +133,7 @@ class _Judge:
         if sound != fitted.theory.effects or usual:
             fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
             told = [*sound[:base], *(sound[place] for place in chosen)]
-            after = self._about_zeros(
-                sum(each.predict(workshop.motion, fitted.theory.start) for each in told)
-            )
+            after = self._about_zeros(workshop.told(told, fitted.theory.start))
             fitted = replace(fitted, residual=after * workshop.weight)
         extended = extended_model(workshop, self.model, fitted, chosen, spread, reason, base)
         points = workshop.evidence.points
@@ -343,18 +341,16 @@ class _Judge:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""
         best: FloatArray | None = None
         for start in Start:
-            error = self._about_zeros(self.model.predict(self.workshop.motion, start))
+            error = self._about_zeros(self.workshop.told(self.model.effects, start))
             if best is None or float(error @ error) < float(best @ best):
                 best = error
         assert best is not None
         return best
 
-    def _about_zeros(self, predicted_arcsec: FloatArray | float) -> FloatArray:
-        """What a prediction for every point leaves of the usable ones, about the zeros that suit it best."""
+    def _about_zeros(self, told_arcsec: FloatArray) -> FloatArray:
+        """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
         workshop = self.workshop
-        error: FloatArray = (
-            workshop.observed - np.broadcast_to(predicted_arcsec, len(workshop.motion))[workshop.index]
-        )
+        error: FloatArray = workshop.observed - told_arcsec
         for zero in range(workshop.evidence.zeros):
             rows = workshop.zero == zero
             if np.any(rows):
@@ -391,6 +387,8 @@ class _Judge:
             kind_number=points.kind[workshop.index].astype(np.float64),
             motion=workshop.motion,
             rows=workshop.index,
+            samples=workshop.evidence.full.motion,
+            runs=workshop.evidence.runs,
             start=fitted.theory.start,
         )
 

@@ -1,10 +1,11 @@
-"""What a diagnosis looks at: the observed error and what drove it, on at most some 50,000 points.
+"""What a diagnosis looks at: the observed error and what drove it, on at most `MOST_POINTS` points.
 
 The angle that drives the effects is the command's where the record has one, plus what the motor encoder shows
 against it as a smooth line in speed and acceleration: neither encoder counts nor a following error are
 findings.
-Longer records are averaged over runs of consecutive samples; the full rate stays at hand for what is fast
-(vibration, interpolation errors of an encoder).
+Longer records are averaged over runs of consecutive samples. What is fitted to them is averaged alike
+(`Evidence.mean`), so that a law is as large there as in the samples. The full rate stays at hand for that,
+and for what is fast (vibration, interpolation errors of an encoder).
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 MOST_POINTS = 100_000
+"""A record of more samples is averaged,"""
+AVERAGED_POINTS = 50_000
+"""to at most about so many points: time and memory go with them, and what is slow needs no more."""
+SHORT = 0.77
+"""Share of the mean length of a run that every other one has: the rest have 1.6 times as much."""
 CHATTER_SIGMAS = 8.0
 """Turns smaller than so many standard deviations of the noise of the measured angle are no turns."""
 LEAST_SAMPLES = 60
@@ -90,6 +96,8 @@ class Evidence:
     """What is fitted."""
     full: Series
     """Every sample."""
+    runs: IntArray
+    """First sample of each point's run, shape (points,)."""
     kinds: tuple[str, ...]
     zeros: int
     commanded: bool
@@ -104,6 +112,10 @@ class Evidence:
     """Turns of the driving angle."""
     remarks: tuple[str, ...]
     """What the record lacks, in words."""
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Means of a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
+        return means(values, self.runs)
 
 
 def gather(
@@ -141,10 +153,12 @@ def gather(
         full.error_arcsec - known, still, facts.motor_count, facts.load_count, facts.commanded
     )
     full = replace(full, sigma_arcsec=sigma)
+    runs = _runs(count, record.starts)
     return Evidence(
         ratio=ratio,
-        points=_averaged(full, -(-count // MOST_POINTS)),
+        points=_averaged(full, runs),
         full=full,
+        runs=runs,
         kinds=kinds,
         zeros=int(full.zero[-1]) + 1,
         commanded=facts.commanded,
@@ -191,6 +205,7 @@ def _series(
         for rows in (slice(first, last) for first, last in pairwise(edges))
     ]
     driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    driving.setflags(write=False)  # so that where it turns round is worked out once
     # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
     angle = driving if target is not None else record.motor_position_deg
     error = (record.load_position_deg - angle / ratio) * ARCSEC_PER_DEG
@@ -261,18 +276,41 @@ def _turns(motor_deg: FloatArray, chatter_deg: float) -> int:
     return int(np.count_nonzero(np.diff(held)))
 
 
-def _averaged(full: Series, run: int) -> Series:
+def _runs(count: int, starts: Sequence[int]) -> IntArray:
+    """Where runs of consecutive samples begin; none reaches over a start.
+
+    Their lengths alternate, so that no period is averaged out in all of them.
+    """
+    if count <= MOST_POINTS:
+        return np.arange(count, dtype=np.intp)
+    size = -(-count // AVERAGED_POINTS)
+    short = round(SHORT * size)
+    pair = np.add.outer(np.arange(0, count, 2 * size), (0, short)).ravel()
+    return np.concatenate(
+        [first + pair[: np.searchsorted(pair, last - first)] for first, last in pairwise([*starts, count])]
+    ).astype(np.intp)
+
+
+def means(values: FloatArray, runs: IntArray) -> FloatArray:
+    """Means of a quantity of every sample, (n,) or (n, p), over runs of samples given by their first ones."""
+    if len(runs) == len(values):
+        return values
+    size = np.diff(np.append(runs, len(values)))
+    total = np.add.reduceat(values, runs, axis=0)
+    return np.asarray(total / (size if values.ndim == 1 else size[:, np.newaxis]))
+
+
+def _averaged(full: Series, runs: IntArray) -> Series:
     """Means over runs of consecutive samples; what is not usable is left out of the means, not of the
     path.
     """
-    if run <= 1:
+    if len(runs) == len(full):
         return full
-    first = np.arange(0, len(full), run)
-    size = np.diff(np.append(first, len(full)))
-    middle = np.minimum(first + run // 2, len(full) - 1)
+    size = np.diff(np.append(runs, len(full)))
+    middle = runs + size // 2
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(values, first) / size)
+        return means(values, runs)
 
     motion = full.motion
     channels = {

@@ -31,7 +31,7 @@ def supported(workshop: Workshop, fitted: Fitted, given: Sequence[Effect]) -> tu
             result[place] = old
         elif isinstance(old, Synchronous) and isinstance(new, Synchronous) and old.orders:
             change = new.coefficients() - old.coefficients()
-            seen = 0.5 * float(np.ptp(workshop.columns(new, start) @ change))
+            seen = 0.5 * float(np.ptp(workshop.does(new.fitted(change), start)))
             largest = float(np.max(np.hypot(change[::2], change[1::2])))
             if largest > EXTRAPOLATED * seen:
                 result[place] = old

@@ -119,10 +119,10 @@ def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
 
 def _does(effect: Effect, traces: Traces) -> FloatArray:
     """What an effect does at the points of the traces, arcsec, shape (m,)."""
-    does = effect.predict(traces.motion, traces.start)
+    does = traces.told(effect)
     if isinstance(effect, HysteresisMemory):  # it stands in the place of the law without memory
-        does = does - Hysteresis(**effect.parameters()).predict(traces.motion, traces.start)
-    return np.asarray(does[traces.rows])
+        does = does - traces.told(Hysteresis(**effect.parameters()))
+    return does
 
 
 def effect_of(finding: Finding) -> Effect | None:
@@ -223,14 +223,13 @@ def _strength(
 
 def _scaled(effect: Effect | None, traces: Traces) -> tuple[str, FloatArray] | None:
     """The part of the model that a cause scales, in words and in arcsec."""
-    motion, rows, start = traces.motion, traces.rows, traces.start
     if isinstance(effect, TorqueModulation):
-        return "ripple", MotorOrders(orders=effect.orders).predict(motion)[rows]
+        return "ripple", traces.told(MotorOrders(orders=effect.orders))
     if isinstance(effect, RateDependence):
-        return "elastic loop", effect.loop.law().predict(motion, start)[rows]
+        return "elastic loop", traces.told(effect.loop.law())
     if isinstance(effect, AmplitudeDrift):
-        ripple = MotorOrders(orders=effect.orders).predict(motion)[rows]
-        loop = effect.loop.law().predict(motion, start)[rows]
+        ripple = traces.told(MotorOrders(orders=effect.orders))
+        loop = traces.told(effect.loop.law())
         by_ripple = abs(effect.ripple_percent_per_k) * float(np.std(ripple))
         by_loop = abs(effect.friction_percent_per_k) * float(np.std(loop))
         return ("ripple", ripple) if by_ripple >= by_loop else ("elastic loop", loop)

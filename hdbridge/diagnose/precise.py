@@ -64,21 +64,21 @@ def _shaken(workshop: Workshop, fitted: Fitted) -> FloatArray:
 
     The second is odd in the direction, as a lag is.
     """
-    motion = workshop.motion
+    motion = workshop.evidence.full.motion
     speed = motion.motor_speed_deg_s
     waves = [each for each in fitted.theory.effects if isinstance(each, OrderSeries) and each.orders]
     if speed is None or not waves:
         return np.empty((len(workshop.index), 0))
-    angle, rate = motion.motor_deg[workshop.index], RAD_PER_DEG * speed[workshop.index] / _RATE
-    columns = np.zeros((len(workshop.index), 2))
+    rate = RAD_PER_DEG * speed / _RATE
+    columns = np.zeros((len(motion), 2))
     for series in waves:
         turns = series.turns_per_motor_turn()
         for each in series.orders:
-            at = RAD_PER_DEG * (each.order * turns * angle + each.phase_deg)
+            at = RAD_PER_DEG * (each.order * turns * motion.motor_deg + each.phase_deg)
             frequency = each.order * turns * rate
             columns[:, 0] += each.amplitude_arcsec * frequency**2 * np.cos(at)
             columns[:, 1] += each.amplitude_arcsec * frequency**3 * np.sin(at)
-    return columns
+    return workshop.at_points(columns)
 
 
 def _speeds_differ(workshop: Workshop) -> bool:

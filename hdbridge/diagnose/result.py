@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.diagnose.evidence import means
 from hdbridge.diagnose.probability import Signs
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.model import TransmissionModel
@@ -145,6 +146,14 @@ class Traces:
     """Which points of ``motion`` these arrays are of."""
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
+    samples: Motion
+    """The same at every sample."""
+    runs: NDArray[np.intp]
+    """First sample of each point of ``motion``."""
+
+    def told(self, effect: Effect) -> FloatArray:
+        """What an effect does at these points, arcsec, shape (m,)."""
+        return means(effect.predict(self.samples, self.start), self.runs)[self.rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -306,8 +306,7 @@ class Search:
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
-        effect = fitted.theory.effects[place]
-        values = self.workshop.columns(effect, fitted.theory.start) @ effect.coefficients()
+        values = self.workshop.does(fitted.theory.effects[place], fitted.theory.start)
         low, high = np.quantile(values, [0.002, 0.998])
         return 0.5 * float(high - low)
 

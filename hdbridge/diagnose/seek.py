@@ -45,7 +45,10 @@ def count_loss(workshop: Workshop, fitted: Fitted) -> Candidate | None:
         return None
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
-    step = Step(time_s=float(workshop.time_s[place]), size_arcsec=1.0)
+    evidence = workshop.evidence
+    assert evidence.full.motion.time_s is not None
+    first = evidence.runs[workshop.index[place]]  # of the samples of the point at which it is seen
+    step = Step(time_s=float(evidence.full.motion.time_s[first]), size_arcsec=1.0)
     return Candidate("count_loss", CountLoss(steps=(step,)))
 
 
@@ -112,7 +115,7 @@ def _bump(half_deg: float) -> FloatArray:
 def fast_residual(workshop: Workshop, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
     """Residual of every sample, and the predicted load angle there; zero where it is not usable."""
     full = workshop.evidence.full
-    predicted = workshop.predicted(fitted, full)
+    predicted = workshop.predicted(fitted)
     residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
     # What is slow is none of the business of those who ask for this, and would leak into their peaks.
     window = 9
@@ -198,12 +201,9 @@ def with_load_angle(workshop: Workshop, load_deg: FloatArray) -> None:
     """Make the predicted load angle what effects of the load encoder's lines count on."""
     evidence = workshop.evidence
     full = replace(evidence.full, motion=replace(evidence.full.motion, load_deg=load_deg))
-    if len(evidence.points) == len(full):
-        points = full
-    else:
-        first = np.arange(0, len(full), -(-len(full) // len(evidence.points)))
-        size = np.diff(np.append(first, len(full)))
-        mean = np.add.reduceat(load_deg, first) / size
+    points = full
+    if len(evidence.points) < len(full):
+        mean = evidence.mean(load_deg)
         points = replace(evidence.points, motion=replace(evidence.points.motion, load_deg=mean))
     workshop.evidence = replace(evidence, full=full, points=points)
     workshop.load_angles += 1

@@ -25,7 +25,7 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.effects.orders import OrderSeries
+from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.effects.play import stop
 
 ITERATIONS = 8
@@ -136,12 +136,11 @@ class Workshop:
         return self.evidence.points.motion
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
-        """Regressors of an effect at the usable points, arcsec, shape (m, p)."""
+        """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
         if isinstance(effect, OrderSeries):
-            key = (effect.turns_per_motor_turn(), tuple(each.order for each in effect.orders))
-            if key not in self._memo:
-                self._memo[key] = effect.columns(self.motion, start)[self.index]
-            return self._memo[key]
+            return np.hstack(
+                [np.empty((len(self.index), 0)), *(self._order(effect, each) for each in effect.orders)]
+            )
         # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
         # depend on those, and these are fields of them.
         unit = effect
@@ -151,11 +150,30 @@ class Workshop:
         if recent in self._recent:
             self._recent.move_to_end(recent)
             return self._recent[recent]
-        columns = np.asarray(effect.columns(self.motion, start)[self.index])
+        columns = self.at_points(effect.columns(self.evidence.full.motion, start))
         self._recent[recent] = columns
         if len(self._recent) > KEPT_COLUMNS:
             self._recent.popitem(last=False)
         return columns
+
+    def _order(self, series: OrderSeries, order: MotorOrder) -> FloatArray:
+        """Cosine and sine of one order at the usable points, shape (m, 2)."""
+        key = (series.turns_per_motor_turn(), order.order)
+        if key not in self._memo:
+            alone = series.model_copy(update={"orders": (order,)})
+            self._memo[key] = self.at_points(alone.columns(self.evidence.full.motion))
+        return self._memo[key]
+
+    def at_points(self, values: FloatArray) -> FloatArray:
+        """Of every sample to the usable points, as the observations are averaged."""
+        return np.asarray(self.evidence.mean(values)[self.index])
+
+    def does(self, effect: Effect, start: Start) -> FloatArray:
+        """What an effect does in the usable samples, arcsec; in means a fast one would seem smaller."""
+        full = self.evidence.full
+        if len(full) == len(self.evidence.points):
+            return np.asarray(self.columns(effect, start) @ effect.coefficients())
+        return effect.predict(full.motion, start)[full.usable]
 
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Columns in units of the noise."""
@@ -170,8 +188,8 @@ class Workshop:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
         memory.
         """
-        angle = self.motion.motor_deg
-        return np.stack([stop(angle, each, start)[self.index] for each in STOPS_DEG], axis=1)
+        angle = self.evidence.full.motion.motor_deg
+        return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
 
     def fit(self, theory: Theory, iterations: int = ITERATIONS) -> Fitted:
         """Gauss-Newton from where the theory stands; never worse than where it began."""
@@ -280,13 +298,19 @@ class Workshop:
         tangent = np.column_stack([fitted.tangent, *shapes])
         return replace(fitted, tangent=tangent, parameters=tuple(parameters))
 
-    def predicted(self, fitted: Fitted, series: Series | None = None) -> FloatArray:
-        """What the theory says for each point of a series, zeros included, arcsec, shape (n,)."""
-        series = series or self.evidence.points
-        total = fitted.zeros[series.zero] + self.level
+    def predicted(self, fitted: Fitted) -> FloatArray:
+        """What the theory says for each sample, zeros included, arcsec, shape (n,)."""
+        full = self.evidence.full
+        total = fitted.zeros[full.zero] + self.level
         for effect in fitted.theory.effects:
-            total = total + effect.predict(series.motion, fitted.theory.start)
+            total = total + effect.predict(full.motion, fitted.theory.start)
         return np.asarray(total)
+
+    def told(self, effects: Sequence[Effect], start: Start) -> FloatArray:
+        """What effects say together at the usable points, arcsec, shape (m,)."""
+        full = self.evidence.full.motion
+        total = sum((each.predict(full, start) for each in effects), start=np.zeros(len(full)))
+        return self.at_points(total)
 
 
 def shape_value(effect: Effect, name: str) -> float:

@@ -15,6 +15,8 @@ encoder count of chatter is several arcseconds. Drive it from the command.
 
 from __future__ import annotations
 
+import weakref
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
 
@@ -51,26 +53,70 @@ class Hysteresis(ElasticLoop):
         """The loop for an offset of one: a loop over the reversals, then all samples at once."""
         if not len(motor_deg):
             return np.empty(0)
-        turning, signs = branches(motor_deg, start)
+        path = path_of(motor_deg, start)
         value = float(start.value)
-        result = np.full(len(motor_deg), value)
-        angles = motor_deg[turning].tolist()
         values = []
         scale = 1.0 if start is Start.VIRGIN else 2.0
-        for (last, angle), sign in zip(pairwise(angles), signs, strict=True):
+        for (last, angle), sign in zip(pairwise(path.angles_deg), path.signs, strict=True):
             values.append(value)
             xi = abs(angle - last) / self.width_deg
             value = sign * min(sign * value + scale * rise_at(2.0 * xi / scale, self.exponent), 1.0)
             scale = 2.0
-        first, lengths = turning[0] + 1, np.diff(turning)
-        sense, begun, origin = (np.repeat(each, lengths) for each in (signs, values, angles[:-1]))
-        xi_of = np.abs(motor_deg[first:] - origin) / self.width_deg
+        first = path.turning[0] + 1
+        result = np.full(len(motor_deg), float(start.value))
+        result[first:] = path.sense
+        # Only the samples that are less than the width away from the turn are not saturated.
+        way_deg = np.abs(path.away_deg)
+        near = np.flatnonzero(way_deg < self.width_deg)
+        branch = np.searchsorted(path.turning[1:], first + near)
+        sense, begun = path.sense[near], np.array(values)[branch]
+        xi_of = way_deg[near] / self.width_deg
         height = 2.0 * rise(xi_of, self.exponent)
-        if start is Start.VIRGIN and signs:
-            virgin = slice(0, int(lengths[0]))
+        if start is Start.VIRGIN:
+            virgin = branch == 0
             height[virgin] = rise(2.0 * xi_of[virgin], self.exponent)
-        result[first:] = sense * np.minimum(sense * begun + height, 1.0)
+        result[first + near] = sense * np.minimum(sense * begun + height, 1.0)
         return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """A motor angle taken apart where it turns round; see `branches`."""
+
+    turning: tuple[int, ...]
+    signs: tuple[int, ...]
+    angles_deg: tuple[float, ...]
+    """Motor angle at ``turning``."""
+    away_deg: FloatArray
+    """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
+    sense: FloatArray
+    """Their direction."""
+
+    @classmethod
+    def of(cls, motor_deg: FloatArray, start: Start) -> Path:
+        """Take an angle of at least one sample apart."""
+        turning, signs = branches(motor_deg, start)
+        angles, lengths = motor_deg[turning], np.diff(turning)
+        away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
+        sense = np.repeat(np.array(signs, dtype=np.float64), lengths)
+        return cls(tuple(turning), tuple(signs), tuple(angles.tolist()), away, sense)
+
+
+_PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
+"""By the identity of the angle's array, as long as that is there."""
+
+
+def path_of(motor_deg: FloatArray, start: Start) -> Path:
+    """`Path.of`; kept for an array that cannot be written to, of which a fit asks it a thousand times."""
+    if motor_deg.flags.writeable:
+        return Path.of(motor_deg, start)
+    key = (id(motor_deg), start is Start.VIRGIN)
+    kept = _PATHS.get(key)
+    if kept is not None and kept[0]() is motor_deg:
+        return kept[1]
+    path = Path.of(motor_deg, start)
+    _PATHS[key] = (weakref.ref(motor_deg, lambda _: _PATHS.pop(key, None)), path)
+    return path
 
 
 def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
@@ -79,18 +125,18 @@ def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[i
     Returns ``turning`` of length b + 1 (first index, each turning point, last index) and ``signs`` of length
     b. A saturated start counts as a direction: going on in it begins no new branch worth telling apart.
     """
-    steps = np.sign(np.diff(motor_deg))
+    steps = np.diff(motor_deg)
     moving = np.flatnonzero(steps)
     if not len(moving):
         return [len(motor_deg) - 1], []
-    held = steps[moving]
-    change = np.flatnonzero(np.diff(held)) + 1
+    forward = steps[moving] > 0.0
+    change = np.flatnonzero(forward[1:] != forward[:-1]) + 1
     turning = [
         0 if start is Start.VIRGIN else int(moving[0]),
         *moving[change].tolist(),
         len(motor_deg) - 1,
     ]
-    return turning, [int(held[0]), *held[change].astype(int).tolist()]
+    return turning, [1 if each else -1 for each in (forward[0], *forward[change].tolist())]
 
 
 class _HysteresisTracker(Tracker):

@@ -103,8 +103,12 @@ def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[
 
 def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
     """Columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
-    angles = np.outer(angle_rad, np.asarray(numbers, dtype=np.float64))
-    return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(angle_rad), -1)
+    result = np.empty((len(angle_rad), 2 * len(numbers)))
+    for at, number in enumerate(numbers):
+        angle = number * angle_rad
+        np.cos(angle, out=result[:, 2 * at])
+        np.sin(angle, out=result[:, 2 * at + 1])
+    return result
 
 
 def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:

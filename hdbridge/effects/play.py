@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from hdbridge.effects.base import FloatArray, Start
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.hysteresis import path_of
 
 
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
@@ -17,21 +17,16 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
     """
     if not len(motor_deg):
         return np.empty(0)
-    turning, _ = branches(motor_deg, start)
+    path = path_of(motor_deg, start)
     gain = 2.0 / width_deg
-    angles = motor_deg[turning].tolist()
     value = float(start.value)
     begin = [value]
-    for last, angle in pairwise(angles):
+    for last, angle in pairwise(path.angles_deg):
         value = min(max(value + gain * (angle - last), -1.0), 1.0)
         begin.append(value)
-    lengths = np.diff(turning)
-    from_value = np.repeat(begin[:-1], lengths)
-    from_angle = np.repeat(angles[:-1], lengths)
     result = np.full(len(motor_deg), float(start.value))
-    result[turning[0] + 1 :] = np.clip(
-        from_value + gain * (motor_deg[turning[0] + 1 :] - from_angle), -1.0, 1.0
-    )
+    from_value = np.repeat(begin[:-1], np.diff(path.turning))
+    result[path.turning[0] + 1 :] = np.clip(from_value + gain * path.away_deg, -1.0, 1.0)
     return result
 
 
