@@ -78,16 +78,19 @@ def resting(recording: Recording, window_s: float) -> FloatArray:
 def provenance(
     paths: Iterable[Path | str],
     recordings: Sequence[Recording],
-    held_out: Mapping[str, Any],
+    held_out: Mapping[str, Any] | str,
 ) -> dict[str, Any]:
-    """What a model file says of where its numbers come from; ``held_out`` is its gain on unseen data."""
+    """What a model file says of where its numbers come from.
+
+    ``held_out`` is its gain on unseen data, or in words why there is none.
+    """
     dates = sorted({each.date for each in recordings if each.date})
     data: dict[str, Any] = {
         "recordings": [str(each) for each in paths],
         "recorded": dates,
         "samples": sum(len(each.record) for each in recordings),
         "versions": versions_here(),
-        "held_out": dict(held_out),
+        "held_out": held_out if isinstance(held_out, str) else dict(held_out),
     }
     return {name: value for name, value in data.items() if value not in ([], {})}
 

@@ -92,12 +92,10 @@ def conclude(
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
     fit = replace(fit, warnings=(*_lost(recordings), *fit.warnings))
-    held_out = {
-        "over": fit.held_out.over,
-        "before_arcsec": fit.held_out.before_arcsec,
-        "after_arcsec": fit.held_out.after_arcsec,
-    }
-    model = with_provenance(fit.model, provenance(recordings, measured, held_out))
+    gain = fit.held_out.gain
+    model = with_provenance(
+        fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)
+    )
     first = measured[0]
     return Calibration(
         recordings=tuple(map(str, recordings)),

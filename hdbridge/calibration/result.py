@@ -48,7 +48,7 @@ class Calibration:
 
     def as_dict(self) -> dict[str, Any]:
         """The contract of ``--json``: schema ``hdbridge.calibration/1``."""
-        fit = self.fit
+        fit, held_out = self.fit, self.fit.held_out
         return {
             "schema": "hdbridge.calibration/1",
             "axis": self.axis,
@@ -107,13 +107,13 @@ class Calibration:
                 "effective_samples": fit.noise.effective_samples,
             },
             "held_out": {
-                "before_arcsec": _number(fit.held_out.before_arcsec),
-                "after_arcsec": _number(fit.held_out.after_arcsec),
-                "fitted_arcsec": _number(fit.held_out.fitted_arcsec),
-                "over": fit.held_out.over,
-                "folds": fit.held_out.folds,
-                "improves": fit.held_out.improves,
-                "text": fit.held_out.text,
+                "before_arcsec": held_out.gain.before_arcsec if held_out.gain else None,
+                "after_arcsec": held_out.gain.after_arcsec if held_out.gain else None,
+                "fitted_arcsec": _number(held_out.fitted_arcsec),
+                "over": held_out.gain.over if held_out.gain else None,
+                "folds": held_out.gain.folds if held_out.gain else 0,
+                "improves": held_out.improves,
+                "text": held_out.text,
             },
             "residual_tests": [
                 {

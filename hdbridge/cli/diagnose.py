@@ -133,12 +133,16 @@ def print_diagnosis(result: Diagnosis) -> None:
             f"{each.probability:.2f}",
             ", ".join(each.aliases),
             f"{each.peak_arcsec:.3g} arcsec",
-            f"{each.before_arcsec:.3g} -> {each.after_arcsec:.3g} arcsec rms",
+            f"{each.gain.before_arcsec:.3g} -> {each.gain.after_arcsec:.3g} arcsec rms"
+            if each.gain
+            else "not made",
             _words(each),
         )
     if result.findings:
         console.print(table)
         for each in result.findings:
+            if refused := each.refusal():
+                console.print(f"not offered, {each.cause}: {refused}")
             if each.experiment:
                 console.print(f"next, for {each.cause}: {each.experiment}")
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from hdbridge.diagnose.experiment import next_experiment
-from hdbridge.diagnose.holdout import held_out
+from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import EXTRAPOLATED, PENALTY, Trail
@@ -92,12 +92,10 @@ def _law(
         gain = held_out(workshop, fitted, old)
         return Finding(
             "hysteresis_memory", 0.95, (), parameters_of(workshop, precise, place, spread),
-            gain.before_arcsec, gain.after_arcsec, next_experiment("hysteresis_memory", ()),
+            gain, next_experiment("hysteresis_memory", ()),
             float(np.quantile(np.abs(apart), 0.998)),
             robust=trail.law_gain, effect=now,
         )  # fmt: skip
-    if type(given) is not type(now):
-        return None
     before, after = values(given), values(now)
     change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
     as_a_whole = change >= max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after)))
@@ -116,11 +114,13 @@ def _law(
     # A loop that obeys neither law may have memory in part of it, or in none.
     aliases = ("hysteresis_memory",) if lawless else ()
     residual = fitted.residual / workshop.weight
-    old_residual = residual + (after - before) - float(np.mean(after - before))
+    apart = after - before - float(np.mean(after - before))
+    taken = math.sqrt(max(float(np.mean((residual + apart) ** 2 - residual**2)), 0.0))
+    moved = values(fitted.theory.effects[place]) - before
     return Finding(
         "hysteresis_parameters", 0.9, aliases, parameters_of(workshop, precise, place, spread),
-        float(np.sqrt(np.mean(old_residual**2))), float(np.sqrt(np.mean(residual**2))),
-        next_experiment("hysteresis_parameters", aliases), max(peak, lawless),
+        held_out_change(workshop, fitted, fitted.places(place), moved),
+        next_experiment("hysteresis_parameters", aliases), max(peak, lawless), taken_arcsec=taken,
         robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
         effect=effect, note="the baseline's own loop takes over the new parameters",
     )  # fmt: skip
@@ -167,6 +167,7 @@ def _orders(
     assert isinstance(now, Synchronous)
     columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     changed: list[MotorOrder] = []
+    which: list[int] = []
     parameters: dict[str, Parameter] = {}
     weight = 0.0
     # Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift.
@@ -191,6 +192,7 @@ def _orders(
             f"order_{old.order}_", np.array([apart.real, -apart.imag]), spread[np.ix_(pair, pair)]
         )
         weight += abs(apart) ** 2
+        which.append(number)
     if not changed:
         return None
     change = now.fitted(now.coefficients() - given.coefficients())
@@ -199,10 +201,12 @@ def _orders(
         return None  # on an arc of their turn orders take any size
     low = {each.order for each in changed} <= {1, 2}
     size = sum(each.amplitude_arcsec for each in changed)
-    residual = float(np.sqrt(np.mean((fitted.residual / workshop.weight) ** 2)))
+    pairs = np.concatenate([columns[2 * number : 2 * number + 2] for number in which])
+    difference = now.model_copy(update={"orders": tuple(changed)})
+    moved = workshop.columns(difference, fitted.theory.start) @ difference.coefficients()
     cause, aliases = ("motor_encoder_eccentricity", ("motor_order",)) if low else ("motor_order", ())
     return Finding(
-        cause, 0.9, aliases, parameters, math.hypot(residual, math.sqrt(0.5 * weight)), residual,
+        cause, 0.9, aliases, parameters, held_out_change(workshop, fitted, pairs, moved),
         next_experiment(cause, aliases), size,
         robust=float(np.sum(workshop.weight**2) * 0.5 * weight),
         effect=MotorEncoderEccentricity.model_construct(orders=tuple(changed)) if low else None,

@@ -11,7 +11,7 @@ from hdbridge.diagnose import changes
 from hdbridge.diagnose.afterthought import reconsidered
 from hdbridge.diagnose.evidence import Leg, gather
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
-from hdbridge.diagnose.extend import extended_model, supported
+from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.gates import Gate, gate
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import ALWAYS, identifiability
@@ -121,21 +121,18 @@ class _Judge:
         findings = [each for each in judged.findings if each.cause not in usual]
         considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
         findings = self._with_unexplained(findings, left)
-        chosen = tuple(
-            place
-            for place in range(base, len(fitted.theory.effects))
-            if fitted.theory.effects[place].name not in usual
-        )
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
-        after = fitted.residual / workshop.weight
+        honest = as_named(workshop, fitted, self.model.effects, {each.cause for each in findings})
+        if honest is not fitted:
+            fitted, spread = honest, covariance(workshop, honest)
         sound = supported(workshop, fitted, self.model.effects)
-        if sound != fitted.theory.effects or usual:
-            fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
-            told = [*sound[:base], *(sound[place] for place in chosen)]
-            after = self._about_zeros(workshop.told(told, fitted.theory.start))
-            fitted = replace(fitted, residual=after * workshop.weight)
+        fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
+        named = {each.cause for each in findings if not each.within}
+        chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
         extended = extended_model(workshop, self.model, fitted, chosen, spread, reason, base)
+        after = self._about_zeros(workshop.told(extended.effects, fitted.theory.start))
+        fitted = replace(fitted, residual=after * workshop.weight)
         points = workshop.evidence.points
         return Diagnosis(
             baseline=_figures(given),
@@ -258,13 +255,14 @@ class _Judge:
             probability=0.5,
             aliases=aliases,
             parameters={},
-            before_arcsec=gain.before_arcsec,
-            after_arcsec=gain.after_arcsec,
+            gain=gain,
             experiment=next_experiment(effect.name, aliases),
             peak_arcsec=self.search.peak(fitted, place),
             robust=own,
             effect=effect,
-            signs=Signs(judged.robust, judged.needed, margin / max(own, 1e-9), gain.recovered),
+            signs=Signs(
+                judged.robust, judged.needed, margin / max(own, 1e-9), gain.recovered if gain else 0.0
+            ),
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[tuple[str, ...], float]:
@@ -310,8 +308,8 @@ class _Judge:
             probability=min(max(1.0 - 0.5 * LEFT_ARCSEC / max(size, 1e-9), 0.5), 0.97),
             aliases=(),
             parameters={},
-            before_arcsec=left.arcsec,
-            after_arcsec=float(np.sqrt(max(left.arcsec**2 - left.explained_arcsec**2, 0.0))),
+            gain=None,
+            left_arcsec=left.arcsec,
             experiment=for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,

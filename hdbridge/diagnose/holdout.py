@@ -1,53 +1,57 @@
 """What a finding gains on data that its fit has not seen: whole stretches of time left out in turn.
 
 Each stretch is left out together with its neighbours in the same fold; everything that is linear near the
-best fit
-(coefficients and, by their tangents, shapes) is refitted on the others, once with the finding and once
-without. All of it is small-matrix algebra on the Gram matrices of the folds.
+best fit (coefficients and, by their tangents, shapes) is refitted on the others, once with the finding and
+once without. Which cause it is, and shapes that were found by search, are those of the whole record.
+All of it is small-matrix algebra on the Gram matrices of the folds.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import FloatArray
+from hdbridge.identify.gain import Gain
 
 FOLDS = 8
 STRETCHES = 64
+OVER = "stretches of time"
 
 
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """Root mean squares on held-out data, arcsec."""
+def held_out(workshop: Workshop, fitted: Fitted, without: Fitted) -> Gain | None:
+    """Leave stretches out in turn; ``without`` is the fit that lacks the effect in question.
 
-    before_arcsec: float
-    after_arcsec: float
-    stretches: int
-    """Stretches of time that were held out."""
-    better: float
-    """Share of them that the finding makes better or leaves alike."""
-
-    @property
-    def recovered(self) -> float:
-        """Share of the variance that the finding takes away."""
-        return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
+    None where the record is too short to leave anything out.
+    """
+    return _gain(workshop, (without.tangent, without.residual), (fitted.tangent, fitted.residual))
 
 
-def held_out(workshop: Workshop, fitted: Fitted, without: Fitted) -> Gain:
-    """Leave stretches out in turn; ``without`` is the fit that lacks the effect in question."""
+def held_out_change(
+    workshop: Workshop, fitted: Fitted, columns: NDArray[np.intp], change_arcsec: FloatArray
+) -> Gain | None:
+    """The same for a change within what the model has.
+
+    Without it these ``columns`` of the tangent stand as they were given, everything else is refitted;
+    ``change_arcsec`` (m,) is what they have changed by.
+    """
+    kept = np.setdiff1d(np.arange(fitted.count()), columns)
+    given = fitted.residual + workshop.weight * change_arcsec
+    return _gain(workshop, (fitted.tangent[:, kept], given), (fitted.tangent, fitted.residual))
+
+
+def _gain(
+    workshop: Workshop, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]
+) -> Gain | None:
+    """From weighted tangents and residuals, each of a best fit or near it."""
     stretch = stretches(workshop)
-    squares = np.bincount(stretch, minlength=int(stretch[-1]) + 1).astype(np.float64)
-    after = _errors(workshop, fitted, stretch)
-    before = _errors(workshop, without, stretch)
-    better = float(np.mean(after <= before * 1.02 + 1e-12))
-    total = float(np.sum(squares))
-    return Gain(
-        float(np.sqrt(np.sum(before) / total)), float(np.sqrt(np.sum(after) / total)), len(squares), better
-    )
+    samples = np.bincount(stretch).astype(np.float64)
+    largest = float(np.max(np.bincount(stretch % FOLDS)))
+    if len(samples) < FOLDS or len(stretch) - largest < after[0].shape[1]:
+        return None
+    squares = [_errors(workshop, tangent, residual, stretch) for tangent, residual in (before, after)]
+    return Gain(OVER, FOLDS, samples, squares[0], squares[1])
 
 
 def stretches(workshop: Workshop) -> NDArray[np.intp]:
@@ -58,9 +62,10 @@ def stretches(workshop: Workshop) -> NDArray[np.intp]:
     return np.asarray(np.unique(number, return_inverse=True)[1])
 
 
-def _errors(workshop: Workshop, fitted: Fitted, stretch: NDArray[np.intp]) -> FloatArray:
+def _errors(
+    workshop: Workshop, tangent: FloatArray, residual: FloatArray, stretch: NDArray[np.intp]
+) -> FloatArray:
     """Sum of squares of each stretch, arcsec squared, with its fold left out of the fit."""
-    tangent, residual = fitted.tangent, fitted.residual
     fold = stretch % FOLDS
     grams, moments = [], []
     for number in range(FOLDS):

@@ -125,7 +125,8 @@ def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
 
     def plain(name: str, i: int) -> Parameter:
         half = NORMAL_95 * float(deviation[i])
-        return Parameter(float(values[i]), unit_of(name), float(values[i]) - half, float(values[i]) + half)
+        value = float(values[i])
+        return Parameter(value, unit_of(name), value - half, value + half, is_size=True)
 
     if isinstance(effect, OrderSeries | SubdivisionalError):
         result: dict[str, Parameter] = {}
@@ -167,7 +168,9 @@ def _lost(
     for i, (step, column) in enumerate(zip(effect.steps, columns, strict=True)):
         half = NORMAL_95 * math.sqrt(max(float(spread[column, column]), 0.0))
         size = step.size_arcsec
-        result[f"step_{i + 1}_size_arcsec"] = Parameter(size, "arcsec", size - half, size + half)
+        result[f"step_{i + 1}_size_arcsec"] = Parameter(
+            size, "arcsec", size - half, size + half, is_size=True
+        )
         first = min(int(np.searchsorted(time_s, step.time_s)), len(time_s) - 1)
         sigmas = max(abs(size) * float(workshop.weight[first]), 1e-9) / max(scatter, 1.0)
         beyond = min(math.ceil(STEP_95 / sigmas**2 - 0.5), len(time_s))
@@ -194,7 +197,7 @@ def polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parame
     )
     return {
         f"{prefix}amplitude_arcsec": Parameter(
-            amplitude, "arcsec", max(amplitude - half, 0.0), amplitude + half
+            amplitude, "arcsec", max(amplitude - half, 0.0), amplitude + half, is_size=True
         ),
         f"{prefix}phase_deg": Parameter(phase, "deg", phase - turn, phase + turn),
     }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hdbridge.diagnose.evidence import means
 from hdbridge.diagnose.probability import Signs
 from hdbridge.effects import Effect, FloatArray, Motion, Start
+from hdbridge.identify.gain import Gain
 from hdbridge.model import TransmissionModel
 
 SCHEMA = "hdbridge.diagnosis/1"
@@ -37,6 +38,8 @@ class Parameter:
     unit: str
     low: float
     high: float
+    is_size: bool = False
+    """Whether it says how large something is: at zero nothing would be there."""
 
     def as_dict(self) -> dict[str, Any]:
         """For machines."""
@@ -54,16 +57,18 @@ class Finding:
     aliases: tuple[str, ...]
     """Other causes that these data cannot tell from it."""
     parameters: Mapping[str, Parameter]
-    before_arcsec: float
-    """Root mean square on held-out data without it, everything else refitted."""
-    after_arcsec: float
-    """... and with it."""
+    gain: Gain | None
+    """On held-out data, everything else refitted; None where nothing was held out."""
     experiment: str
     """What to measure next, in words."""
     peak_arcsec: float
     """Half the span of what it does in this record."""
     robust: float = 0.0
     """Block-robust chi square."""
+    left_arcsec: float = 0.0
+    """Of something unexplained: root mean square that is left beyond the noise."""
+    taken_arcsec: float = 0.0
+    """Of a change within the model: root mean square that it takes away in the fit itself."""
     lives_in: str = ""
     """Of something unexplained: the coordinate over which it shows."""
     note: str = ""
@@ -86,8 +91,8 @@ class Finding:
             "aliases": list(self.aliases),
             "parameters": {name: each.as_dict() for name, each in self.parameters.items()},
             "gain": {
-                "held_out_rms_before_arcsec": _round(self.before_arcsec),
-                "held_out_rms_after_arcsec": _round(self.after_arcsec),
+                "held_out_rms_before_arcsec": _round(self.gain.before_arcsec) if self.gain else None,
+                "held_out_rms_after_arcsec": _round(self.gain.after_arcsec) if self.gain else None,
             },
             "experiment": self.experiment,
             "peak_arcsec": _round(self.peak_arcsec),
@@ -96,7 +101,30 @@ class Finding:
             data["lives_in"] = self.lives_in
         if self.note:
             data["note"] = self.note
+        if refused := self.refusal():
+            data["not_offered"] = refused
         return data
+
+    @property
+    def within(self) -> bool:
+        """Whether it is a change of a part that the model has already."""
+        return self.signs is None and self.cause != "unexplained"
+
+    def refusal(self) -> str:
+        """Why it is not offered as an improvement of the model, in words; empty where nothing is against."""
+        if self.cause == "unexplained":
+            return "there is no law that could be held out or compensated"
+        if self.gain is None:
+            return "nothing was held out: the record is too short to leave any of it out"
+        if self.gain.recovered <= 0.0:
+            return (
+                f"no gain on held-out data, {self.gain.before_arcsec:.3g} to {self.gain.after_arcsec:.3g} "
+                "arcsec rms"
+            )
+        sizes = [each for each in self.parameters.values() if each.is_size]
+        if sizes and all(each.low <= 0.0 <= each.high for each in sizes):
+            return "zero is in the 95 % interval of everything that says how large it is"
+        return ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,7 +137,7 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
         for each in findings
         if each.cause == "hysteresis_parameters"
         and "last reversal" not in left.lives_in
-        and each.before_arcsec**2 - each.after_arcsec**2 < SHADOW * left.arcsec**2
+        and each.taken_arcsec**2 < SHADOW * left.arcsec**2
     ]
     words = [f"{each.cause}: does less than what is left unexplained" for each in doubtful]
     return [each for each in findings if each not in doubtful], words

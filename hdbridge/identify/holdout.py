@@ -10,6 +10,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.identify.beside import is_rounding
 from hdbridge.identify.design import clusters
+from hdbridge.identify.gain import Gain
 from hdbridge.identify.joint import JointFit, Problem, Solution
 from hdbridge.identify.noise import NoiseModel, Precision
 from hdbridge.identify.result import HeldOut
@@ -18,10 +19,6 @@ from hdbridge.identify.segment import Kind
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
-SURE = 2.0
-"""Standard errors by which the fall must be more than nothing."""
-WORTH = 0.01
-"""Share of the squares by which it must fall at least."""
 
 
 def held_out(
@@ -52,29 +49,28 @@ def held_out(
         before[out] = (problem.observed - active_arcsec - shift @ rest)[out]
         used |= out
     weight = blocks.count * used
-    total = float(np.sum(weight))
-    if not total:
-        return HeldOut(math.nan, math.nan, math.nan, 0, over, False, "too little data to leave any out")
-
-    def rms(values: FloatArray) -> float:
-        return math.sqrt(float(weight @ values**2) / total + inside_variance)
-
+    if not np.sum(weight):
+        return HeldOut(None, math.nan, "nothing was held out: there is too little data to leave any out")
     gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
     stretch = clusters(blocks, max(gone / 40, 1e-9))
-    fall = np.bincount(stretch, weight * (before**2 - after**2))
-    mean, count = float(np.mean(fall)), len(fall)
-    error = float(np.std(fall, ddof=1)) / math.sqrt(count) if count > 1 else math.inf
-    share = mean * count / max(total * rms(before) ** 2, 1e-300)
-    improves = mean > SURE * error and share >= WORTH
-    words = "improves on" if improves else "does not improve on"
-    return HeldOut(
-        rms(before),
-        rms(after),
-        rms(solution.residual),
-        len(np.unique(fold[used])),
+
+    def squares(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(stretch, weight * (values**2 + inside_variance)))
+
+    gain = Gain(
         over,
-        improves,
-        f"{words} the active model: {rms(before):.2f} to {rms(after):.2f} arcsec on {over} left out",
+        len(np.unique(fold[used])),
+        np.asarray(np.bincount(stretch, weight)),
+        squares(before),
+        squares(after),
+    )
+    fitted = math.sqrt(float(weight @ solution.residual**2) / float(np.sum(weight)) + inside_variance)
+    result = HeldOut(gain, fitted, "")
+    words = "improves on" if result.improves else "does not improve on"
+    return replace(
+        result,
+        text=f"{words} the active model: {gain.before_arcsec:.2f} to {gain.after_arcsec:.2f} arcsec on "
+        f"{over} left out",
     )
 
 

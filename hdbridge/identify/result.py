@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 
 from hdbridge.effects import FloatArray
+from hdbridge.identify.gain import Gain
 from hdbridge.identify.intervals import Interval
 from hdbridge.identify.noise import NoiseModel
 from hdbridge.identify.orders import Order
 from hdbridge.identify.spectrum import Spectrum
 from hdbridge.model import TransmissionModel
+
+WORTH = 0.01
+"""Share of the squares by which what is left out must fall at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +74,21 @@ class ResidualTest:
 class HeldOut:
     """How well a model fitted to the rest of a record tells the part that was left out."""
 
-    before_arcsec: float
-    """Rms of what the active model (or none) leaves, its zero fitted to the rest too."""
-    after_arcsec: float
+    gain: Gain | None
+    """Against the active model (or none), its zero fitted too; None where nothing was held out."""
     fitted_arcsec: float
     """Rms of the new model on what it was fitted to."""
-    folds: int
-    over: str
-    """What was left out at a time: load turns, motor turns or stretches of time."""
-    improves: bool
-    """True only where the squares left out fall by more than chance, by at least one in a hundred."""
     text: str
+
+    @property
+    def improves(self) -> bool:
+        """True only where the squares left out fall by more than chance, by at least `WORTH` of them."""
+        return self.gain is not None and self.gain.sure and self.gain.recovered >= WORTH
+
+    @property
+    def worse(self) -> bool:
+        """Whether the model leaves more of what was left out than the active one, or none, does."""
+        return self.gain is not None and self.gain.recovered < 0.0
 
 
 @dataclass(frozen=True, slots=True)

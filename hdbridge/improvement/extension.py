@@ -9,6 +9,7 @@ import numpy as np
 
 from hdbridge.diagnose import Diagnosis, Finding
 from hdbridge.effects import CATALOGUE, Channel, Effect, Wear
+from hdbridge.identify.gain import Gain
 from hdbridge.model import TransmissionModel
 from hdbridge.units import DEG_PER_TURN
 
@@ -23,17 +24,17 @@ class Extension:
     left: tuple[str, ...]
     """What is found and not compensated, with the reason."""
 
+    refused: tuple[str, ...] = ()
+    """Changes within the model that must not be offered, with the reason; they cannot be left out of it."""
+
     @property
     def improves(self) -> bool:
-        """Whether every carried finding gains on data that the fit has not seen."""
-        return bool(self.carried) and all(each.after_arcsec < each.before_arcsec for each in self.carried)
+        """Whether all that the model is changed by gains on data that the fit has not seen."""
+        return bool(self.carried) and not self.refused
 
-    def held_out(self) -> str:
-        """The gains in words."""
-        return "; ".join(
-            f"{each.cause} {each.before_arcsec:.3g} to {each.after_arcsec:.3g} arcsec rms"
-            for each in self.carried
-        )
+    def gains(self) -> list[tuple[str, Gain]]:
+        """Of what is carried: cause, and what it gains on held-out data."""
+        return [(each.cause, each.gain) for each in self.carried if each.gain is not None]
 
 
 def extension_of(
@@ -44,6 +45,7 @@ def extension_of(
     A lost count or the phase of a vibration says nothing of tomorrow. What is not compensated but repeats
     (orders of the load of unknown origin) stays in the model, where a person can state its origin. Wear goes
     on from the turns that the motor has run by the end of the record.
+    What does not gain on held-out data, or may be nothing (`Finding.refusal`), is left out.
     ``rivals`` are the causes that each has not been told from (`further.untold`): where one of them must not
     be compensated, what was found is left out too, for it may well be that one.
     """
@@ -51,8 +53,13 @@ def extension_of(
     reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
     carried = tuple(each for each in diagnosis.findings if not reasons[id(each)])
     names = {each.cause for each in carried}
+    refused = tuple(
+        f"{each.cause}: {each.refusal()}" for each in diagnosis.findings if each.within and each.refusal()
+    )
     doubtful = {
-        each.cause for each in diagnosis.findings if each.effect is not None and each.effect.is_compensable()
+        each.cause
+        for each in diagnosis.findings
+        if each.effect is not None and (each.effect.is_compensable() or each.refusal())
     } - names
     turns = _turns_run(diagnosis)
     kept = tuple(
@@ -66,7 +73,8 @@ def extension_of(
         if name in {each.name for each in kept}
     }
     left = tuple(dict.fromkeys(each for each in reasons.values() if each))
-    return Extension(replace(diagnosis.model, effects=kept, uncertainty=uncertainty), carried, left)
+    model = replace(diagnosis.model, effects=kept, uncertainty=uncertainty)
+    return Extension(model, carried, left, refused)
 
 
 def named(findings: Sequence[Finding]) -> str:
@@ -94,6 +102,8 @@ def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
         return (
             f"unexplained, lives in the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
         )
+    if refused := finding.refusal():
+        return f"{finding.cause} is not offered: {refused}"
     # A change of a part that the model has already needs no effect of its own.
     if finding.effect is not None and not finding.effect.is_compensable():
         return f"{finding.cause} is not compensated: {CATALOGUE[finding.cause].compensable.why}"

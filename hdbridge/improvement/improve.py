@@ -194,9 +194,7 @@ def _concluded(
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
     if not extension.improves:
-        return replace(
-            result, offer=Offer(False, f"not offered: no gain on held-out data, {extension.held_out()}")
-        )
+        return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
     model = with_provenance(extension.model, _provenance(result, recording))
     tell("stepping with the active and with the extended model, in turns")
     floor = floor_of(drive.axis, recording)
@@ -231,20 +229,19 @@ def _told(trial: Trial) -> str:
 
 
 def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
-    first = result.extension.carried[0]
-    held_out = {
-        "over": f"stretches of time left out of the fit, without and with {first.cause}",
-        "before_arcsec": first.before_arcsec,
-        "after_arcsec": first.after_arcsec,
-    }
+    cause, gain = result.extension.gains()[0]
+    held_out = gain.as_dict() | {"over": f"{gain.over} left out of the fit, without and with {cause}"}
     found = [
-        {
-            "cause": each.cause,
-            "probability": round(each.probability, 3),
-            "aliases": list(each.aliases),
-            "held_out_before_arcsec": each.before_arcsec,
-            "held_out_after_arcsec": each.after_arcsec,
-        }
+        {"cause": each.cause, "probability": round(each.probability, 3), "aliases": list(each.aliases)}
+        | (
+            {
+                "held_out_before_arcsec": each.gain.before_arcsec,
+                "held_out_after_arcsec": each.gain.after_arcsec,
+            }
+            if each.gain
+            else {}
+        )
+        | ({"not_offered": refused} if (refused := each.refusal()) else {})
         for each in result.diagnosis.findings
     ]
     return {**provenance(result.recordings, [recording], held_out), "found": found}

@@ -120,7 +120,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 def _claim(finding: Finding) -> str:
     """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
-        size = f"{_two(finding.before_arcsec)} arcsec rms beyond the noise"
+        size = f"{_two(finding.left_arcsec)} arcsec rms beyond the noise"
         return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
     name = _title(finding.cause)
     if finding.aliases:
@@ -150,15 +150,15 @@ def _to_do(diagnosis: Diagnosis) -> Section:
 def _found(diagnosis: Diagnosis) -> Section:
     rows: list[list[str | float]] = []
     for number, each in enumerate(diagnosis.findings, 1):
-        gained = 1.0 - (each.after_arcsec / each.before_arcsec) ** 2 if each.before_arcsec > 0.0 else 0.0
         rows.append(
             [
                 f"{number}. {_name(each.cause)}",
                 f"{each.probability:.2f}",
                 "" if each.cause == UNEXPLAINED else each.peak_arcsec,
-                each.before_arcsec,
-                each.after_arcsec,
-                f"{100.0 * gained:.0f} %",
+                each.gain.before_arcsec if each.gain else "not made",
+                each.gain.after_arcsec if each.gain else "",
+                f"{100.0 * each.gain.recovered:.0f} %" if each.gain else "",
+                each.refusal() or "yes",
             ]
         )
     header: list[str | Heading] = [
@@ -168,12 +168,13 @@ def _found(diagnosis: Diagnosis) -> Section:
         Heading("held out, without"),
         Heading("with"),
         Heading("gain", "of the squares"),
+        "offered",
     ]
     return Section(
         "What was found",
         "Size: half the span of what it does in this record. Held out: residual (rms) on stretches of time "
-        "that the fit has not seen, everything else refitted (of something unexplained: beyond the noise). "
-        "Gain: the share of the mean square that goes.",
+        "that the fit has not seen, everything else refitted. Gain: the share of the mean square that goes. "
+        "Offered: whether an improvement of the model may hold it, and if not, why.",
         [Table(header, rows)],
     )
 

@@ -55,7 +55,8 @@ def test_a_hidden_effect_is_named(
     result = diagnosed({cause: effect}, **axis)
     assert names(result)[:1] == [cause]
     found = result.findings[0]
-    assert found.after_arcsec < found.before_arcsec
+    assert found.gain.after_arcsec < found.gain.before_arcsec
+    assert not found.refusal()
     assert found.probability > 0.8
     assert result.extended.rms_arcsec < 1.5 * diagnosed().extended.rms_arcsec + 0.1
 

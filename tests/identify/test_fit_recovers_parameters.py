@@ -52,8 +52,8 @@ def test_the_fitted_model_goes_through_its_file_with_its_uncertainty(standard):
 
 def test_held_out_data_speak_for_the_new_model_against_none(standard):
     assert standard.held_out.improves
-    assert standard.held_out.before_arcsec > 20.0
-    assert standard.held_out.after_arcsec == pytest.approx(0.5, rel=0.1)
+    assert standard.held_out.gain.before_arcsec > 20.0
+    assert standard.held_out.gain.after_arcsec == pytest.approx(0.5, rel=0.1)
 
 
 def test_against_the_true_model_nothing_improves(bench):
@@ -71,7 +71,7 @@ def test_against_the_true_model_nothing_improves(bench):
     )
     result = fit(axis.record(bench.plan()), axis.ratio, replace(bench.options, active=truth))
     assert not result.held_out.improves
-    assert result.held_out.before_arcsec == pytest.approx(0.5, rel=0.1)
+    assert result.held_out.gain.before_arcsec == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(("width", "exponent"), [(7.0, 2.0), (35.0, 2.6), (30.0, 1.25)])

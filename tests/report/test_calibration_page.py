@@ -12,6 +12,7 @@ from hdbridge.calibration import Calibration, Offer
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.evaluation.stepping import Scatter
+from hdbridge.identify.gain import Gain
 from hdbridge.identify.intervals import Interval
 from hdbridge.identify.noise import NoiseModel
 from hdbridge.identify.orders import Order
@@ -81,7 +82,11 @@ def fitted():
             Curve(np.linspace(0.0, 30.0, 301), np.linspace(0.0, 3.0, 301)),
         ),
         residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),
-        held_out=HeldOut(20.0, 1.0, 1.0, 2, "motor turns", True, "improves on no model: 20.0 to 1.0 arcsec"),
+        held_out=HeldOut(
+            Gain("motor turns", 2, np.ones(8), np.full(8, 400.0), np.ones(8)),
+            1.0,
+            "improves on no model: 20.0 to 1.0 arcsec",
+        ),
         traces=traces(),
         warnings=("the width <cannot> be known: no small reversals",),
     )

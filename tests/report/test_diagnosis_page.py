@@ -29,6 +29,7 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.evaluation.stepping import Scatter
+from hdbridge.identify.gain import Gain
 from hdbridge.model import TransmissionModel
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
@@ -85,8 +86,7 @@ def finding(cause="load_order", size=4.0, **more):
         "probability": 0.97,
         "aliases": (),
         "parameters": {"order_1_amplitude_arcsec": Parameter(4.0312, "arcsec", 4.0002, 4.0622)},
-        "before_arcsec": 3.0,
-        "after_arcsec": 0.5,
+        "gain": Gain("stretches of time", 8, np.ones(16), np.full(16, 9.0), np.full(16, 0.25)),
         "experiment": "two slow load turns both ways",
         "peak_arcsec": size,
         "effect": effect,
@@ -96,7 +96,15 @@ def finding(cause="load_order", size=4.0, **more):
 
 def unexplained(lives_in="load angle and direction"):
     return Finding(
-        "unexplained", 0.8, (), {}, 1.2, 0.7, "look closer at the load angle", 1.2, lives_in=lives_in
+        "unexplained",
+        0.8,
+        (),
+        {},
+        None,
+        "look closer at the load angle",
+        1.2,
+        left_arcsec=1.2,
+        lives_in=lives_in,
     )
 
 
@@ -138,6 +146,8 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
             driven,
             np.arange(len(driven)),
             Start.FORWARD,
+            driven,
+            np.arange(len(driven)),
         ),
         considered=("creep: not seen in enough independent stretches",),
     )
@@ -201,7 +211,7 @@ def test_it_says_cause_size_gain_and_what_else_it_could_be(plain):
     assert "0.61 remain, without it 2.90 at best; the noise of a reading is 0.50" in text
     assert "or one that it cannot be distinguished from" in text
     row = re.search(r"1\. load order</th>(.*?)</tr>", plain).group(1)
-    assert re.findall(r">([^<>]+)</td>", row) == ["0.97", "4.00", "3.00", "0.50", "97 %"]
+    assert re.findall(r">([^<>]+)</td>", row) == ["0.97", "4.00", "3.00", "0.50", "97 %", "yes"]
     header = plain[: plain.index("1. load order</th>")].rpartition("<thead>")[2]
     units = dict(re.findall(r'>([\w ,]+) <span class="unit">([\w ]+)<', header))
     assert units["size"] == units["with"] == "arcsec"
