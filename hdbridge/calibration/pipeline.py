@@ -72,7 +72,8 @@ def calibrate(
             f"with {checked.before.model}"
         )
         return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
-    reason = f"calibration {journal.folder.name}: stepping 3 sigma {before:.2f} to {after:.2f} arcsec"
+    figures = (f"stepping 3 sigma {before:.2f} to {after:.2f} arcsec", *checked.worse)
+    reason = f"calibration {journal.folder.name}: {', '.join(figures)}"
     pending = propose(profile, result.model, reason, date, identity_of(drive))
     return _kept(journal.folder, replace(result, offer=Offer(True, reason, pending)))
 

@@ -103,6 +103,7 @@ class Calibration:
                 "standing_arcsec": fit.noise.standing.rms_arcsec if fit.noise.standing else None,
                 "laps_arcsec": fit.noise.laps_arcsec,
                 "residual_arcsec": fit.noise.residual_arcsec,
+                "fitted_arcsec": fit.noise.fitted_arcsec,
                 "samples": fit.noise.samples,
                 "effective_samples": fit.noise.effective_samples,
             },

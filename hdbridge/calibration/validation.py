@@ -85,6 +85,31 @@ class Stepped:
         return cls(data["model"], cw, ccw, pooled, errors, targets)
 
 
+def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
+    """The directions in which a test scatters more after than before, by more than chance, in words.
+
+    Both together may scatter less all the same.
+    """
+    found = []
+    for name, one, other, errors in (
+        ("CW", before.cw, after.cw, after.errors_arcsec[0]),
+        ("CCW", before.ccw, after.ccw, after.errors_arcsec[1]),
+    ):
+        if other.three_sigma_arcsec > _chance(len(errors)) * one.three_sigma_arcsec:
+            found.append(
+                f"worse {name}: 3 sigma {one.three_sigma_arcsec:.2f} to {other.three_sigma_arcsec:.2f} arcsec"
+            )
+    return tuple(found)
+
+
+def _chance(steps: int) -> float:
+    """Factor by which a standard deviation of so many steps must be larger to count as larger.
+
+    Of n steps it is known to 1 / sqrt(2 n) of itself; two are compared.
+    """
+    return 1.0 + CHANCE / math.sqrt(max(steps, 1))
+
+
 @dataclass(frozen=True, slots=True)
 class Validation:
     """The stepping test before and after, and what the axis could do at best."""
@@ -99,10 +124,13 @@ class Validation:
     @property
     def improves(self) -> bool:
         """Whether the axis points no worse with the new model, by more than chance."""
-        # Of n steps a standard deviation is known to 1 / sqrt(2 n) of itself; two are compared.
-        steps = sum(map(len, self.after.errors_arcsec))
-        worse = 1.0 + CHANCE / math.sqrt(steps)
+        worse = _chance(sum(map(len, self.after.errors_arcsec)))
         return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """What got worse in one direction, in words."""
+        return worse_ways(self.before, self.after)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, which `from_dict` reads back."""
@@ -112,6 +140,7 @@ class Validation:
             "floor_arcsec": self.floor.three_sigma_arcsec,
             "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
             "noise_floor_arcsec": self.floor.noise_arcsec,
+            "worse": list(self.worse),
             "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
             "accuracy": {
                 "before": self.accuracy_before.as_dict() if self.accuracy_before else None,

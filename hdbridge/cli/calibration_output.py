@@ -45,7 +45,11 @@ def print_calibration(result: Calibration) -> None:
     print_table(table)
     noise = fit.noise
     standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
-    console.print(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms")
+    console.print(
+        f"noise at rest {standing}, the model leaves {noise.residual_arcsec:.2f} arcsec rms, "
+        f"{noise.fitted_arcsec:.2f} beside what was fitted with it and is no part of it",
+        soft_wrap=True,
+    )
     console.print(f"held out: {escape(fit.held_out.text)}", soft_wrap=True)
     if len(result.drift) > 1:
         errors = [error for _, error in result.drift]
@@ -94,6 +98,7 @@ def _title(result: Calibration) -> str:
 def print_stepping(checked: Validation) -> None:
     """The stepping test with the model before and with the new one, beside the floor of the axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
+    print_worse("stepping", checked.worse)
     _print_accuracy(checked)
     floor = checked.floor
     console.print(
@@ -106,6 +111,12 @@ def print_stepping(checked: Validation) -> None:
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
     """Scatter and mean of stepping tests, a line each."""
     print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
+
+
+def print_worse(test: str, ways: Iterable[str]) -> None:
+    """What got worse in one direction."""
+    for each in ways:
+        console.print(f"{test}: {each}", style="bold", soft_wrap=True)
 
 
 def _print_accuracy(checked: Validation) -> None:

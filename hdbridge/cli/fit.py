@@ -49,6 +49,9 @@ def command(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the model even if it is worse on held-out data.")
+    ] = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -56,6 +59,7 @@ def command(
 
     A CSV file needs the columns `time_s`, `motor_position_deg`, `load_position_deg` (multi-turn);
     `motor_target_deg` helps. Nothing is activated: a fit that shall be used goes to a profile by --out.
+    A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
     recordings = {each: Recording.load(each) for each in records}
@@ -65,16 +69,23 @@ def command(
     if compared and config:
         compared.check_ratio(config)
     found = conclude(recordings, known, compared, axis=config, independent_zeros=independent_zeros)
-    if out is not None:
+    held_out = found.fit.held_out
+    refused = out is not None and held_out.worse and not force
+    if out is not None and not refused:
         found.model.save(out)
     write_json(json_file, found.as_dict())
     if html_file is not None:
         write_calibration_page(html_file, found)
     print_calibration(found)
-    if out is not None:
+    if out is not None and not refused:
         console.print(f"model: {out}", soft_wrap=True)
     if html_file is not None:
         print_page(html_file)
+    if refused:
+        raise InputError(
+            f"{out}: not written: the model is worse on held-out data; it {held_out.text}; record more, or "
+            "write it all the same with --force"
+        )
 
 
 def _ratio(given: float | None, axis: AxisConfig | None, recordings: Mapping[Path, Recording]) -> float:

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from hdbridge.calibration.validation import worse_ways
 from hdbridge.cli.booted import booted
-from hdbridge.cli.calibration_output import print_next, print_page, print_stepping, print_steps
+from hdbridge.cli.calibration_output import print_next, print_page, print_stepping, print_steps, print_worse
 from hdbridge.cli.diagnose import print_diagnosis
 from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
 from hdbridge.cli.options import (
@@ -141,6 +142,7 @@ def report(
     if result.trial is not None:
         print_stepping(result.trial.stepping)
         print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)
+        print_worse("small steps", worse_ways(*result.trial.small))
         if result.trial.of_floor > LEFT_OF_FLOOR:
             console.print(
                 f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Synchronous
-from hdbridge.identify.beside import DELAY, TEXTS, UNITS
+from hdbridge.identify.beside import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.identify.design import Design
 from hdbridge.identify.figures import laps_arcsec, standing
 from hdbridge.identify.holdout import held_out
@@ -50,15 +50,20 @@ def conclude(
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
     inside = _inside_variance(design, solution, problem.beside.columns @ solution.beside)
     samples_used = float(np.sum(blocks.count))
-    residual_rms = math.sqrt(float(blocks.count @ solution.residual**2) / samples_used + inside)
+    fitted_rms = math.sqrt(float(blocks.count @ solution.residual**2) / samples_used + inside)
+    # Samples were put right by the delay, which no model holds.
+    measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
+    written = _about_zeros(design, measured - _sum(design, effects))
+    residual_rms = math.sqrt(float(blocks.count @ written**2) / samples_used + inside)
     ones = np.ones(len(blocks))
     figures = NoiseFigures(
         standing=standing(samples),
         laps_arcsec=laps_arcsec(samples),
         model=state.noise,
         residual_arcsec=residual_rms,
+        fitted_arcsec=fitted_rms,
         samples=int(samples_used),
-        effective_samples=residual_rms**2 * float(ones @ precision.apply(ones)),
+        effective_samples=fitted_rms**2 * float(ones @ precision.apply(ones)),
     )
     further = _further(solution, cov)
     zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
@@ -81,13 +86,13 @@ def conclude(
         residual_tests=residual_tests(
             solution.residual, blocks, precision, lines, {str(each) for each in selection.chosen}, figures
         ),
-        held_out=held_out(problem, solution, state.noise, active, inside),
-        traces=_traces(design, solution, zeros),
+        held_out=held_out(problem, solution, state.noise, active, measured, inside),
+        traces=_traces(design, solution, zeros, written),
         warnings=tuple(warnings),
     )
 
 
-def _traces(design: Design, solution: Solution, zeros: Sequence[float]) -> Traces:
+def _traces(design: Design, solution: Solution, zeros: Sequence[float], left_arcsec: FloatArray) -> Traces:
     """What is drawn: a block all of whose samples were given no weight has no mean to be drawn."""
     blocks, ratio = design.blocks, design.samples.ratio
     used = blocks.count > 0
@@ -100,7 +105,7 @@ def _traces(design: Design, solution: Solution, zeros: Sequence[float]) -> Trace
         kind_index=blocks.kind[used],
         error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
         predicted_arcsec=_sum(design, solution.effects)[used],
-        residual_arcsec=solution.residual[used],
+        residual_arcsec=left_arcsec[used],
     )
 
 
@@ -120,6 +125,14 @@ def _predicted(design: Design, effect: Effect) -> FloatArray:
 
 def _sum(design: Design, effects: tuple[Effect, ...]) -> FloatArray:
     return sum((_predicted(design, each) for each in effects), start=np.zeros(len(design.blocks)))
+
+
+def _about_zeros(design: Design, left_arcsec: FloatArray) -> FloatArray:
+    """What is left of each block about the mean of its absolute zero, shape (b,)."""
+    blocks = design.blocks
+    total = np.bincount(blocks.zero, blocks.count * left_arcsec, design.samples.zeros)
+    count = np.bincount(blocks.zero, blocks.count, design.samples.zeros)
+    return np.asarray(left_arcsec - (total / np.maximum(count, 1e-300))[blocks.zero])
 
 
 def _lines(

@@ -33,7 +33,7 @@ from hdbridge.identify.orders import Selection
 from hdbridge.identify.result import FitResult, Outliers
 from hdbridge.identify.samples import Samples, gather
 from hdbridge.identify.segment import Segment
-from hdbridge.identify.state import State, System, candidate_orders
+from hdbridge.identify.state import State, System, candidate_orders, turns_covered
 from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50
@@ -89,6 +89,11 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     starts = [each.start or Start.FORWARD for each in samples.chains]
     design = Design.of(samples, make_blocks(samples), starts)
     candidates = candidate_orders(design, options)
+    if not candidates:
+        warnings.append(
+            f"orders are not fitted: only {turns_covered(design):.2f} turns of the motor are seen, on which "
+            "they cannot be told from anything else; sweep over a turn or more"
+        )
     waves = harmonics(design, [each.per_motor_turn for each in candidates])
     always = np.concatenate([zeros(design), waves], axis=1)
     weight = design.blocks.count

@@ -9,33 +9,43 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.identify.beside import is_rounding
+from hdbridge.identify.blocks import Blocks
 from hdbridge.identify.design import clusters
 from hdbridge.identify.gain import Gain
-from hdbridge.identify.joint import JointFit, Problem, Solution
+from hdbridge.identify.joint import JointFit, Problem, Solution, is_valid
 from hdbridge.identify.noise import NoiseModel, Precision
 from hdbridge.identify.result import HeldOut
-from hdbridge.identify.samples import KINDS, IntArray
+from hdbridge.identify.samples import KINDS, BoolArray, IntArray
 from hdbridge.identify.segment import Kind
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
+RECORDINGS = "recordings"
+CELL_DEG = 30.0
+SAME_WAY = 0.8
+"""A recording went where others did when so much of it lies in cells of the motor angle that they saw."""
 
 
 def held_out(
-    problem: Problem, solution: Solution, noise: NoiseModel, active_arcsec: FloatArray, inside_variance: float
+    problem: Problem,
+    solution: Solution,
+    noise: NoiseModel,
+    active_arcsec: FloatArray,
+    measured_arcsec: FloatArray,
+    inside_variance: float,
 ) -> HeldOut:
-    """Leave out one fold of whole turns at a time.
+    """Leave out one fold at a time.
 
-    ``active_arcsec`` (b,) is what the active model predicts; ``inside_variance`` is what samples vary inside
-    their blocks, which no model of this kind changes.
+    ``active_arcsec`` (b,) is what the active model predicts; ``measured_arcsec`` (b,) what was measured,
+    before any delay was put right; ``inside_variance`` is what samples vary inside their blocks, which no
+    model of this kind changes.
     """
     blocks = problem.design.blocks
     fold, over = folds(problem)
     # Turns and rounding are noise of the fit, not something that a model could be given.
     problem = replace(problem, beside=problem.beside.without(is_rounding))
     shift = problem.beside.columns
-    before = np.zeros(len(blocks))
-    after = np.zeros(len(blocks))
+    beside, alone = (np.zeros((2, len(blocks))) for _ in range(2))
     used = np.zeros(len(blocks), dtype=bool)
     for number in np.unique(fold).tolist():
         out = fold == number
@@ -43,42 +53,70 @@ def held_out(
         if np.count_nonzero(~out) < 2 * solution.jacobian.shape[1]:
             continue
         fit = JointFit(problem, precision, exact=False).refine(solution.effects, iterations=4)
-        after[out] = fit.residual[out]
-        # The active model has no zero and no nuisances of its own: it is given those that suit it best.
+        # The active model has no nuisances of its own: it is given those that suit it best.
         rest = _least_squares(shift, problem.observed - active_arcsec, precision)
-        before[out] = (problem.observed - active_arcsec - shift @ rest)[out]
+        either = (problem.observed - active_arcsec - shift @ rest, fit.residual)
+        told = (active_arcsec, _told(problem, fit))
+        for row in (0, 1):
+            beside[row, out] = _about_zeros(blocks, either[row], out, known=False)[out]
+            alone[row, out] = _about_zeros(blocks, measured_arcsec - told[row], out, known=True)[out]
         used |= out
     weight = blocks.count * used
     if not np.sum(weight):
-        return HeldOut(None, math.nan, "nothing was held out: there is too little data to leave any out")
+        return HeldOut(
+            None, None, math.nan, "nothing was held out: there is too little data to leave any out"
+        )
     gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
-    stretch = clusters(blocks, max(gone / 40, 1e-9))
+    stretch = blocks.chain if over == RECORDINGS else clusters(blocks, max(gone / 40, 1e-9))
+    number = len(np.unique(fold[used]))
 
-    def squares(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(stretch, weight * (values**2 + inside_variance)))
+    def total(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(stretch, values))
 
-    gain = Gain(
-        over,
-        len(np.unique(fold[used])),
-        np.asarray(np.bincount(stretch, weight)),
-        squares(before),
-        squares(after),
-    )
+    def gain(left: FloatArray) -> Gain:
+        before, after = (total(weight * (each**2 + inside_variance)) for each in left)
+        return Gain(over, number, total(weight), before, after)
+
     fitted = math.sqrt(float(weight @ solution.residual**2) / float(np.sum(weight)) + inside_variance)
-    result = HeldOut(gain, fitted, "")
+    result = HeldOut(gain(alone), gain(beside), fitted, "")
+    assert result.gain is not None
     words = "improves on" if result.improves else "does not improve on"
-    return replace(
-        result,
-        text=f"{words} the active model: {gain.before_arcsec:.2f} to {gain.after_arcsec:.2f} arcsec on "
-        f"{over} left out",
-    )
+    figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"
+    return replace(result, text=f"{words} the active model: {figures} on {over} left out")
+
+
+def _told(problem: Problem, fit: Solution) -> FloatArray:
+    """What the effects of a fit predict, as far as a model can hold them, shape (b,)."""
+    design = problem.design
+    valid = [each for each in fit.effects if is_valid(each)]
+    parts = (design.columns(each, exact=False) @ each.coefficients() for each in valid)
+    return np.asarray(sum(parts, start=np.zeros(len(design.blocks))))
+
+
+def _about_zeros(blocks: Blocks, left_arcsec: FloatArray, out: BoolArray, *, known: bool) -> FloatArray:
+    """About the zeros that the data outside ``out`` have; about its own where a zero is in ``out`` alone.
+
+    ``known`` is False where the former have been taken off already.
+    """
+    result = left_arcsec.copy()
+    for zero in range(int(np.max(blocks.zero)) + 1):
+        rows = blocks.zero == zero
+        inside = rows & ~out
+        lost = not np.any(inside)
+        if lost or known:
+            chosen = rows if lost else inside
+            weight = np.maximum(blocks.count[chosen], 1e-9)
+            result[rows] -= np.average(left_arcsec[chosen], weights=weight)
+    return result
 
 
 def folds(problem: Problem) -> tuple[IntArray, str]:
     """Which fold each block is in, and what is left out in words.
 
     Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
-    reversals) by stretches of time, so that no fold takes all there is to know about a reversal.
+    reversals) by stretches of time, so that no fold takes all there is to know about a reversal. Of several
+    short recordings that went the same way whole ones: what is left in one of them goes on from one
+    stretch to the next, and would be foretold by its neighbours.
     """
     blocks = problem.design.blocks
     lowest = float(np.min(blocks.motor_deg))
@@ -87,10 +125,22 @@ def folds(problem: Problem) -> tuple[IntArray, str]:
     gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
     by_time = clusters(blocks, max(gone / (10 * FOLDS), 1e-9)) % FOLDS
     if turns < 2 * FOLDS:
-        return by_time, "stretches of time"
+        return (blocks.chain % FOLDS, RECORDINGS) if _alike(blocks) else (by_time, "stretches of time")
     local = np.isin(blocks.kind, [KINDS.index(each) for each in (Kind.SINE, Kind.REVERSAL)])
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
     return np.where(local, by_time, by_turn), words
+
+
+def _alike(blocks: Blocks) -> bool:
+    """Whether there are recordings of which nothing is known but that each went where others did."""
+    if not np.all(blocks.kind == KINDS.index(Kind.UNKNOWN)) or int(blocks.chain[-1]) == 0:
+        return False
+    cell = np.floor(blocks.motor_deg / CELL_DEG).astype(np.intp)
+    for chain in range(int(blocks.chain[-1]) + 1):
+        own = blocks.chain == chain
+        if np.any(own) and np.mean(np.isin(cell[own], cell[~own])) < SAME_WAY:
+            return False
+    return True
 
 
 def _least_squares(columns: FloatArray, observed: FloatArray, precision: Precision) -> FloatArray:

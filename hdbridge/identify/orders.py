@@ -141,7 +141,7 @@ def _scores(
     """For each candidate: fall in chi square, amplitude, and the share of it that those inside leave over."""
     active = np.concatenate([np.zeros(0), *(pairs[index] for index in inside)]).astype(np.intp)
     wanted = range(len(pairs)) if only is None else [only]
-    columns = np.concatenate([pairs[index] for index in wanted]).astype(np.intp)
+    columns = np.concatenate([np.zeros(0), *(pairs[index] for index in wanted)]).astype(np.intp)
     explained = solve_symmetric(information[np.ix_(active, active)], information[np.ix_(active, columns)])
     left = information[np.ix_(columns, columns)] - information[np.ix_(columns, active)] @ explained
     score = right[columns] - explained.T @ right[active]

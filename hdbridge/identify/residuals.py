@@ -84,7 +84,7 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
 def _level(figures: NoiseFigures) -> ResidualTest:
     if figures.standing is None:
         return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
-    size = math.sqrt(max(figures.residual_arcsec**2 - figures.standing.rms_arcsec**2, 0.0))
+    size = math.sqrt(max(figures.fitted_arcsec**2 - figures.standing.rms_arcsec**2, 0.0))
     rest = figures.standing.rms_arcsec
-    text = f"{figures.residual_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
+    text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
     return ResidualTest("noise_level", size < max(figures.standing.rms_arcsec, 1.0), size, text)

@@ -43,7 +43,9 @@ class NoiseFigures:
     model: NoiseModel
     """White noise and wanders as the intervals use them, from the residual."""
     residual_arcsec: float
-    """Rms of the residual of a sample."""
+    """Rms that the model, as it is written, leaves of a sample, about its zero."""
+    fitted_arcsec: float
+    """The same beside all that was fitted with it and is not written: delay, rounding, other orders."""
     samples: int
     """Used by the fit."""
     effective_samples: float
@@ -75,15 +77,24 @@ class HeldOut:
     """How well a model fitted to the rest of a record tells the part that was left out."""
 
     gain: Gain | None
-    """Against the active model (or none), its zero fitted too; None where nothing was held out."""
+    """Of the model alone against the active one, or none, each about its zero; None where nothing was held
+    out.
+    """
+    beside: Gain | None
+    """The same with all that is fitted beside the model (delay, orders of the load) taken off of both."""
     fitted_arcsec: float
-    """Rms of the new model on what it was fitted to."""
+    """Rms that the fit leaves of the same data, with all that is fitted beside the model."""
     text: str
 
     @property
     def improves(self) -> bool:
-        """True only where the squares left out fall by more than chance, by at least `WORTH` of them."""
-        return self.gain is not None and self.gain.sure and self.gain.recovered >= WORTH
+        """Whether the model is worth having.
+
+        What it leaves beside the nuisances falls by more than chance, by at least `WORTH` of the squares, and
+        alone it is not worse.
+        """
+        gain = self.beside
+        return gain is not None and gain.sure and gain.recovered >= WORTH and not self.worse
 
     @property
     def worse(self) -> bool:

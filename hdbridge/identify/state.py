@@ -17,6 +17,11 @@ from hdbridge.identify.orders import Family, Order, Selection, select
 from hdbridge.identify.samples import Samples
 from hdbridge.units import DEG_PER_TURN
 
+WHOLE_TURN = 0.95
+"""Turns that count as one."""
+COVERED_DEG = 30.0
+"""A motor angle was seen when some angle within the same cell of this size was."""
+
 System = tuple[FloatArray, FloatArray]
 """J' K^-1 J and J' K^-1 y."""
 
@@ -117,11 +122,18 @@ class State(NamedTuple):
 
 
 def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
-    """Orders to look for: the load's and flexspline's only where the record spans enough of a load turn."""
+    """Orders to look for: what the travel resolves.
+
+    Neighbouring orders are apart from each other, and from all else that varies along the way, from a whole
+    turn on (Rayleigh): orders of the motor need a motor turn, those of load and flexspline enough of a load
+    turn.
+    """
     ratio = design.samples.ratio
+    if turns_covered(design) < WHOLE_TURN:
+        return ()
     turns = float(np.ptp(design.blocks.motor_deg)) / DEG_PER_TURN
     motor = [Order.motor(number) for number in range(1, options.highest_order + 1)]
-    if turns < 0.95 * ratio:
+    if turns < WHOLE_TURN * ratio:
         return tuple(motor)
     numbers = range(1, options.load_orders + 1)
     return (
@@ -129,3 +141,11 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
         *(Order.load(number, ratio) for number in numbers if number < ratio),
         *(Order.flexspline(number, ratio) for number in numbers if number * turns / ratio > 1.5),
     )
+
+
+def turns_covered(design: Design) -> float:
+    """Motor turns of different angles that were seen about one zero."""
+    blocks = design.blocks
+    cell = np.floor(blocks.motor_deg / COVERED_DEG).astype(np.intp)
+    seen = (len(np.unique(cell[blocks.zero == zero])) for zero in range(design.samples.zeros))
+    return max(seen, default=0) * COVERED_DEG / DEG_PER_TURN

@@ -223,9 +223,12 @@ def _concluded(
 def _told(trial: Trial) -> str:
     big = [each.pooled.three_sigma_arcsec for each in (trial.stepping.before, trial.stepping.after)]
     small = [each.pooled.three_sigma_arcsec for each in trial.small]
-    return (
-        f"stepping 3 sigma {big[0]:.2f} to {big[1]:.2f} arcsec, small steps {small[0]:.2f} to {small[1]:.2f}"
+    figures = (
+        f"stepping 3 sigma {big[0]:.2f} to {big[1]:.2f} arcsec",
+        f"small steps {small[0]:.2f} to {small[1]:.2f}",
+        *trial.worse,
     )
+    return ", ".join(figures)
 
 
 def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:

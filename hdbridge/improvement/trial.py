@@ -12,7 +12,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
-from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept
+from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept, worse_ways
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Hysteresis, HysteresisMemory
@@ -50,6 +50,12 @@ class Trial:
         return any(each > CHANCE for each in gains) and all(each > -CHANCE for each in gains)
 
     @property
+    def worse(self) -> tuple[str, ...]:
+        """What got worse in one direction of either test, in words."""
+        small = (f"small steps {each}" for each in worse_ways(*self.small))
+        return (*self.stepping.worse, *small)
+
+    @property
     def of_floor(self) -> float:
         """Three sigma of the stepping test with the extended model over what the axis could do at best."""
         return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
@@ -59,7 +65,11 @@ class Trial:
         before, after = self.small
         return {
             "stepping": self.stepping.as_dict(),
-            "small_steps": {"before": before.as_dict(), "after": after.as_dict()},
+            "small_steps": {
+                "before": before.as_dict(),
+                "after": after.as_dict(),
+                "worse": list(worse_ways(before, after)),
+            },
             "improves": self.improves,
         }
 

@@ -229,7 +229,8 @@ def _residual(result: Calibration) -> Iterator[Block]:
     noise = fit.noise
     yield Facts(
         [
-            ("residual, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
+            ("left by the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
+            ("... beside what was fitted with it", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
                 f"{noise.standing.rms_arcsec:.2f} arcsec" if noise.standing else "not measured",

@@ -11,6 +11,7 @@ import yaml
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.improvement import Trial
 from hdbridge.procedures.stepping import Standing, SteppingOutcome
+from hdbridge.report.validation import stepping_sections
 
 
 def refused(err, *texts):
@@ -100,3 +101,26 @@ NEARLY_AS_NARROW = stepped(*(1.1, -1.0, 0.8, -1.0) * 8)
 )
 def test_better_is_better_somewhere_and_worse_nowhere(big, small, better):
     assert Trial(Validation(*big, Floor(1.0, 0.5)), small).improves is better
+
+
+def both_ways(cw, ccw):
+    places = range(16)
+    stands = [
+        tuple(Standing(float(place), mean + size * (-1) ** place, 0.1) for place in places)
+        for mean, size in (cw, ccw)
+    ]
+    return Stepped.of("a model", SteppingOutcome(cw=stands[0], ccw=stands[1]))
+
+
+def test_what_got_worse_in_one_direction_is_said():
+    """The two ways come together, so the whole is better; the way back alone is not."""
+    before, after = both_ways((20.0, 1.0), (-20.0, 1.0)), both_ways((0.0, 1.0), (0.0, 2.0))
+    checked = Validation(before, after, Floor(1.0, 0.5))
+    assert checked.improves
+    assert checked.worse == ("worse CCW: 3 sigma 3.00 to 6.00 arcsec",)
+    trial = Trial(checked, (after, after))
+    assert trial.worse == checked.worse
+    assert checked.as_dict()["worse"] == list(checked.worse)
+    (section, *_) = stepping_sections(checked)
+    assert "It got worse CCW" in section.text
+    assert Validation(after, before, Floor(1.0, 0.5)).worse == ()

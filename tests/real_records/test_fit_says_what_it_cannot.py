@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from typer.testing import CliRunner
 
 from hdbridge.cli import app
 from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 
@@ -45,3 +48,66 @@ def test_what_cannot_be_told_apart_is_said_in_few_lines(tmp_path: Path, turns: f
     assert 0 < len(said) < 12
     assert any("record both directions" in line for line in said)
     assert any("load turns" in line for line in said)
+
+
+def moves(folder: Path, turns: float, phases_deg: tuple[float, ...], drag: float = 0.0) -> list[str]:
+    """A second of one move, again and again, each with a zero and a phase of its own."""
+    rng = np.random.default_rng(2)
+    part = np.arange(100) / 100.0
+    paths = []
+    for number, phase_deg in enumerate(phases_deg):
+        motor = 100.0 + 360.0 * turns * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+        error = 20.0 * np.cos(np.radians(2.0 * motor + phase_deg)) - drag * np.gradient(motor, 0.01)
+        load = motor / 100.0 + (error + 40.0 * number + rng.standard_normal(100)) / 3600.0
+        columns = {"time_s": part, "motor_position_deg": motor, "load_position_deg": load}
+        Record(columns).write_csv(folder / f"move{number}.csv")
+        paths.append(str(folder / f"move{number}.csv"))
+    return paths
+
+
+def fitted(folder: Path, paths: list[str], *more: str) -> tuple[Any, dict[str, Any], str]:
+    options = ["--ratio", "100", "--independent-zeros", "--json", str(folder / "fit.json")]
+    result = CliRunner().invoke(app, ["fit", *paths, *options, *more])
+    data = json.loads((folder / "fit.json").read_text())
+    return result, data, " ".join(result.output.split())
+
+
+def test_less_than_a_turn_resolves_no_order(tmp_path: Path) -> None:
+    result, data, said = fitted(tmp_path, moves(tmp_path, 0.4, (30.0,) * 3))
+    assert result.exit_code == 0
+    assert not [each for each in data["parameters"] if each["effect"] == "synchronous"]
+    assert "orders are not fitted" in said
+
+
+def test_the_residual_is_what_the_written_model_leaves(tmp_path: Path) -> None:
+    """A drag passes for a delay of one encoder, which is fitted beside the model and no part of it."""
+    paths = moves(tmp_path, 2.0, (30.0,) * 3, drag=0.02)
+    out = tmp_path / "model.yaml"
+    _, data, said = fitted(tmp_path, paths, "--out", str(out))
+    model = TransmissionModel.load(out)
+    left = []
+    for path in paths:
+        record = Record.read_csv(Path(path))
+        error = record.transmission_error_arcsec(100.0) - model.predict(record.motion())
+        left.append(error - np.mean(error))
+    rms = float(np.sqrt(np.mean(np.square(left))))
+    noise, held_out = data["noise"], data["held_out"]
+    assert noise["residual_arcsec"] == pytest.approx(rms, rel=0.2)
+    assert noise["fitted_arcsec"] < 0.5 * rms
+    assert held_out["after_arcsec"] == pytest.approx(rms, rel=0.2)
+    assert held_out["over"] == "recordings"
+    assert f"leaves {noise['residual_arcsec']:.2f} arcsec" in said
+
+
+def test_a_model_that_is_worse_on_what_was_left_out_is_not_written(tmp_path: Path) -> None:
+    """Ripple that has another phase in each recording: any two foretell nothing of the third."""
+    paths = moves(tmp_path, 2.0, (0.0, 90.0, 180.0))
+    out = tmp_path / "model.yaml"
+    result, data, _ = fitted(tmp_path, paths, "--out", str(out))
+    assert data["held_out"]["after_arcsec"] > data["held_out"]["before_arcsec"]
+    assert isinstance(result.exception, InputError)
+    assert "--force" in str(result.exception)
+    assert not out.exists()
+    result, *_ = fitted(tmp_path, paths, "--out", str(out), "--force")
+    assert result.exit_code == 0
+    assert out.exists()

@@ -70,7 +70,7 @@ def fitted():
         ),
         zeros_arcsec=(0.0,),
         nuisances=(Nuisance("delay_ms", "the load encoder is read later by", 0.25, 0.02, "ms"),),
-        noise=NoiseFigures(None, 0.4, NoiseModel(0.3, 0.4), 1.0, 8400, 800.0),
+        noise=NoiseFigures(None, 0.4, NoiseModel(0.3, 0.4), 1.0, 1.0, 8400, 800.0),
         outliers=Outliers(3, 1),
         orders=(ChosenOrder(second, 5.0, 900.0, 16.0),),
         spectrum=Spectrum(
@@ -83,7 +83,7 @@ def fitted():
         ),
         residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),
         held_out=HeldOut(
-            Gain("motor turns", 2, np.ones(8), np.full(8, 400.0), np.ones(8)),
+            *[Gain("motor turns", 2, np.ones(8), np.full(8, 400.0), np.ones(8))] * 2,
             1.0,
             "improves on no model: 20.0 to 1.0 arcsec",
         ),
