@@ -17,6 +17,9 @@ from hdbridge.model.difference import diff
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
 
+TAKEN_OFF = 0.95
+"""What was fitted beside a model (a delay, orders of the load) is told where this share is left, or less."""
+
 
 def print_calibration(result: Calibration) -> None:
     """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
@@ -45,10 +48,11 @@ def print_calibration(result: Calibration) -> None:
     print_table(table)
     noise = fit.noise
     standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
+    apart = ""
+    if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
+        apart = f"; {noise.fitted_arcsec:.2f} with what was fitted beside the model taken off"
     console.print(
-        f"noise at rest {standing}, the model leaves {noise.residual_arcsec:.2f} arcsec rms, "
-        f"{noise.fitted_arcsec:.2f} beside what was fitted with it and is no part of it",
-        soft_wrap=True,
+        f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}", soft_wrap=True
     )
     console.print(f"held out: {escape(fit.held_out.text)}", soft_wrap=True)
     if len(result.drift) > 1:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdbridge.diagnose import Diagnosis
+from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.diagnose.evidence import gather
 from hdbridge.diagnose.holdout import held_out_change
 from hdbridge.diagnose.theory import Theory, Workshop
@@ -86,3 +86,16 @@ def test_nothing_is_held_out_of_something_unexplained(diagnosed: Diagnosed) -> N
     data = first.as_dict()
     assert set(data["gain"].values()) == {None}
     assert data["not_offered"]
+
+
+def test_what_is_not_named_is_not_written(
+    diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
+) -> None:
+    """Several near-equal orders of the flexspline are one unknown, and none of them goes into the model."""
+    orders = {"orders": [(2, 4.0, 30.0), (3, 4.0, 70.0), (5, 4.0, 10.0)]}
+    found = diagnosed({"flexspline_order": orders})
+    assert [each.cause for each in found.findings] == ["unexplained"]
+    assert {each.name for each in found.model.effects} == {"synchronous", "hysteresis"}
+    # What the extended model is said to leave is what it leaves.
+    again = diagnose(Record(columns({"flexspline_order": orders})), found.model)
+    assert found.extended.rms_arcsec == pytest.approx(again.baseline.rms_arcsec, rel=0.01)

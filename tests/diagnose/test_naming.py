@@ -186,7 +186,7 @@ def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagno
 
 def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
     signs = Signs(robust=robust / 10.0, needed=25.0, ahead=0.3, recovered=0.2)
-    return Finding(cause, 0.5, (), {}, 1.0, 0.8, "", peak_arcsec, robust=robust, signs=signs)
+    return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, signs=signs)
 
 
 ALONE = Beside(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)

@@ -27,7 +27,7 @@ def choice_of(left, known, done=()):
 
 
 def found(cause, *aliases, lives_in=""):
-    return Finding(cause, 0.9, aliases, {}, 2.0, 1.0, "", 5.0, lives_in=lives_in)
+    return Finding(cause, 0.9, aliases, {}, None, "", 5.0, lives_in=lives_in)
 
 
 @pytest.fixture(scope="module")

@@ -96,7 +96,7 @@ def test_the_residual_is_what_the_written_model_leaves(tmp_path: Path) -> None:
     assert noise["fitted_arcsec"] < 0.5 * rms
     assert held_out["after_arcsec"] == pytest.approx(rms, rel=0.2)
     assert held_out["over"] == "recordings"
-    assert f"leaves {noise['residual_arcsec']:.2f} arcsec" in said
+    assert f"residual {noise['residual_arcsec']:.2f} arcsec rms; {noise['fitted_arcsec']:.2f} with" in said
 
 
 def test_a_model_that_is_worse_on_what_was_left_out_is_not_written(tmp_path: Path) -> None:
