@@ -140,9 +140,10 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
         if folder.is_dir():
             first = min((each.name for each in folder.iterdir()), default=None)
             if first is not None:
+                begun = "; go on with what was begun there by --resume" * (folder / "recording.yaml").exists()
                 raise InputError(
                     f"{folder}: {output.option} would write into a folder that is not empty (it has "
-                    f"{first}); expected a new or an empty one"
+                    f"{first}); expected a new or an empty one{begun}"
                 )
     for each in inputs:
         if _same(folder, each):
