@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support.command import run_here
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 SHORT = """\
@@ -55,11 +56,9 @@ class Cell:
         )
 
     def run(self, *arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        process = self.start(*arguments)
-        out, err = process.communicate(timeout=240)
-        assert process.returncode == status, err
-        assert "Traceback" not in err
-        return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+        done = run_here(self.folder, *arguments)
+        assert done.returncode == status, done.stderr
+        return done
 
     def calibrate(self, *arguments: object, status: int = 0):
         return self.run("calibrate", "axis", "--simulate", *arguments, status=status)

@@ -1,15 +1,14 @@
-"""The command line as a person uses it: a process, its output and its exit status."""
+"""The command line as a person uses it: its output and its exit status."""
 
-import io
 import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
-
-from hdbridge.cli import main
+from support.command import run_here
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
@@ -17,14 +16,20 @@ PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 @pytest.fixture
 def hdbridge(tmp_path):
     """Run `hdbridge ARGS...` in an empty folder."""
+    return partial(run_here, tmp_path)
 
-    def run(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+
+@pytest.fixture
+def process(tmp_path):
+    """The same in a process of its own, for what is done with its standard output."""
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "hdbridge", *map(str, arguments)],
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=timeout,
+            timeout=120,
             check=False,
         )
 
@@ -48,22 +53,6 @@ def unread(tmp_path):
                 timeout=120,
                 check=False,
             ).stderr
-
-    return run
-
-
-@pytest.fixture
-def here(monkeypatch, capsys, tmp_path):
-    """The same in this process, which spares its start; nobody answers its questions."""
-
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["hdbridge", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.StringIO(""))
-        with pytest.raises(SystemExit) as end:
-            main()
-        out, err = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, end.value.code or 0, out, err)
 
     return run
 

@@ -5,8 +5,8 @@ import json
 from hdbridge.cli import doctor
 
 
-def test_doctor_passes_a_sound_axis(here, tmp_path):
-    done = here("doctor", "article", "--simulate", "--json", "out.json")
+def test_doctor_passes_a_sound_axis(hdbridge, tmp_path):
+    done = hdbridge("doctor", "article", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "all right" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -17,51 +17,51 @@ def test_doctor_passes_a_sound_axis(here, tmp_path):
     assert abs(turn["figures"]["ratio_measured"] - 50) < 0.1
 
 
-def test_doctor_names_the_line_to_change(here, profile, tmp_path):
+def test_doctor_names_the_line_to_change(hdbridge, profile, tmp_path):
     folder = profile(
         "    counts_per_turn: 2880000\n    direction: 1",
         "    counts_per_turn: 2880000\n    direction: -1",
         "truth.yaml",
     )
-    done = here("doctor", folder, "--simulate", "--json", "out.json")
+    done = hdbridge("doctor", folder, "--simulate", "--json", "out.json")
     assert done.returncode == 4
     assert f"-> {folder}/axis.yaml:33:3: load_encoder.direction: found 1, expected -1" in done.stdout
     assert "1 of 18 checks failed, first 'counts, directions, ratio'" in done.stderr
     assert json.loads((tmp_path / "out.json").read_text())["passed"] is False
 
 
-def test_doctor_of_a_broken_file_says_where(here, profile):
+def test_doctor_of_a_broken_file_says_where(hdbridge, profile):
     folder = profile("cycle_ms: 4", "cycle_ms: four")
-    done = here("doctor", folder, "--simulate")
+    done = hdbridge("doctor", folder, "--simulate")
     assert done.returncode == 4
     assert f"{folder}/axis.yaml:" in done.stdout
     assert "drive.cycle_ms" in done.stdout
     assert "not possible  the bus" in done.stdout
 
 
-def test_doctor_without_motion(here):
-    done = here("doctor", "article", "--simulate", "--no-motion")
+def test_doctor_without_motion(hdbridge):
+    done = hdbridge("doctor", "article", "--simulate", "--no-motion")
     assert done.returncode == 0, done.stdout
     assert "left out by --no-motion" in done.stdout
     assert "as far as it can be checked without motion" in done.stdout
 
 
-def test_doctor_on_a_real_bus_without_a_drive(here):
-    done = here("doctor", "article")
+def test_doctor_on_a_real_bus_without_a_drive(hdbridge):
+    done = hdbridge("doctor", "article")
     assert done.returncode == 4
     assert "bus.interface: found virtual" in done.stdout
 
 
-def test_a_real_axis_moves_only_when_somebody_says_so(here, monkeypatch):
+def test_a_real_axis_moves_only_when_somebody_says_so(hdbridge, monkeypatch):
     """The bus is simulated, but the command does not know it."""
     real = doctor.connected
     monkeypatch.setattr(
         doctor, "connected", lambda axis, files, **options: real(axis, files, **{**options, "simulate": True})
     )
-    done = here("doctor", "article")
+    done = hdbridge("doctor", "article")
     assert done.returncode == 4
     assert "Keep the way clear" in done.stderr
     assert "not possible  power on at rest" in done.stdout
     assert "FAIL" not in done.stdout
     assert "motion was not confirmed" in done.stderr
-    assert here("doctor", "article", "--yes").returncode == 0
+    assert hdbridge("doctor", "article", "--yes").returncode == 0

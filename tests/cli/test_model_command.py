@@ -45,22 +45,22 @@ def offset(folder) -> float:
     return effect.parameters()["offset_arcsec"]
 
 
-def test_commit_activate_roll_back_and_log(here, propose, tmp_path):
+def test_commit_activate_roll_back_and_log(hdbridge, propose, tmp_path):
     for each in (41.0, 42.0):
         folder = propose(each)
-        assert here("model", "commit", folder).returncode == 0
+        assert hdbridge("model", "commit", folder).returncode == 0
         assert offset(folder) == each
     assert not (folder / "pending.yaml").exists()
-    assert here("model", "activate", folder, 1, "--reason", "the first was better").returncode == 0
+    assert hdbridge("model", "activate", folder, 1, "--reason", "the first was better").returncode == 0
     assert offset(folder) == 41.0
     for expected in (42.0, 41.0):
-        assert here("model", "rollback", folder, "--reason", "no").returncode == 0
+        assert hdbridge("model", "rollback", folder, "--reason", "no").returncode == 0
         assert offset(folder) == expected
-    done = here("model", "rollback", folder)
+    done = hdbridge("model", "rollback", folder)
     assert done.returncode == 2
     assert "nothing to roll back to" in done.stderr
 
-    done = here("model", "log", folder, "--json", "log.json")
+    done = hdbridge("model", "log", folder, "--json", "log.json")
     assert "the first was better" in done.stdout
     log = json.loads((tmp_path / "log.json").read_text())
     assert log["schema"] == "hdbridge.model-log/1"
@@ -69,35 +69,35 @@ def test_commit_activate_roll_back_and_log(here, propose, tmp_path):
     assert log["models"][1]["reason"] == "offset 41.0"
 
 
-def test_diff_compares_active_and_pending_or_any_two(here, propose, tmp_path):
+def test_diff_compares_active_and_pending_or_any_two(hdbridge, propose, tmp_path):
     folder = propose(41.0)
-    done = here("model", "diff", folder)
+    done = hdbridge("model", "diff", folder)
     assert "no model → pending" in done.stdout
-    here("model", "commit", folder)
+    hdbridge("model", "commit", folder)
     propose(42.5)
-    done = here("model", "diff", folder, "--json", "diff.json")
+    done = hdbridge("model", "diff", folder, "--json", "diff.json")
     assert "+1.500" in done.stdout
     rows = json.loads((tmp_path / "diff.json").read_text())["parameters"]
     changed = [each for each in rows if each["changed"]]
     assert [(each["parameter"], each["before"], each["after"]) for each in changed] == [
         ("offset_arcsec", 41.0, 42.5)
     ]
-    here("model", "commit", folder)
-    assert "-1.500" in here("model", "diff", folder, 2, 1).stdout
-    done = here("model", "diff", folder, 2, 7)
+    hdbridge("model", "commit", folder)
+    assert "-1.500" in hdbridge("model", "diff", folder, 2, 1).stdout
+    done = hdbridge("model", "diff", folder, 2, 7)
     assert done.returncode == 2
     assert "there is no model '7'" in done.stderr
 
 
-def test_discard_leaves_the_active_model(here, propose):
+def test_discard_leaves_the_active_model(hdbridge, propose):
     folder = propose(41.0)
-    here("model", "commit", folder)
+    hdbridge("model", "commit", folder)
     propose(42.0)
-    assert here("model", "discard", folder).returncode == 0
+    assert hdbridge("model", "discard", folder).returncode == 0
     assert not (folder / "pending.yaml").exists()
     assert offset(folder) == 41.0
     for action in ("discard", "commit"):
-        done = here("model", action, folder)
+        done = hdbridge("model", action, folder)
         assert done.returncode == 2
         assert "no pending model" in done.stderr
 
@@ -109,10 +109,10 @@ def test_discard_leaves_the_active_model(here, propose):
         ("name: article", "name: another", "axis"),
     ],
 )
-def test_a_model_of_another_axis_is_not_committed(here, propose, profile, old, new, word):
+def test_a_model_of_another_axis_is_not_committed(hdbridge, propose, profile, old, new, word):
     folder = propose(41.0)
     profile(old, new)
-    done = here("model", "commit", folder)
+    done = hdbridge("model", "commit", folder)
     assert done.returncode == 2
     assert f"provenance.{word}" in done.stderr
     assert not (folder / "model.yaml").exists()

@@ -71,19 +71,19 @@ def bench(tmp_path, profile):
         ("demo --count 2 --out rec", "not empty"),
     ],
 )  # fmt: skip
-def test_what_would_destroy_something_is_refused_before_anything_is_read(here, bench, line, words):
-    done = here(*line.split())
+def test_what_would_destroy_something_is_refused_before_anything_is_read(hdbridge, bench, line, words):
+    done = hdbridge(*line.split())
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert (done.stderr.count("\n"), done.stdout) == (1, "")
     assert bench()
 
 
-def test_a_second_result_takes_the_place_of_the_first(here, tmp_path):
+def test_a_second_result_takes_the_place_of_the_first(hdbridge, tmp_path):
     for _ in range(2):
-        assert here("check", "article", "--json", "out.json").returncode == 0
+        assert hdbridge("check", "article", "--json", "out.json").returncode == 0
     (tmp_path / "empty").touch()  # as mktemp makes it
-    assert here("check", "article", "--json", "empty").returncode == 0
+    assert hdbridge("check", "article", "--json", "empty").returncode == 0
     assert json.loads((tmp_path / "empty").read_text())["axis"] == "article"
 
 
@@ -104,13 +104,13 @@ def test_stepping_twice_into_one_folder_keeps_the_first(hdbridge, tmp_path):
     assert (tmp_path / "kept" / "stepping-none.csv.gz").read_bytes() == first
 
 
-def test_a_minus_is_the_standard_output_and_tables_then_go_to_the_standard_error(hdbridge, tmp_path):
+def test_a_minus_is_the_standard_output_and_tables_then_go_to_the_standard_error(process, tmp_path):
     for place in ("-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
-        done = hdbridge("check", "article", "--json", place)
+        done = process("check", "article", "--json", place)
         assert json.loads(done.stdout if place == "-" else done.stdout.split("\n}\n")[0] + "}")
         assert "all right" in (done.stderr if place == "-" else done.stderr + done.stdout)
     assert not (tmp_path / "-").exists()
-    assert hdbridge("fit", "x.csv", "--json", "-", "--html", "/dev/stdout").returncode == 2
+    assert process("fit", "x.csv", "--json", "-", "--html", "/dev/stdout").returncode == 2
 
 
 def test_a_pipe_is_written_straight_through(hdbridge, tmp_path):
@@ -126,7 +126,7 @@ def test_a_pipe_is_written_straight_through(hdbridge, tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_a_device_is_never_replaced(here, tmp_path):
+def test_a_device_is_never_replaced(hdbridge, tmp_path):
     """A node of its own, as root; for others the terminal's will do, which they cannot replace anyway."""
     device = tmp_path / "null"
     try:
@@ -136,21 +136,21 @@ def test_a_device_is_never_replaced(here, tmp_path):
         device = Path("/dev/null")
         if os.geteuid() == 0:
             pytest.skip("device nodes do not work here")
-    done = here("fit", "article", "--json", device)
+    done = hdbridge("fit", "article", "--json", device)
     assert done.returncode == 2
-    assert here("check", "article", "--json", device).returncode == 0
-    assert here("model", "log", "article", "--json", device).returncode == 0
+    assert hdbridge("check", "article", "--json", device).returncode == 0
+    assert hdbridge("model", "log", "article", "--json", device).returncode == 0
     TransmissionModel(50.0).save(device)
     assert stat.S_ISCHR(device.stat().st_mode)
 
 
-def test_a_socket_is_no_place_for_a_result(here, tmp_path, monkeypatch):
+def test_a_socket_is_no_place_for_a_result(hdbridge, tmp_path, monkeypatch):
     import socket
 
     monkeypatch.chdir(tmp_path)
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind("place")
-        done = here("check", "article", "--json", "place")
+        done = hdbridge("check", "article", "--json", "place")
     assert done.returncode == 2
     assert "neither a file nor a pipe nor a character device" in done.stderr
 
@@ -165,10 +165,10 @@ def test_a_file_that_the_shell_writes_to_already_is_refused(tmp_path):
     assert "standard output goes there already" in done.stderr
 
 
-def test_names_that_lead_nowhere_are_one_line(here, tmp_path):
+def test_names_that_lead_nowhere_are_one_line(hdbridge, tmp_path):
     (tmp_path / "circle").symlink_to(tmp_path / "circle")
     for place, words in (("circle", "circle"), ("x" * 300, "too long"), ("one/two", "no folder")):
-        done = here("check", "article", "--json", place)
+        done = hdbridge("check", "article", "--json", place)
         assert done.returncode == 2
         assert words in done.stderr
         assert done.stderr.count("\n") == 1

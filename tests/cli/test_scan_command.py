@@ -3,8 +3,8 @@
 import json
 
 
-def test_scan_lists_the_drive_and_recognises_it(here, tmp_path):
-    done = here("scan", "article", "--simulate", "--json", "out.json")
+def test_scan_lists_the_drive_and_recognises_it(hdbridge, tmp_path):
+    done = hdbridge("scan", "article", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     for text in ("drive (CiA 402)", "PP, HM, CSP", "node_id: 1", "is the drive of"):
         assert text in done.stdout
@@ -16,28 +16,28 @@ def test_scan_lists_the_drive_and_recognises_it(here, tmp_path):
     assert node["identity"]["vendor_id"] == 0x4844
 
 
-def test_scan_names_the_line_that_differs(here, profile):
+def test_scan_names_the_line_that_differs(hdbridge, profile):
     folder = profile("product_code: 0x402", "product_code: 0x403")
-    done = here("scan", folder, "--simulate")
+    done = hdbridge("scan", folder, "--simulate")
     assert done.returncode == 4
     assert (
         f"{folder}/axis.yaml:16:5: drive.identity.product_code: found 0x403; node 1 says 0x402" in done.stdout
     )
 
 
-def test_scan_of_an_empty_bus_says_what_to_check(here):
-    done = here("scan", "--interface", "virtual", "--channel", "nobody", "--listen", 0, "--timeout-ms", 1)
+def test_scan_of_an_empty_bus_says_what_to_check(hdbridge):
+    done = hdbridge("scan", "--interface", "virtual", "--channel", "nobody", "--listen", 0, "--timeout-ms", 1)
     assert done.returncode == 4
     assert "no node answers; check power, wiring" in done.stderr
 
 
-def test_scan_without_a_bus_is_refused(here):
-    done = here("scan", "--interface", "socketcan")
+def test_scan_without_a_bus_is_refused(hdbridge):
+    done = hdbridge("scan", "--interface", "socketcan")
     assert done.returncode == 2
     assert "--channel" in done.stderr
 
 
-def test_scan_of_a_bus_that_does_not_open(here):
-    done = here("scan", "--interface", "socketcan", "--channel", "absent0")
+def test_scan_of_a_bus_that_does_not_open(hdbridge):
+    done = hdbridge("scan", "--interface", "socketcan", "--channel", "absent0")
     assert done.returncode == 3
     assert "socketcan:absent0" in done.stderr

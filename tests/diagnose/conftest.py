@@ -38,7 +38,12 @@ def model(plant: ModuleType) -> TransmissionModel:
 
 @pytest.fixture(scope="session")
 def diagnosed(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -> Callable[..., Diagnosis]:
+    known: dict[str, Diagnosis] = {}
+
     def run(effects: dict[str, Any] | None = None, seed: int = 1, **axis: Any) -> Diagnosis:
-        return diagnose(Record(columns(effects, seed, **axis)), model)
+        key = repr((effects or {}, seed, axis))
+        if key not in known:  # no record is diagnosed twice
+            known[key] = diagnose(Record(columns(effects, seed, **axis)), model)
+        return known[key]
 
     return run

@@ -1,18 +1,15 @@
 """An axis with a model and something hidden in it, and `hdbridge improve` on its simulated drive."""
 
-import io
 import json
 import random
 import shutil
-import sys
 import time
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+from support.command import run_here
 from support.hidden import Run, hide
 
-from hdbridge.cli import main
 from hdbridge.sim.truth import Truth
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -108,28 +105,22 @@ class Cell:
         return cell
 
 
-def run_here(folder, arguments, status):
-    """In this process, which spares its start."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr(sys, "argv", ["hdbridge", *map(str, arguments)])
-        with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as end:
-            main()
-    assert (end.value.code or 0) == status, err.getvalue()
-    return out.getvalue(), err.getvalue()
+def run(folder, arguments, status):
+    done = run_here(folder, *arguments)
+    assert done.returncode == status, done.stderr
+    return done.stdout, done.stderr
 
 
 @pytest.fixture
 def cell(tmp_path):
     """A cell whose axis has nothing hidden in it yet."""
-    return Cell(tmp_path / "cell", run_here)
+    return Cell(tmp_path / "cell", run)
 
 
 @pytest.fixture(scope="session")
 def improved_once(tmp_path_factory):
     """An axis with an order of the motor hidden in it, improved once for everybody to look at."""
-    cell = Cell(tmp_path_factory.mktemp("improved") / "cell", run_here)
+    cell = Cell(tmp_path_factory.mktemp("improved") / "cell", run)
     cell.hidden = cell.hide("motor_order")
     return cell, *cell.improve("--html", "page.html")
 
