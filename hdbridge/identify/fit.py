@@ -192,7 +192,13 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = joint_fit(state.problem(selection), state.precision())
         system = state.information()
-    return state.after(solution), solution, selection, system, outliers
+    state = state.after(solution)
+    problem = state.problem(selection)
+    if len(problem.beside.names) != len(solution.beside):
+        # The first orders came in last, and what swings with them, or turns that now matter.
+        solution = joint_fit(problem, state.precision())
+        system = state.information()
+    return state, solution, selection, system, outliers
 
 
 def _hold_what_is_unknown(

@@ -111,3 +111,15 @@ def test_a_model_that_is_worse_on_what_was_left_out_is_not_written(tmp_path: Pat
     result, *_ = fitted(tmp_path, paths, "--out", str(out), "--force")
     assert result.exit_code == 0
     assert out.exists()
+
+
+def test_a_vibrating_move_whose_orders_come_in_last_is_fitted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    part = np.arange(100) / 100.0
+    motor = 720.0 * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+    shaken = 5.0 * np.cos(2.0 * np.pi * 20.0 * part + 2.0) + rng.standard_normal(100)
+    load = motor / 100.0 + (2.0 * np.cos(np.radians(2.0 * motor)) + shaken) / 3600.0
+    columns = {"time_s": part, "motor_position_deg": motor, "load_position_deg": load}
+    Record(columns).write_csv(tmp_path / "move.csv")
+    result = CliRunner().invoke(app, ["fit", str(tmp_path / "move.csv"), "--ratio", "100"])
+    assert result.exit_code == 0, result.exception

@@ -215,3 +215,15 @@ def test_a_fit_without_stepping_and_reference_pose_has_a_page_too(plain):
     assert "Stepping test" not in text
     assert "Reference pose" not in charts
     assert len(text) < 1_000_000
+
+
+def test_where_nothing_was_held_out_it_says_so():
+    said = "nothing was held out: there is too little data to leave any out"
+    fit = dataclasses.replace(fitted(), held_out=HeldOut(None, None, float("nan"), said))
+    calibration = dataclasses.replace(result(), fit=fit)
+    text, _ = read(calibration)
+    assert "Nothing was held out" in text
+    data = json.loads(json.dumps(calibration.as_dict(), allow_nan=False))["held_out"]
+    assert (data["before_arcsec"], data["after_arcsec"], data["fitted_arcsec"]) == (None, None, None)
+    assert data["improves"] is False
+    assert data["text"] == said
