@@ -1,3 +1,107 @@
-"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point where it is told."""
+"""hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point where it is told.
+
+These names are the library's front door; docs/api.md describes each, and they change only with a note in the
+changelog. Each is loaded when it is first used: importing hdbridge costs nothing. All else may change without
+notice.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import MappingProxyType, ModuleType
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.calibration import fit
+    from hdbridge.control.bench import Bench
+    from hdbridge.control.compensation import Compensation, Inverse
+    from hdbridge.diagnose import diagnose
+    from hdbridge.drive import Drive, open_bus
+    from hdbridge.errors import (
+        BusError,
+        DriveError,
+        HdbridgeError,
+        IdentityError,
+        InputError,
+        SafetyStop,
+        SdoError,
+        TransitionError,
+    )
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import Stepping
+    from hdbridge.procedures.trajectory import Trajectory
+    from hdbridge.records.record import Record
+    from hdbridge.records.recording import Recording
+    from hdbridge.simulated import simulated
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AxisConfig",
+    "Bench",
+    "BusError",
+    "Compensation",
+    "Drive",
+    "DriveError",
+    "HdbridgeError",
+    "IdentityError",
+    "InputError",
+    "Inverse",
+    "Record",
+    "Recording",
+    "SafetyStop",
+    "SdoError",
+    "Stepping",
+    "Trajectory",
+    "TransitionError",
+    "TransmissionModel",
+    "diagnose",
+    "fit",
+    "open_bus",
+    "simulated",
+]
+
+_MODULES: Final = MappingProxyType(
+    {
+        "AxisConfig": "axis",
+        "Bench": "control.bench",
+        "Compensation": "control.compensation",
+        "Drive": "drive",
+        "Inverse": "control.compensation",
+        "Record": "records.record",
+        "Recording": "records.recording",
+        "Stepping": "procedures.stepping",
+        "Trajectory": "procedures.trajectory",
+        "TransmissionModel": "model",
+        "diagnose": "diagnose",
+        "fit": "calibration",
+        "open_bus": "drive",
+        "simulated": "simulated",
+    }
+)
+"""Where the names are, but for the errors."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'hdbridge' has no attribute '{name}'")
+    found = getattr(import_module(f"hdbridge.{_MODULES.get(name, 'errors')}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _FrontDoor(ModuleType):
+    """Keeps `hdbridge.diagnose` the function: importing the folder of that name would put it there."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (isinstance(value, ModuleType) and name in __all__):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _FrontDoor

@@ -28,7 +28,6 @@ import yaml
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import Calibration, calibrate, start_journal
-from hdbridge.calibration.measure import identity_of
 from hdbridge.drive.drive import Drive
 from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
@@ -127,7 +126,7 @@ def one(job: tuple[int, str, Path | None]) -> Outcome:
             Drive(bus, axis, clock) as drive,
         ):
             drive.boot()
-            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, identity_of(drive))
+            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
             result = calibrate(drive, journal, folder, DATE)
             axis_s = clock.now()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -65,7 +65,7 @@ def from_suite(folder: Path) -> Iterator[Row]:
         hidden = yaml.safe_load(path.read_text(encoding="utf-8"))
         recording = Recording.load(path.parent / "record.csv")
         model = TransmissionModel.load(path.parent / "model.yaml")
-        result = diagnose(recording.record, model, recording.segments, named_from=0.0)
+        result = diagnose(recording, model, named_from=0.0)
         there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
         loop = hidden["kind"] == "other_law"
         yield from judged(

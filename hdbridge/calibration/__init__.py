@@ -8,6 +8,7 @@
 `calibrate` does all four. Bench and drive come in; nothing here knows whether they are simulated.
 """
 
+from hdbridge.calibration.fit import fit
 from hdbridge.calibration.identification import identify, segments_of
 from hdbridge.calibration.journal import Journal
 from hdbridge.calibration.measure import measure, start_journal
@@ -24,6 +25,7 @@ __all__ = [
     "calibrate",
     "conclude",
     "concluded",
+    "fit",
     "identify",
     "measure",
     "segments_of",

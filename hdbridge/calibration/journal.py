@@ -15,12 +15,19 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.control.bench import Leg
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.record import Record
-from hdbridge.records.recording import ABOUT_NAME, HEADER, Recording, RecordingFile, sha256_of, versions_here
+from hdbridge.records.recording import (
+    ABOUT_NAME,
+    HEADER,
+    Recording,
+    RecordingFile,
+    Segment,
+    sha256_of,
+    versions_here,
+)
 
 PAUSE_S = 1.0
 """Between two tasks in the recording's time; the drive is disabled there."""
@@ -146,7 +153,7 @@ class Journal:
         self,
         task: str,
         record: Record,
-        legs: Sequence[Leg],
+        legs: Sequence[Segment],
         *,
         complete: bool,
         lost: tuple[str, ...] = (),

@@ -112,7 +112,7 @@ def measure(
     ``progress`` receives the task's name, the seconds done and those in all. What a task had measured when it
     was stopped (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`) is kept before that is passed on.
     """
-    journal.check_is_of(drive.axis, identity_of(drive))
+    journal.check_is_of(drive.axis, drive.identity)
     left = outlook(journal.plan, drive.axis, journal.done)
     if not left.tasks:
         return
@@ -134,12 +134,5 @@ def measure(
                 )
             raise
         journal.add(
-            task.name, run.record, run.legs, complete=True, lost=lost_channels(drive.axis, run.record)
+            task.name, run.record, run.segments, complete=True, lost=lost_channels(drive.axis, run.record)
         )
-
-
-def identity_of(drive: Drive) -> Identity:
-    """What the booted drive answered."""
-    found = drive.report.identity if drive.report else {}
-    known = drive.axis.drive.identity.model_dump(exclude_none=True)
-    return Identity.model_validate({**known, **found})

@@ -11,7 +11,7 @@ from pathlib import Path
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
 from hdbridge.calibration.journal import Journal, tasks_of
-from hdbridge.calibration.measure import identity_of, measure
+from hdbridge.calibration.measure import measure
 from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
 from hdbridge.drive.drive import Drive
@@ -74,7 +74,7 @@ def calibrate(
         return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
     figures = (f"stepping 3 sigma {before:.2f} to {after:.2f} arcsec", *checked.worse)
     reason = f"calibration {journal.folder.name}: {', '.join(figures)}"
-    pending = propose(profile, result.model, reason, date, identity_of(drive))
+    pending = propose(profile, result.model, reason, date, drive.identity)
     return _kept(journal.folder, replace(result, offer=Offer(True, reason, pending)))
 
 
@@ -150,7 +150,7 @@ def active_model(
         return None
     model = TransmissionModel.load(path)
     try:
-        model.check_bound_to(axis, identity_of(drive))
+        model.check_bound_to(axis, drive.identity)
     except InputError as problem:
         tell(f"not compared with the active model: {problem}")
         return None

@@ -15,13 +15,11 @@ from rich.table import Table
 from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, write_json
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.planned import plan_report
-from hdbridge.diagnose.seeing import seen_over
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
-from hdbridge.records.foreign import check_records, zeros_apart_arcsec
 from hdbridge.records.recording import Recording
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
@@ -78,34 +76,17 @@ def run(
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
-    recording = Recording.load(*records)
-    if recording.ratio is not None and abs(recording.ratio / known.ratio - 1.0) > 1e-9:
-        raise InputError(
-            f"{records[0]}: recorded with ratio {recording.ratio:g}, {model} has {known.ratio:g}; use the "
-            "model of this gear"
-        )
-    parts = recording.record.parts()
-    whole = len(parts) == len(records)
-    check_records(
-        dict(zip(records, parts, strict=True)) if whole else {records[0]: recording.record}, known.ratio
-    )
-    apart = None if independent_zeros else zeros_apart_arcsec(parts, known.ratio)
-    if apart is not None:
-        notes.print(
-            f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
-            "encoders' zeros were lost between them, give --independent-zeros",
-            soft_wrap=True,
-        )
+    recordings = {each: Recording.load(each) for each in records}
     result = diagnose(
-        recording.record,
+        recordings,
         known,
-        recording.segments,
         independent_zeros=independent_zeros,
         progress=lambda words: notes.print(f"{words} ..."),
     )
-    shares = seen_over(result)
+    recording = Recording.joined(list(recordings.values()))
+    document = result.as_dict()
     # Files first: who reads the tables may have had enough of them (`| head`).
-    write_json(json_file, result.as_dict() | {"seen_over": shares})
+    write_json(json_file, document)
     if html_file is not None:
         page = diagnosis_page(
             result,
@@ -120,7 +101,7 @@ def run(
         notes.print(f"wrote {extend}")
     print_diagnosis(result)
     _print_figures(result)
-    _print_shares(shares)
+    _print_shares(document["seen_over"])
 
 
 def print_diagnosis(result: Diagnosis) -> None:

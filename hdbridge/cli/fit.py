@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import conclude
+from hdbridge.calibration import fit
 from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
-from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
-from hdbridge.records.foreign import check_records
 from hdbridge.records.recording import Recording
 
 
@@ -62,13 +59,14 @@ def command(
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
-    recordings = {each: Recording.load(each) for each in records}
-    known = _ratio(ratio, config, recordings)
-    check_records({path: each.record for path, each in recordings.items()}, known)
     compared = TransmissionModel.load(active) if active else None
-    if compared and config:
-        compared.check_ratio(config)
-    found = conclude(recordings, known, compared, axis=config, independent_zeros=independent_zeros)
+    found = fit(
+        {each: Recording.load(each) for each in records},
+        ratio=ratio,
+        axis=config,
+        active=compared,
+        independent_zeros=independent_zeros,
+    )
     held_out = found.fit.held_out
     refused = out is not None and held_out.worse and not force
     if out is not None and not refused:
@@ -86,21 +84,3 @@ def command(
             f"{out}: not written: the model is worse on held-out data; it {held_out.text}; record more, or "
             "write it all the same with --force"
         )
-
-
-def _ratio(given: float | None, axis: AxisConfig | None, recordings: Mapping[Path, Recording]) -> float:
-    """The gear's ratio, from the option, the axis file or the recordings, which must agree."""
-    said = [("--ratio", given), (f"{axis.path}" if axis else "", axis.gear.ratio if axis else None)]
-    said += [(f"{path}", each.ratio) for path, each in recordings.items()]
-    known = [(where, value) for where, value in said if value is not None]
-    if not known:
-        raise InputError(
-            f"{next(iter(recordings))}: the ratio of the gear is not known; give --ratio N or --axis PROFILE"
-        )
-    for where, value in known[1:]:
-        if value != known[0][1]:
-            raise InputError(
-                f"{where} has a ratio of {value:g}, but {known[0][0]} says {known[0][1]:g}; expected one "
-                "gear: correct the wrong one, or leave out the other gear's record"
-            )
-    return known[0][1]

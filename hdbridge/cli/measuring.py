@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import Journal, start_journal
-from hdbridge.calibration.measure import identity_of, outlook
+from hdbridge.calibration.measure import outlook
 from hdbridge.cli.options import notes, progress_bar
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -84,7 +84,7 @@ class Measurement:
         if self.journal is not None:
             return self.journal
         about = {} if simulated_seed is None else {"simulated": True, "seed": simulated_seed}
-        return start_journal(self.folder, self.axis, self.plan, self.date, identity_of(drive), about)
+        return start_journal(self.folder, self.axis, self.plan, self.date, drive.identity, about)
 
 
 @contextmanager

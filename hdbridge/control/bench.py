@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -30,28 +30,26 @@ from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment, versions_here
 
 Outcome = TypeVar("Outcome")
 """The channels that an axis need not have, and their keys in the axis file."""
 _AT_REST = Moment()
 
 
-@dataclass(frozen=True, slots=True)
-class Leg:
-    """One move of a procedure as it was run."""
+class _Leg(NamedTuple):
+    """One move of a procedure as it was run; a `Segment` is made of it when there is time."""
 
     kind: str
     start_s: float
     end_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Run(Generic[Outcome]):
-    """What a procedure gave."""
+@dataclass(frozen=True)
+class Run(Recording, Generic[Outcome]):
+    """The recording of a procedure that has run, and what the procedure gave."""
 
-    outcome: Outcome
-    record: Record
-    legs: tuple[Leg, ...]
+    outcome: Outcome = field(kw_only=True)
 
 
 def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
@@ -107,12 +105,19 @@ class Bench:
     def __init__(
         self,
         drive: Drive,
-        compensation: Compensation | None = None,
+        compensation: Compensation | TransmissionModel | None = None,
         *,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """``interrupted`` is asked in each cycle; a yes stops the axis (KeyboardInterrupt)."""
+        """A model compensates as `compensation_for` makes it, and is refused (InputError) where that refuses.
+
+        ``interrupted`` is asked in each cycle; a yes stops the axis (KeyboardInterrupt).
+        """
         axis = drive.axis
+        if compensation is None:
+            compensation = TransmissionModel(axis.gear.ratio)
+        if isinstance(compensation, TransmissionModel):
+            compensation = compensation_for(axis, compensation)
         self.view = axis_view(axis)
         self.supervision = Supervision()
         self.cycle = Cycle(
@@ -125,13 +130,13 @@ class Bench:
         )
         self._drive = drive
         self._image = drive.image
-        self._compensation = compensation or compensation_for(axis, TransmissionModel(axis.gear.ratio))
+        self._compensation = compensation
         self._interrupted = interrupted
         self._observer = Observer()
         self._sensed = Sensed(axis)
         self._place = 0.0
         self._measured: list[list[Sample]] = []
-        self._legs: list[Leg] = []
+        self._legs: list[_Leg] = []
 
     def run(
         self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None
@@ -158,7 +163,17 @@ class Bench:
             raise
         self._image.power.go(State.SWITCH_ON_DISABLED)
         self._rest()
-        return Run(outcome, self.record(), tuple(self._legs))
+        axis = self._drive.axis
+        return Run(
+            self.record(),
+            self.legs,
+            axis=axis.name,
+            ratio=axis.gear.ratio,
+            drive=self._drive.identity,
+            versions=versions_here(),
+            notes={"procedure": type(procedure).__name__},
+            outcome=outcome,
+        )
 
     def record(self) -> Record:
         """What the present procedure has measured so far.
@@ -178,9 +193,9 @@ class Bench:
         return Record(columns)
 
     @property
-    def legs(self) -> tuple[Leg, ...]:
+    def legs(self) -> tuple[Segment, ...]:
         """The moves that the present procedure has run so far."""
-        return tuple(self._legs)
+        return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
 
     def _enable(self) -> None:
         """Enable the drive by PDO, standing still, and begin from where it stands."""
@@ -297,7 +312,7 @@ class Bench:
         finally:
             if samples:
                 self._measured.append(samples)
-                self._legs.append(Leg(move.kind, samples[0].time_s, samples[-1].time_s))
+                self._legs.append(_Leg(move.kind, samples[0].time_s, samples[-1].time_s))
 
     def _rest(self) -> None:
         """Wait for the drive to stand with power off or in quick stop, then disable it."""

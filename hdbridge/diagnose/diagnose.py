@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.diagnose import changes
 from hdbridge.diagnose.afterthought import reconsidered
-from hdbridge.diagnose.evidence import Leg, gather
+from hdbridge.diagnose.evidence import gather
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.gates import Gate, gate
@@ -39,7 +39,10 @@ from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.model import TransmissionModel
+from hdbridge.records.foreign import check_records, zeros_apart_arcsec
+from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
 
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 NAMED = 0.3
@@ -58,20 +61,25 @@ LOW_SHARE = 0.8
 
 
 def diagnose(
-    record: Record,
+    recording: Given,
     model: TransmissionModel,
-    legs: Sequence[Leg] = (),
     *,
     independent_zeros: bool = False,
     progress: Callable[[str], None] = lambda _: None,
     named_from: float = NAMED,
 ) -> Diagnosis:
-    """Say how the model differs from the record, and why.
+    """Say how the model differs from one or several recordings, and why; ``.as_dict()`` is the document.
 
-    ``legs`` are the segments of a recording, where it has them. Causes that are less probable than
-    ``named_from`` are not named. InputError where the record is too short,
-    contradicts the model's ratio, or lacks a channel that the model needs.
+    ``independent_zeros`` says that the encoders' zeros were lost between them. ``progress`` receives what is
+    being done, in words. Causes that are less probable than ``named_from`` are not named. InputError where a
+    recording is too short, was made by no axis of the model's ratio, or lacks a channel that the model needs.
     """
+    recordings = by_name(recording)
+    agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
+    check_records({name: each.record for name, each in recordings.items()}, model.ratio)
+    whole = Recording.joined(list(recordings.values()))
+    record, legs = whole.record, whole.segments
+    remarks = () if independent_zeros else _of_zeros(record.parts(), model.ratio)
     lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
     for name, channels in lacking.items():
         if channels:
@@ -85,7 +93,19 @@ def diagnose(
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    return _Judge(workshop, search, trail, model, record, named_from).diagnosis()
+    found = _Judge(workshop, search, trail, model, record, named_from).diagnosis()
+    return replace(found, remarks=(*remarks, *found.remarks))
+
+
+def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
+    """A remark where the zeros of the recordings do not agree."""
+    apart = zeros_apart_arcsec(parts, ratio)
+    if apart is None:
+        return ()
+    return (
+        f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
+        "encoders' zeros were lost between them, say so (on the command line: --independent-zeros)",
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hdbridge.diagnose.evidence import means
 from hdbridge.diagnose.probability import Signs
+from hdbridge.diagnose.seeing import seen_over
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.identify.gain import Gain
 from hdbridge.model import TransmissionModel
@@ -221,6 +222,7 @@ class Diagnosis:
             },
             "remarks": list(self.remarks),
             "considered": list(self.considered),
+            "seen_over": seen_over(self),
         }
 
     def verdict(self) -> str:

@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.result import Diagnosis, Traces
 from hdbridge.effects import Channel, FloatArray, Motion
 from hdbridge.effects.base import MEASURED
 from hdbridge.effects.hysteresis import branches
 from hdbridge.units import DEG_PER_TURN
+
+if TYPE_CHECKING:
+    from hdbridge.diagnose.result import Diagnosis, Traces
 
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]

@@ -15,6 +15,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
+from hdbridge.axis import Identity
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
@@ -91,6 +92,12 @@ class Drive:
         self._mode = None
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients).run(reset=reset)
         return self.report
+
+    @property
+    def identity(self) -> Identity:
+        """Which drive it is: what the booted one has answered, else what the axis file expects."""
+        answered = self.report.identity if self.report else {}
+        return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
     def enable(self, mode: Mode = Mode.CSP) -> None:
         """Make ready for power in ``mode``: target = actual position, mode set and seen in 6061h, then power.

@@ -12,7 +12,7 @@ from typing import Any
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import provenance, with_provenance
 from hdbridge.calibration.journal import Journal, tasks_of
-from hdbridge.calibration.measure import identity_of, measure, start_journal
+from hdbridge.calibration.measure import measure, start_journal
 from hdbridge.calibration.pipeline import ACTIVE_NAME, MODEL_NAME
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import floor_of
@@ -68,7 +68,7 @@ def improve(
     model does not gain on held-out data and in stepping. InputError where model or recordings are not of this
     axis and drive.
     """
-    active.check_bound_to(drive.axis, identity_of(drive))
+    active.check_bound_to(drive.axis, drive.identity)
     bench = _Bench(drive, date, progress, interrupted)
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
     paths, recording, apart = _begin(source, bench)
@@ -158,7 +158,7 @@ def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
 
 
 def _diagnosed(recording: Recording, active: TransmissionModel, apart: bool) -> Diagnosis:
-    return diagnose(recording.record, active, recording.segments, independent_zeros=apart)
+    return diagnose(recording, active, independent_zeros=apart)
 
 
 def _journal(
@@ -173,12 +173,12 @@ def _journal(
     axis = bench.drive.axis
     if (folder / ABOUT_NAME).exists():
         journal = Journal.open(folder)
-        journal.check_is_of(axis, identity_of(bench.drive))
+        journal.check_is_of(axis, bench.drive.identity)
         return journal, ()
     choice = choose(diagnosis, rivals, active, axis_view(axis), [each.name for each in plans])
     if choice is None:
         return None, ()
-    return start_journal(folder, axis, choice.plan, bench.date, identity_of(bench.drive)), choice.tells
+    return start_journal(folder, axis, choice.plan, bench.date, bench.drive.identity), choice.tells
 
 
 def _concluded(
@@ -216,7 +216,7 @@ def _concluded(
     if not trial.improves:
         return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
-    pending = propose(profile, model, reason, bench.date, identity_of(drive))
+    pending = propose(profile, model, reason, bench.date, drive.identity)
     return replace(result, offer=Offer(True, reason, pending))
 
 

@@ -94,8 +94,7 @@ class Recording:
         InputError for whatever is wrong with one of them, and for files that have changed since they were
         recorded.
         """
-        parts = [cls._load_one(Path(path)) for path in paths]
-        return parts[0] if len(parts) == 1 else cls._joined(parts)
+        return cls.joined([cls._load_one(Path(path)) for path in paths])
 
     @classmethod
     def _load_one(cls, path: Path) -> Self:
@@ -128,8 +127,10 @@ class Recording:
         )
 
     @classmethod
-    def _joined(cls, parts: Sequence[Self]) -> Self:
-        """One recording; what its parts do not agree about is left open."""
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """One recording, in the order given; what its parts do not agree about is left open."""
+        if len(parts) == 1:
+            return parts[0]
         records = [each.record for each in parts]
         shifts = time_shifts_s(records)
         segments = [

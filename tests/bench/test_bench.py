@@ -109,7 +109,7 @@ def test_the_record_has_what_was_commanded_and_measured(axis, bench_on):
     bench = Bench(drive)
     run = bench.run(Moves(MoveTo(1.0), Dwell(0.2), MoveTo(0.0), Dwell(0.2)))
     record = run.record
-    assert [leg.kind for leg in run.legs] == ["move", "standstill", "move", "standstill"]
+    assert [leg.kind for leg in run.segments] == ["move", "standstill", "move", "standstill"]
     assert np.allclose(np.diff(record.columns["time_s"]), axis.drive.cycle_s)
     assert record.columns["motor_target_deg"].max() == pytest.approx(50.0, abs=0.05)
     assert record.columns["motor_position_deg"].max() == pytest.approx(50.0, abs=0.1)

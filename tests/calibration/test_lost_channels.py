@@ -7,7 +7,6 @@ from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration import measure, start_journal
-from hdbridge.calibration.measure import identity_of
 from hdbridge.drive.drive import Drive
 from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
@@ -27,7 +26,7 @@ def measured(cell, silent_cycles):
         drive.boot()
         date = datetime(2026, 1, 2, tzinfo=UTC)
         plan = Plan.load(str(cell.folder / "short.yaml"))
-        journal = start_journal(cell.folder / "rec", axis, plan, date, identity_of(drive))
+        journal = start_journal(cell.folder / "rec", axis, plan, date, drive.identity)
 
         def each_cycle():
             nonlocal cycles

@@ -89,3 +89,16 @@ def test_examples_of_the_library_run(number, tmp_path, monkeypatch, capsys):
     exec(compile(program, f"docs/api.md, example {number + 1}", "exec"), {"__name__": "__main__"})
     promised = re.findall(r"# -> (.*)$", program, re.MULTILINE)
     assert capsys.readouterr().out.splitlines() == promised
+
+
+def test_the_example_of_the_readme_runs_as_it_stands(monkeypatch, capsys):
+    """From a fresh clone's folder, and no longer than it is meant to be."""
+    (program,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    lines = [each for each in program.splitlines() if each]
+    assert len(lines) <= 8
+    assert sum("import" in each for each in lines) <= 2
+    monkeypatch.chdir(ROOT)
+    exec(compile(program, "README.md, example", "exec"), {"__name__": "__main__"})
+    assert "arcsec" in capsys.readouterr().out

@@ -27,7 +27,7 @@ from hdbridge.procedures.chain import Chain
 from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.stepping import Stepping
-from hdbridge.records.recording import Recording, Segment
+from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from support.hidden import Hidden, Run, hide_all
@@ -143,22 +143,12 @@ class Cell:
 
     def measure(self, parts: Sequence[Procedure[Any]]) -> None:
         """Run the procedures as one and keep them as a recording."""
-        run = Bench(self.drive).run(Chain(tuple(parts), ACCELERATION_DEG_S2))
-        axis = self.drive.axis
-        Recording(
-            run.record,
-            axis=axis.name,
-            ratio=axis.gear.ratio,
-            segments=tuple(
-                Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in run.legs
-            ),
-        ).save(self.recording)
+        Bench(self.drive).run(Chain(tuple(parts), ACCELERATION_DEG_S2)).save(self.recording)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Of the recording folder, against the model file."""
-        recording = Recording.load(self.recording)
-        return diagnose(recording.record, TransmissionModel.load(self.model), recording.segments)
+        return diagnose(Recording.load(self.recording), TransmissionModel.load(self.model))
 
     def step(self, model: TransmissionModel) -> float:
         """Pooled three sigma of the load error at rest with a model, arcsec."""

@@ -1,0 +1,36 @@
+"""A model from recordings alone: hdbridge's own, or anybody's."""
+
+from __future__ import annotations
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration.pipeline import conclude
+from hdbridge.calibration.result import Calibration
+from hdbridge.model import TransmissionModel
+from hdbridge.records.foreign import check_records
+from hdbridge.records.given import Given, agreed_ratio, by_name
+
+
+def fit(
+    recording: Given,
+    *,
+    ratio: float | None = None,
+    axis: AxisConfig | None = None,
+    active: TransmissionModel | None = None,
+    independent_zeros: bool = False,
+) -> Calibration:
+    """Fit a model to one or several recordings; ``.model`` is the model, ``.as_dict()`` the document.
+
+    ``ratio`` (motor turns per load turn) is needed where neither the recordings nor ``axis`` say it; with
+    ``axis`` the model is bound to it. ``active`` is the model to compare with and to fall back on.
+    ``independent_zeros`` says that the encoders' zeros were lost between the recordings.
+
+    InputError where a recording cannot be used, is of another gear, or was made by no axis; what the data
+    leave open stands in ``.fit.warnings``.
+    """
+    recordings = by_name(recording)
+    said = [("ratio", ratio), (str(axis.path), axis.gear.ratio) if axis else ("axis", None)]
+    known = agreed_ratio(recordings, said)
+    check_records({name: each.record for name, each in recordings.items()}, known)
+    if active and axis:
+        active.check_ratio(axis)
+    return conclude(recordings, known, active, axis=axis, independent_zeros=independent_zeros)

@@ -1,0 +1,51 @@
+"""What `fit` and `diagnose` may be given as a measurement: one or several records or recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from hdbridge.errors import InputError
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
+
+Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Recording]
+"""In the order of their time; a mapping says what messages call each."""
+
+
+def by_name(given: Given) -> dict[Path, Recording]:
+    """Each recording by what messages call it: its file, or its number. InputError where there is none."""
+    if isinstance(given, Mapping):
+        named = dict(given)
+    else:
+        several = [given] if isinstance(given, Record | Recording) else list(given)
+        recordings = [Recording(each) if isinstance(each, Record) else each for each in several]
+        sources = [each.record.source for each in recordings]
+        named = {
+            Path(source if source and sources.count(source) == 1 else f"recording {number}"): each
+            for number, (source, each) in enumerate(zip(sources, recordings, strict=True), 1)
+        }
+    if not named:
+        raise InputError("no recording; give at least one Record or Recording")
+    return named
+
+
+def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
+    """The gear's ratio, from what is ``said`` of it (where, and what) and the recordings, which must agree.
+
+    InputError where they do not, or where nobody says it.
+    """
+    said = [*said, *((f"{name}", each.ratio) for name, each in recordings.items())]
+    known = [(where, value) for where, value in said if value is not None]
+    if not known:
+        raise InputError(
+            f"{next(iter(recordings))}: the ratio of the gear is not known; say it, or name the axis (on the "
+            "command line: --ratio N or --axis PROFILE)"
+        )
+    for where, value in known[1:]:
+        if abs(value / known[0][1] - 1.0) > 1e-9:
+            raise InputError(
+                f"{where} has a ratio of {value:g}, but {known[0][0]} says {known[0][1]:g}; expected one "
+                "gear: correct the wrong one, or leave out the other gear's record"
+            )
+    return known[0][1]

@@ -1,0 +1,46 @@
+"""`import hdbridge`: the names that a user needs, and nothing loaded before it is used."""
+
+import subprocess
+import sys
+
+import pytest
+
+import hdbridge
+
+
+def python(program: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120
+    ).stdout.strip()
+
+
+def test_importing_it_loads_nothing():
+    heavy = "[each for each in sys.modules if each.startswith(('hdbridge.', 'numpy'))]"
+    assert python(f"import hdbridge, sys; print({heavy})") == "[]"
+
+
+@pytest.mark.parametrize("name", hdbridge.__all__)
+def test_every_name_is_there_and_says_what_it_is(name):
+    found = getattr(hdbridge, name)
+    assert found.__name__ == name
+    assert found.__doc__
+    assert name in dir(hdbridge)
+
+
+def test_another_name_is_refused_as_python_does():
+    with pytest.raises(AttributeError, match="no attribute 'Brench'"):
+        hdbridge.Brench  # noqa: B018
+
+
+@pytest.mark.parametrize("name", ["diagnose", "simulated"])
+def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
+    """The import system would put the module in its place, whichever comes first."""
+    assert python(f"import hdbridge.{name}\nprint(type(hdbridge.{name}).__name__)") == "function"
+    assert (
+        python(f"import hdbridge\nhdbridge.{name}\nfrom hdbridge import {name}\nprint({name}.__name__)")
+        == name
+    )
+
+
+def test_the_folder_of_a_function_can_still_be_imported():
+    assert python("from hdbridge.diagnose.result import Diagnosis; print(Diagnosis.__name__)") == "Diagnosis"

@@ -1,0 +1,82 @@
+"""What a bench has measured goes straight into a file, a fit and a diagnosis, which check it."""
+
+import numpy as np
+import pytest
+
+from hdbridge import AxisConfig, InputError, Record, Recording, TransmissionModel, diagnose, fit, simulated
+
+
+@pytest.fixture(scope="module")
+def fitted(run):
+    return fit(run)
+
+
+def changed(record, **columns):
+    return Record({**record.columns, **columns})
+
+
+def test_a_run_is_a_recording_with_its_legs(run, axis, tmp_path):
+    run.save(tmp_path / "kept")
+    kept = Recording.load(tmp_path / "kept")
+    assert kept.record == run.record
+    assert kept.segments == run.segments
+    assert {each.kind for each in kept.segments} == {"move", "sweep", "sine"}
+    assert (kept.axis, kept.ratio) == (axis.name, axis.gear.ratio)
+    assert kept.drive.vendor_id == axis.drive.identity.vendor_id
+    assert "hdbridge" in kept.versions
+
+
+def test_a_fit_of_a_run_is_the_model_and_the_document_of_the_command(fitted, run):
+    document = fitted.as_dict()
+    assert document["schema"] == "hdbridge.calibration/1"
+    assert document["axis"] == run.axis
+    assert {each.name for each in fitted.model.effects} == {"synchronous", "hysteresis"}
+
+
+def test_a_diagnosis_of_a_run_is_the_document_of_the_command(run, fitted):
+    document = diagnose(run, fitted.model).as_dict()
+    assert document["schema"] == "hdbridge.diagnosis/1"
+    assert "motor angle" in document["seen_over"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "complaint"),
+    [
+        (lambda record: changed(record, time_s=np.zeros(len(record))), "time that passes"),
+        (lambda record: changed(record, load_position_deg=np.radians(record.load_position_deg)), "radians"),
+        (lambda record: changed(record, motor_position_deg=np.zeros(len(record))), "never moves"),
+        (
+            lambda record: changed(record, load_position_deg=(record.load_position_deg - 5) % 360),
+            "multi-turn",
+        ),
+    ],
+)
+def test_what_no_axis_can_have_made_is_refused_by_both(run, model, axis, spoil, complaint):
+    spoilt = spoil(run.record)
+    with pytest.raises(InputError, match=complaint):
+        fit(spoilt, axis=axis)
+    with pytest.raises(InputError, match=complaint):
+        diagnose([run, spoilt] if "never" not in complaint else spoilt, model)
+
+
+def test_another_gear_is_refused(run):
+    with pytest.raises(InputError, match="recording 1 has a ratio of 50, but ratio says 100"):
+        fit(run, ratio=100)
+    with pytest.raises(InputError, match="has a ratio of 50, but the model says 100"):
+        diagnose(run, TransmissionModel(100.0))
+
+
+def test_a_bare_record_needs_a_ratio(run):
+    with pytest.raises(InputError, match="the ratio of the gear is not known"):
+        fit(run.record)
+
+
+def test_no_recording_is_refused(model):
+    with pytest.raises(InputError, match="no recording"):
+        diagnose([], model)
+
+
+def test_a_simulated_axis_without_a_truth_is_refused(axis, tmp_path):
+    (tmp_path / "axis.yaml").write_text(axis.path.read_text())
+    with pytest.raises(InputError, match=r"truth\.yaml"), simulated(AxisConfig.load(tmp_path)):
+        pass
