@@ -6,6 +6,8 @@ bus; 4 the drive; 5 the supervision stopped the axis; 130 Ctrl-C (the axis was s
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 from importlib import import_module
@@ -16,7 +18,8 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from hdbridge import __version__
-from hdbridge.errors import HdbridgeError
+from hdbridge.cli import plain, usage
+from hdbridge.errors import HdbridgeError, InputError
 
 PANELS: Final = {
     "Without hardware": {
@@ -118,14 +121,38 @@ def _hdbridge(
 
 def main() -> None:
     """Run the command line; errors raised on purpose are one line and their exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=plain.HANDLER)
     try:
-        app()
+        status = app(standalone_mode=False)
+        sys.stdout.flush()
     except HdbridgeError as error:
         print(f"hdbridge: {error}", file=sys.stderr)
-        sys.exit(error.exit_status)
+        status = error.exit_status
+    except usage.UsageError as error:
+        if usage.asks_for_help(error):
+            print(error.format_message())
+        else:
+            print(f"hdbridge: {usage.refusal(error)}", file=sys.stderr)
+        status = InputError.exit_status
+    except typer.Abort:
+        status = 130
     except BrokenPipeError:  # `hdbridge ... | head`: who reads has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        _close_output()
+        status = 0
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        _close_output()
+        print(f"hdbridge: the standard output cannot be written: {error.strerror}", file=sys.stderr)
+        status = InputError.exit_status
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _close_output() -> None:
+    """What is left in the buffer cannot be written, and must not fail again when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

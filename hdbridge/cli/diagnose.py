@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +12,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, write_json
-from hdbridge.diagnose import Diagnosis, Finding, diagnose
+from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, print_table, write_json
+from hdbridge.diagnose import Diagnosis, Finding, Parameter, diagnose
 from hdbridge.diagnose.planned import plan_report
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
@@ -106,28 +106,48 @@ def run(
 
 def print_diagnosis(result: Diagnosis) -> None:
     """Verdict, findings, the next experiments, and what was not named."""
-    console.print(result.verdict())
-    table = Table("cause", "probability", "or", "size", "held out", "parameters")
-    for each in result.findings:
-        table.add_row(
-            each.cause if not each.lives_in else f"{each.cause} (lives in {each.lives_in})",
-            f"{each.probability:.2f}",
-            ", ".join(each.aliases),
-            f"{each.peak_arcsec:.3g} arcsec",
-            f"{each.gain.before_arcsec:.3g} -> {each.gain.after_arcsec:.3g} arcsec rms"
-            if each.gain
-            else "not made",
-            _words(each),
-        )
+    _say(result.verdict())
     if result.findings:
-        console.print(table)
+        table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
         for each in result.findings:
-            if refused := each.refusal():
-                console.print(f"not offered, {each.cause}: {refused}")
-            if each.experiment:
-                console.print(f"next, for {each.cause}: {each.experiment}")
+            table.add_row(
+                each.cause,
+                f"{each.probability:.2f}",
+                f"{each.peak_arcsec:.3g}",
+                f"{each.gain.before_arcsec:.3g} -> {each.gain.after_arcsec:.3g}" if each.gain else "not made",
+            )
+        print_table(table)
+    for each in result.findings:
+        for line in _details(each):
+            _say(line)
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
-        notes.print(remark)
+        notes.print(remark, markup=False, soft_wrap=True)
+
+
+def _details(finding: Finding) -> Iterator[str]:
+    """What is known of a finding beside its line in the table; nothing for one that says nothing more."""
+    said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
+    if finding.aliases:
+        said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
+    if finding.lives_in:
+        said.insert(0, f"depends on the {finding.lives_in}")
+    if refused := finding.refusal():
+        said.append(f"not offered: {refused}")
+    if finding.experiment:
+        said.append(f"measure next: {finding.experiment}")
+    if said:
+        yield f"{finding.cause}:"
+        yield from (f"  {each}" for each in said)
+
+
+def _number(parameter: Parameter) -> str:
+    low, high = f"{parameter.low:.4g}", f"{parameter.high:.4g}"
+    return f"{parameter.value:.4g} ({low} to {high}) {parameter.unit}".rstrip()
+
+
+def _say(line: str) -> None:
+    """A line as it is: whole in a pipe, and nothing in it is markup."""
+    console.print(line, markup=False, soft_wrap=True)
 
 
 def _print_figures(result: Diagnosis) -> None:
@@ -139,7 +159,7 @@ def _print_figures(result: Diagnosis) -> None:
     for name, pair in rows.items():
         figures = [value for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)]
         table.add_row(escape(name), *(f"{value:.2f}" for value in figures))
-    console.print(table)
+    print_table(table)
 
 
 def _print_shares(shares: dict[str, dict[str, float]]) -> None:
@@ -151,7 +171,7 @@ def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     for name, each in ranked:
         if max(each.values()) >= WORTH_TELLING:
             table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
-    console.print(table)
+    print_table(table)
 
 
 def _title(recording: Recording, records: Sequence[Path]) -> str:
@@ -171,13 +191,6 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
     return [*rows, ("samples", f"{len(recording.record):,} in {np.ptp(recording.record.time_s):,.0f} s")]
 
 
-def _words(finding: Finding) -> str:
-    return "\n".join(
-        f"{name} {each.value:.4g} ({each.low:.4g} to {each.high:.4g}) {each.unit}"
-        for name, each in finding.parameters.items()
-    )
-
-
 def _print_plan(report: dict[str, Any]) -> None:
     table = Table("cause", "detected from", "not told from")
     for name, each in report["identifiability"].items():
@@ -186,6 +199,6 @@ def _print_plan(report: dict[str, Any]) -> None:
             f"{limit:.2g} arcsec" if each["detectable"] else f"no: {each.get('reason') or 'limit too high'}"
         )
         table.add_row(name, words, ", ".join(each["aliases"]))
-    console.print(table)
+    print_table(table)
     for note in report["notes"]:
-        notes.print(note)
+        notes.print(note, markup=False, soft_wrap=True)

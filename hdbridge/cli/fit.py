@@ -11,6 +11,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration import fit
 from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
+from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording

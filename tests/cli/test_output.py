@@ -109,3 +109,31 @@ def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path, slow, argum
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert errors == ""
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+def test_a_terminal_that_lacks_a_character_gets_another(tmp_path, encoding):
+    shown = command(
+        *("step", "article", "--simulate", "--count", 2, "--scheme", "none"),
+        env={**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"},
+        cwd=tmp_path,
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "CW 3s" in shown.stdout
+
+
+def test_a_full_standard_output_ends_in_one_line(tmp_path):
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        done = subprocess.run(
+            [sys.executable, "-m", "hdbridge", "check", "article"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=120,
+            check=False,
+            cwd=tmp_path,
+        )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "hdbridge: the standard output cannot be written: No space left on device"
+    ]

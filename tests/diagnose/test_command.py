@@ -42,6 +42,11 @@ def test_it_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_
     assert max(shares, key=lambda name: shares[name]) == "motor angle"
     assert "motor angle" in result.output
     assert "Diagnosis of record.csv.gz" in page.read_text()
+    # In a pipe as in a terminal of 80 columns: what is printed is whole, and a table does not wrap.
+    tables = [line for line in result.output.splitlines() if line[:1] in "│┃┏└┡"]
+    assert max(map(len, tables)) <= 80
+    assert "…" not in result.output
+    assert "order_5_amplitude_arcsec" in result.output
 
 
 @pytest.mark.parametrize(

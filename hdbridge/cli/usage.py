@@ -1,0 +1,81 @@
+"""A command line that is refused, in the one line that every error of hdbridge is."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import typer
+
+from hdbridge.files.expectation import nearest, one_line
+
+UsageError: Any = typer.BadParameter.__mro__[1]
+"""What is wrong with a command line. typer has it from click or brings its own; it exports only an heir."""
+_KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
+
+
+def refusal(error: Any) -> str:
+    """One line: the option, what was found, what is expected, and where all of them are listed."""
+    context = getattr(error, "ctx", None)
+    line = _about_value(error) or _about_line(error)
+    path = getattr(context, "command_path", "hdbridge")
+    return one_line(f"{line}; see {path} --help")
+
+
+def asks_for_help(error: Any) -> bool:
+    """Whether the line only lacks a command, and the error's text is the help."""
+    return type(error).__name__ == "NoArgsIsHelpError"
+
+
+def _about_value(error: Any) -> str | None:
+    """Of a value that does not suit its option: what was found and expected, as of a key in a file."""
+    param, cause = getattr(error, "param", None), error.__cause__
+    if param is None or not hasattr(cause, "errors"):
+        return None
+    first = cause.errors()[0]
+    found, kind = first["input"], str(first["type"]).split("_")[0]
+    choices = re.findall(r"'([^']*)'", str(first["msg"]).partition("not one of")[2])
+    if choices:
+        close = nearest(str(found), choices)
+        expected = " or ".join(choices) + (f" (did you mean {close}?)" if close else "")
+    else:
+        expected = _KINDS.get(kind) or ("an integer" if isinstance(found, int) else "a number")
+        expected += _range(getattr(param, "min", None), getattr(param, "max", None))
+    return f"{_name(param)}: found {str(found)!r}; expected {expected}"
+
+
+def _about_line(error: Any) -> str:
+    """Of a line that has too much or too little."""
+    message = str(error.format_message()).strip().rstrip(".")
+    option = getattr(error, "option_name", None)
+    possible = getattr(error, "possibilities", None)
+    if option is not None and "requires" in message:
+        return f"{option}: a value is missing"
+    if option is not None:
+        close = nearest(option, possible) if possible else None
+        return f"{option}: no such option" + (f" (did you mean {close}?)" if close else "")
+    if message.startswith("Missing"):
+        param = getattr(error, "param", None)
+        return f"{_name(param)}: is missing" if param is not None else message
+    extra = re.search(r"extra arguments?(?:\(s\))? \((.*)\)", message)
+    if extra:
+        return f"{extra[1]!r}: expected no further argument"
+    unknown = re.match(r"No such command ('.*?')\.?(?: Did you mean (.*)\?)?$", message)
+    if unknown:
+        return f"{unknown[1]}: no such command" + (f" (did you mean {unknown[2]}?)" if unknown[2] else "")
+    return message
+
+
+def _name(param: Any) -> str:
+    """As it is typed: --count, PROFILE."""
+    if param.param_type_name == "option":
+        return str(max(param.opts, key=len))
+    return str(param.metavar or param.name.upper()).removesuffix("...").strip("[]{}")
+
+
+def _range(low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        return f" from {low:.10g} to {high:.10g}"
+    if low is not None:
+        return f" of at least {low:.10g}"
+    return "" if high is None else f" of at most {high:.10g}"

@@ -1,0 +1,42 @@
+"""A command line that is refused: one line, as for a wrong file, with what was given."""
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ("step", "article", "--count", "abc"),
+            "--count: found 'abc'; expected an integer from 2 to 100000; see hdbridge step --help",
+        ),
+        (("step", "article", "--count", 1), "--count: found '1'; expected a number from 2 to 100000"),
+        (("latency", "--duration", "soon"), "--duration: found 'soon'; expected a number from 0.1 to 86400"),
+        (("step", "article", "--scheme", "bth"), "--scheme: found 'bth'; expected none or synchronous or"),
+        (("step", "article", "--scheme", "bth"), "(did you mean both?)"),
+        (("step", "article", "--cuont", 5), "--cuont: no such option (did you mean --count?)"),
+        (("step", "article", "--count"), "--count: a value is missing"),
+        (("step",), "PROFILE: is missing; see hdbridge step --help"),
+        (("fit",), "RECORD: is missing"),
+        (("step", "article", "twice"), "'twice': expected no further argument"),
+        (("stpe", "article"), "'stpe': no such command (did you mean 'step'?); see hdbridge --help"),
+        (("model", "lgo"), "'lgo': no such command (did you mean 'log'?); see hdbridge model --help"),
+        (("model", "activate", "article", "x"), "VERSION: found 'x'; expected an integer of at least 1"),
+        (("step", "article", "--count", "1\n2"), r"--count: found '1\\n2'"),
+    ],
+)
+def test_one_line_says_what_was_given_and_what_is_expected(here, arguments, line):
+    done = here(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (said,) = done.stderr.splitlines()
+    assert said.startswith("hdbridge: ")
+    assert line in said
+
+
+@pytest.mark.parametrize("arguments", [(), ("model",)])
+def test_without_a_command_it_shows_what_there_is(here, arguments):
+    done = here(*arguments)
+    assert done.returncode == 2
+    assert "Usage" in done.stdout
+    assert done.stderr == ""
