@@ -11,6 +11,7 @@ import io
 import os
 import sys
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
@@ -18,7 +19,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from hdbridge import __version__
-from hdbridge.cli import plain, usage
+from hdbridge.cli import eventlog, plain, usage
 from hdbridge.errors import HdbridgeError, InputError
 
 PANELS: Final = {
@@ -27,11 +28,14 @@ PANELS: Final = {
         "simulate": "Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.",
     },
     "Before the first move": {
+        "new": "Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of "
+        "itself.",
         "check": "Read an axis file, its EDS and its model; say what they mean, or what is wrong and where.",
         "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
         "axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
+        "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
         "latency": "Measure how late this machine wakes up; print the histogram and the cycle time that it "
         "carries.",
     },
@@ -45,6 +49,9 @@ PANELS: Final = {
         "model": "The models of an axis: the active one, one that waits, and every one that there was.",
     },
     "Positioning": {
+        "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
+        "last.",
+        "home": "Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.",
         "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
         "measured.",
     },
@@ -81,7 +88,6 @@ app = typer.Typer(
     name="hdbridge",
     cls=_LoadedToRun,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -109,14 +115,27 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def _hdbridge(
-    version: Annotated[
+    version: Annotated[  # noqa: ARG001 - its callback has told it by then
         bool, typer.Option("--version", help="Print the version and exit.", callback=_tell_version)
     ] = False,
+    verbose: Annotated[
+        int,
+        typer.Option(
+            "--verbose", "-v", count=True, help="Tell what is done on the bus; -vv: every SDO transfer."
+        ),
+    ] = 0,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Append all that -vv tells, a JSON object per line."),
+    ] = None,
 ) -> None:
     """Make a harmonic-drive axis point where it is told: a CANopen master that knows its gear.
 
     To begin: `hdbridge demo`, then docs/tutorial.md.
     """
+    if verbose or log is not None:
+        eventlog.begin(verbose, log)
+        eventlog.tell("command", arguments=sys.argv[1:], version=__version__)
 
 
 def main() -> None:
@@ -125,7 +144,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=plain.HANDLER)
     try:
-        status = app(standalone_mode=False)
+        status = app(prog_name="hdbridge", standalone_mode=False)
         sys.stdout.flush()
     except HdbridgeError as error:
         print(f"hdbridge: {error}", file=sys.stderr)
@@ -147,7 +166,9 @@ def main() -> None:
         _close_output()
         print(f"hdbridge: the standard output cannot be written: {error.strerror}", file=sys.stderr)
         status = InputError.exit_status
-    sys.exit(status if isinstance(status, int) else 0)
+    status = status if isinstance(status, int) else 0
+    eventlog.end(status)
+    sys.exit(status)
 
 
 def _close_output() -> None:

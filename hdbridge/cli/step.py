@@ -51,7 +51,8 @@ def step(
     scheme: Annotated[
         list[Scheme] | None,
         typer.Option(
-            "--scheme", help="Only this scheme; may stand several times. Else all that the model has."
+            "--scheme",
+            help="Only this scheme; may stand several times. Else all of the model. `none` needs none.",
         ),
     ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
@@ -79,11 +80,13 @@ def step(
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
-    chosen = model or files.model
+    chosen: Path | None = model or files.model
+    if scheme and set(scheme) == {Scheme.NONE} and model is None:
+        chosen = None  # what compensates nothing needs no model
     comparison = run_comparison(
         axis,
         files,
-        TransmissionModel.load(chosen),
+        TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
         stepping,
         scheme,
         simulate=simulate,
@@ -167,7 +170,7 @@ def print_result(axis: AxisConfig, comparison: Comparison) -> None:
 def write_page(
     path: Path,
     axis: AxisConfig,
-    model: Path,
+    model: Path | None,
     comparison: Comparison,
     stepping: Stepping,
     *,
@@ -182,7 +185,7 @@ def write_page(
     )
     facts = {
         "axis": f"{axis.name} ({axis.path})",
-        "model": str(model),
+        "model": str(model or "none"),
         "drive": drive,
         "date": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
         "steps": f"{stepping.count} of {stepping.step_deg:g} motor degrees each way",

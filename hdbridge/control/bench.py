@@ -6,6 +6,7 @@ the drive.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -33,6 +34,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment, versions_here
 
 Outcome = TypeVar("Outcome")
+_log = logging.getLogger(__name__)
 """The channels that an axis need not have, and their keys in the axis file."""
 _AT_REST = Moment()
 
@@ -135,13 +137,22 @@ class Bench:
         self._observer = Observer()
         self._sensed = Sensed(axis)
         self._place = 0.0
+        self._most = math.inf
+        """Samples of a leg; where there are more, the first half goes."""
         self._measured: list[list[Sample]] = []
         self._legs: list[_Leg] = []
 
     def run(
-        self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None
+        self,
+        procedure: Procedure[Outcome],
+        progress: Callable[[float], None] = lambda _: None,
+        *,
+        keep_s: float = math.inf,
     ) -> Run[Outcome]:
-        """Run one procedure to its end; ``progress`` receives the share done, about ten times a second.
+        """Run one procedure to its end; ``progress`` receives the share done after each leg.
+
+        Of a leg that lasts longer than ``keep_s`` at least the last so many seconds are kept, at most twice
+        as many: for one that holds the axis for hours.
 
         Refused with InputError, before anything moves, where the procedure would leave the axis's limits.
         Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
@@ -151,6 +162,28 @@ class Bench:
         rehearsal = rehearse(procedure, self.view, standing_deg)
         self._measured.clear()
         self._legs.clear()
+        self._most = math.inf if math.isinf(keep_s) else max(2 * math.ceil(keep_s / self.cycle.period_s), 2)
+        _log.info("run begins", {"procedure": type(procedure).__name__, "ideally_s": rehearsal.duration_s})
+        try:
+            outcome = self._powered(procedure, rehearsal, progress)
+        finally:
+            self._tell_end()
+        axis = self._drive.axis
+        return Run(
+            self.record(),
+            self.legs,
+            axis=axis.name,
+            ratio=axis.gear.ratio,
+            drive=self._drive.identity,
+            versions=versions_here(),
+            notes={"procedure": type(procedure).__name__},
+            outcome=outcome,
+        )
+
+    def _powered(
+        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
+    ) -> Outcome:
+        """The procedure, from power on to power off."""
         self._enable()
         try:
             outcome = self._walk(procedure, rehearsal, progress)
@@ -163,17 +196,18 @@ class Bench:
             raise
         self._image.power.go(State.SWITCH_ON_DISABLED)
         self._rest()
-        axis = self._drive.axis
-        return Run(
-            self.record(),
-            self.legs,
-            axis=axis.name,
-            ratio=axis.gear.ratio,
-            drive=self._drive.identity,
-            versions=versions_here(),
-            notes={"procedure": type(procedure).__name__},
-            outcome=outcome,
-        )
+        return outcome
+
+    def _tell_end(self) -> None:
+        """What happened within the cycle is told when the axis rests: the cycle itself tells nothing."""
+        nodes = self._drive.monitor.nodes.values()
+        facts = {
+            "samples": sum(len(each) for each in self._measured),
+            "legs": len(self._legs),
+            "supervision": {fault.name.lower(): n for fault, n in self.supervision.counts.items() if n},
+            "emergencies": [str(each) for node in nodes for each in node.emergencies],
+        }
+        _log.info("run ended", {name: value for name, value in facts.items() if value})
 
     def record(self) -> Record:
         """What the present procedure has measured so far.
@@ -269,7 +303,7 @@ class Bench:
         observe, ratio = self._observer.moment, self.view.ratio
         compensation, sensed = self._compensation, self._sensed
         needs, has_channels = bool(compensation.needs), bool(image.channels)
-        target_deg = self._place
+        target_deg, most = self._place, self._most
         # Counted in cycles that were run, not in clock time: a period that was skipped must not make the
         # target jump ahead.
         elapsed_s = 0.0
@@ -303,6 +337,8 @@ class Bench:
                         feedback.readings,
                     )
                 )
+                if len(samples) > most:
+                    del samples[: len(samples) // 2]
                 self._place = target_deg
                 if interrupted():
                     raise KeyboardInterrupt

@@ -6,6 +6,7 @@ read back. The first thing that is not as expected ends the boot-up with an erro
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -32,6 +33,7 @@ from hdbridge.errors import DriveError, IdentityError, SdoError
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
+_log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
 """How long a node may take from a reset to its boot-up message before it is asked directly."""
 STATE_TIMEOUT_S: Final = 1.0
@@ -94,6 +96,7 @@ class BootUp:
     # -- network management -------------------------------------------------------------------------------
 
     def _nmt(self, command: NmtCommand, node_id: int) -> None:
+        _log.info("nmt", {"command": command.name, "node": node_id})
         self._link.send(objects.COB_NMT, bytes((command, node_id)))
 
     def _receive_until(self, deadline_s: float) -> bool:

@@ -11,6 +11,7 @@ then walks the states by PDO, while SYNC and set-points are already running.
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig
 
+_log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S: Final = 0.2
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 
@@ -91,6 +93,7 @@ class Drive:
         self.report = None
         self._mode = None
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients).run(reset=reset)
+        _log.info("booted", {"node": self.axis.drive.node_id, "bus": self.link.name, **self.report.identity})
         return self.report
 
     @property
@@ -130,6 +133,7 @@ class Drive:
         motor_counts = self._commander.preload_target()
         self.image.halt = False
         self.image.seed(motor_counts, positions.load_counts, self._commander.statusword())
+        _log.info("enable", {"node": self.axis.drive.node_id, "mode": mode.name})
         if mode is Mode.CSP:
             self.image.power.go(State.OPERATION_ENABLED)
         else:
@@ -146,6 +150,7 @@ class Drive:
             self._commander.walk(State.SWITCH_ON_DISABLED)
         self._expect_master(False)
         self._mode = None
+        _log.info("disabled", {"node": self.axis.drive.node_id, "state": state.value})
 
     def fault_reset(self) -> None:
         """Reset a fault: a rising edge on bit 7. `TransitionError` when there is none, `DriveError` when "

@@ -8,6 +8,7 @@ dropped and counted, and every deadline is on the monotonic clock that was passe
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import uuid
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,7 @@ import can
 from hdbridge.clock import Clock
 from hdbridge.errors import BusError
 
+_log = logging.getLogger(__name__)
 _GONE: Final = frozenset(
     {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.ENETUNREACH, errno.EBADF, errno.EIO}
 )
@@ -241,9 +243,11 @@ def open_bus(settings: BusSettings) -> Iterator[can.BusABC]:
         raise BusError(f"{name}: {what}") from error
     if bus.channel_info == "unknown":  # python-can's word for it; messages need a name
         bus.channel_info = name
+    _log.info("bus opened", {"bus": name})
     try:
         yield bus
     finally:
+        _log.info("bus closed", {"bus": name})
         # A device that has been unplugged may fail to close; there is nothing left to save then.
         with suppress(can.CanError, OSError):
             bus.shutdown()

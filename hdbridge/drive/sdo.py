@@ -11,6 +11,7 @@ Never used inside the control cycle.
 
 from __future__ import annotations
 
+import logging
 import struct
 from pathlib import Path
 from typing import Final
@@ -25,6 +26,7 @@ from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import COB_SDO_ANSWER, COB_SDO_REQUEST, STANDARD, Address, IntegerType
 from hdbridge.errors import InputError, SdoError
 
+_log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
 DEFAULT_ATTEMPTS: Final = 3
 DEFAULT_SIZE_CAP: Final = 4096
@@ -36,8 +38,7 @@ _ABORT_TIMED_OUT: Final = 0x0504_0000
 _ABORT_OUT_OF_MEMORY: Final = 0x0504_0005
 _HEADER: Final = struct.Struct("<BHB")
 
-_TYPES: Final = {
-    datatypes.BOOLEAN: IntegerType.UINT8,
+INTEGER_TYPES: Final = {
     datatypes.INTEGER8: IntegerType.INT8,
     datatypes.INTEGER16: IntegerType.INT16,
     datatypes.INTEGER24: IntegerType.INT24,
@@ -49,6 +50,8 @@ _TYPES: Final = {
     datatypes.UNSIGNED32: IntegerType.UINT32,
     datatypes.UNSIGNED64: IntegerType.UINT64,
 }
+"""By the number that the EDS has for them (CiA 301, table 44)."""
+_TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}
 
 _ADVICE: Final = {
     0x0601_0000: "the drive does not support this access",
@@ -280,9 +283,13 @@ class SdoClient:
             )
             try:
                 if data is None:
-                    return self._channel.fetch(index, sub, self.size_cap)
+                    answer = self._channel.fetch(index, sub, self.size_cap)
+                    self._tell("sdo read", index, sub, data=answer.hex(" "))
+                    return answer
                 self._channel.download(index, sub, data)
+                self._tell("sdo write", index, sub, data=data.hex(" "))
             except SdoAbortedError as error:
+                self._tell(f"sdo {doing} refused", index, sub, abort=f"{error.code:08X}h")
                 advice = _ADVICE.get(error.code, "see the drive's manual for this code")
                 text = SdoAbortedError.CODES.get(error.code, "vendor-specific")
                 raise SdoAbortError(
@@ -292,12 +299,17 @@ class SdoClient:
                 ) from error
             except _NoAnswerError as error:
                 problem = f"{error}; check that the node is powered and its node id and bit rate are right"
+                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
             except SdoCommunicationError as error:
                 problem = f"{error}; check that no second SDO client is active"
+                self._tell(f"sdo {doing} failed", index, sub, problem=str(error))
             else:
                 return b""
         times = f"{self.attempts} attempts" if self.attempts != 1 else "one attempt"
         raise SdoError(f"{self.describe(index, sub)}: {doing} failed after {times}: {problem}")
+
+    def _tell(self, event: str, index: int, sub: int, **facts: object) -> None:
+        _log.debug(event, {"node": self.node_id, "object": f"{index:04X}h:{sub:02X}", **facts})
 
     @staticmethod
     def _is_extension(data: bytes, size: int, kind: IntegerType) -> bool:

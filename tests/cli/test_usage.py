@@ -22,7 +22,7 @@ import pytest
         (("stpe", "article"), "'stpe': no such command (did you mean 'step'?); see hdbridge --help"),
         (("model", "lgo"), "'lgo': no such command (did you mean 'log'?); see hdbridge model --help"),
         (("model", "activate", "article", "x"), "VERSION: found 'x'; expected an integer of at least 1"),
-        (("step", "article", "--count", "1\n2"), r"--count: found '1\\n2'"),
+        (("step", "article", "--count", "1\n2"), r"--count: found '1\n2'"),
     ],
 )
 def test_one_line_says_what_was_given_and_what_is_expected(here, arguments, line):

@@ -1,0 +1,122 @@
+"""A profile's folder to begin with: a copy of a bundled one, or what a drive on the bus says of itself."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hdbridge.bringup.match import axis_lines
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.files.bundled import bundled_profile
+
+if TYPE_CHECKING:
+    from hdbridge.axis import BusConfig
+    from hdbridge.bringup.scan import Node
+
+FILES = ("axis.yaml", "model.yaml", "truth.yaml")
+_TO_FILL_IN = {
+    "drive": {"rated_torque_nm": "0         # fill in: rated torque of the motor, Nm"},
+    "motor_encoder": {"counts_per_turn": "0         # fill in: counts per motor turn"},
+    "load_encoder": {
+        "counts_per_turn": "0         # fill in: counts per load turn",
+        "source": "{index: 0x60E4, subindex: 1, type: int32}   # fill in: where its reading comes from",
+    },
+    "gear": {"ratio": "0         # fill in: motor turns per load turn"},
+}
+"""What an axis file needs and the drive may not say: `hdbridge check` stops at what is left."""
+_TAIL = """
+# At the load. Begin with little; `hdbridge doctor` moves within these.
+limits:
+  position_min_deg: -5
+  position_max_deg: 5
+  velocity_deg_s: 5
+  acceleration_deg_s2: 50
+  jerk_deg_s3: 1000
+  torque_percent: 30
+"""
+
+
+def copy_bundled(source: str, folder: Path) -> list[Path]:
+    """The files of a bundled profile in a new folder, the axis named after it; what was written."""
+    name = _axis_name(folder)
+    origin = bundled_profile(source)
+    _make_new(folder)
+    written = []
+    for each in FILES:
+        if (origin / each).is_file():
+            shutil.copyfile(origin / each, folder / each)
+            written.append(folder / each)
+    text = (folder / "axis.yaml").read_text(encoding="utf-8")
+    write_atomically(folder / "axis.yaml", re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1))
+    return written
+
+
+def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) -> list[Path]:
+    """An axis file of what a drive says of itself, and its EDS beside it; what was written."""
+    text = axis_text(_axis_name(folder), bus, node, eds.name if eds else "FILE.eds")
+    if eds is not None and not eds.is_file():
+        raise InputError(f"{eds}: there is no such file; expected the EDS file of the drive")
+    _make_new(folder)
+    written = [folder / "axis.yaml"]
+    if eds is not None:
+        shutil.copyfile(eds, folder / eds.name)
+        written.append(folder / eds.name)
+    write_atomically(written[0], text)
+    return written
+
+
+def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
+    """The text of an axis file; what nobody can know but a person is marked ``fill in``."""
+    said = _sections(axis_lines(node))
+    for section, keys in _TO_FILL_IN.items():
+        lines = said.setdefault(section, [])
+        there = {each.split(":")[0].strip() for each in lines}
+        lines += [f"  {key}: {value}" for key, value in keys.items() if key not in there]
+    said["drive"] = [
+        re.sub(r"FILE\.eds\b.*", f"{eds_name}", each) if "eds:" in each else each for each in said["drive"]
+    ]
+    said["drive"] += ["  cycle_ms: 4", "  following_error_deg: 5.0      # of the motor"]
+    bitrate = [f"  bitrate_bps: {bus.bitrate_bps}"] if bus.bitrate_bps else []
+    head = [
+        "# Made by `hdbridge new --from scan` of what the drive says of itself. From here on it is yours:",
+        "# hdbridge reads it and never changes it. docs/files.md describes every key; `hdbridge check` says",
+        "# what is missing or wrong.",
+        "schema: hdbridge.axis/1",
+        f"name: {name}",
+        "",
+        "bus:",
+        f"  interface: {bus.interface}",
+        f"  channel: {bus.channel}",
+        *bitrate,
+    ]
+    order = ("drive", "motor_encoder", "load_encoder", "gear")
+    body = [line for section in order for line in ("", f"{section}:", *said[section])]
+    return "\n".join([*head, *body]) + "\n" + _TAIL
+
+
+def _sections(lines: list[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    section = ""
+    for line in lines:
+        if line.startswith(" "):
+            found[section].append(line)
+        else:
+            section = line.split(":")[0]
+            found[section] = []
+    return found
+
+
+def _axis_name(folder: Path) -> str:
+    name = folder.resolve().name
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+        raise InputError(f"{folder}: {name!r} is no name of an axis; expected letters, digits, '.', '_', '-'")
+    return name
+
+
+def _make_new(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is there already; expected a new folder, nothing was written")
+    make_folder(folder)

@@ -1,0 +1,112 @@
+"""``hdbridge home``: let the drive find its zero."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    JsonOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    connected,
+    console,
+    load_axis,
+    notes,
+    write_json,
+)
+from hdbridge.drive.drive import Drive
+
+TOWARDS_SWITCH = 0.1
+"""Of the axis's highest speed."""
+TOWARDS_ZERO = 0.02
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("home")(home)
+
+
+def home(
+    profile: ProfileArgument,
+    method: Annotated[
+        int,
+        typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual."),
+    ],
+    switch_velocity_deg_s: Annotated[
+        float | None,
+        typer.Option(
+            "--switch-velocity",
+            min=1e-6,
+            help="Towards the switch, degrees of the load per second; else a tenth of the axis's limit.",
+        ),
+    ] = None,
+    zero_velocity_deg_s: Annotated[
+        float | None,
+        typer.Option(
+            "--zero-velocity",
+            min=1e-6,
+            help="Towards the zero, degrees of the load per second; else a fiftieth of the axis's limit.",
+        ),
+    ] = None,
+    acceleration_deg_s2: Annotated[
+        float | None,
+        typer.Option("--acceleration", min=1e-6, help="Of the load, deg/s2; else the axis's limit."),
+    ] = None,
+    offset_deg: Annotated[
+        float, typer.Option("--offset", help="Load angle that the home position gets (607Ch).")
+    ] = 0.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Seconds that it may take.")
+    ] = 60.0,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.
+
+    The drive moves by itself, within the speeds given. Ctrl-C stops it (exit status 130). A model belongs to
+    the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
+    """
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel)
+    with (
+        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
+        at = drive.home(
+            method,
+            switch_velocity_deg_s or TOWARDS_SWITCH * axis.limits.velocity_deg_s,
+            zero_velocity_deg_s or TOWARDS_ZERO * axis.limits.velocity_deg_s,
+            acceleration_deg_s2,
+            offset_deg,
+            timeout_s,
+        )
+    load_by_motor_deg = at.motor_deg / axis.gear.ratio
+    write_json(
+        json_file,
+        {
+            "schema": "hdbridge.home/1",
+            "axis": axis.name,
+            "method": method,
+            "motor_position_deg": at.motor_deg,
+            "load_position_by_motor_deg": load_by_motor_deg,
+            "load_position_deg": at.load_deg,
+        },
+    )
+    console.print(
+        f"homed by method {method}: the load is at {load_by_motor_deg:.4f} deg by the motor encoder, "
+        f"{at.load_deg:.4f} deg by its own; power is off",
+        soft_wrap=True,
+    )

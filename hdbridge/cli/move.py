@@ -1,0 +1,161 @@
+"""``hdbridge move``: the load to an angle, compensated, and hold it there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hdbridge.cli.booted import booted
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    JsonOption,
+    ModelOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    console,
+    load_axis,
+    notes,
+    print_table,
+    progress_bar,
+    write_json,
+)
+from hdbridge.control.bench import Bench
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Standing
+from hdbridge.procedures.waypoints import Hold, WayPoints
+
+KEPT_S = 60.0
+"""While it is held only the last minute of samples is kept."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("move", context_settings={"ignore_unknown_options": True})(move)
+
+
+def move(
+    profile: ProfileArgument,
+    angles_deg: Annotated[
+        list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
+    ],
+    relative: Annotated[
+        bool, typer.Option("--relative", help="Each angle counts from where the axis stood before it.")
+    ] = False,
+    velocity_deg_s: Annotated[
+        float | None,
+        typer.Option("--velocity", min=1e-6, help="Degrees of the load per second; else the axis's limit."),
+    ] = None,
+    hold_s: Annotated[
+        float | None,
+        typer.Option(
+            "--hold",
+            min=0.0,
+            help="Hold the last angle for so many seconds; else until Ctrl-C (a simulated axis: not at all).",
+        ),
+    ] = None,
+    model: ModelOption = None,
+    compensated: Annotated[
+        bool,
+        typer.Option("--compensated/--uncompensated", help="By the active model, where there is one."),
+    ] = True,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Move the load to one angle or to several, compensated by the active model, and hold the last.
+
+    Each move is limited in speed, acceleration and jerk by the axis file, and refused before anything moves
+    where it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
+    ends the command in good order. Then power is off: what hangs on the axis needs a brake.
+    """
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel)
+    chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
+    with booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted):
+        if simulate and hold_s is None:
+            hold_s = 0.0  # nobody sees a simulated axis stand
+        hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
+        stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
+        targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
+        way = WayPoints(tuple(targets_deg), hold, velocity_deg_s)
+        bench = Bench(drive, chosen, interrupted=lambda: interrupted() and not hold.begun)
+        with progress_bar() as bar:
+            task = bar.add_task("moving", total=1.0)
+
+            def show(share: float) -> None:
+                there = share >= 1.0
+                words = (
+                    f"holding {targets_deg[-1]:g} deg; Ctrl-C ends it"
+                    if there and hold_s is None
+                    else "moving"
+                )
+                bar.update(task, completed=share, description=words)
+
+            run = bench.run(way, show, keep_s=KEPT_S)
+    write_json(json_file, _document(axis.name, chosen, run.outcome))
+    _print(axis.name, chosen, run.outcome)
+
+
+def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
+    """The model that compensates; one without effects where there is none, or none is wanted."""
+    if not compensated:
+        if given is not None:
+            raise InputError("--uncompensated uses no model: leave out --model")
+        return TransmissionModel(ratio)
+    if given is None and not files.model.exists():
+        notes.print(f"not compensated: {files.model} does not exist", markup=False, soft_wrap=True)
+        return TransmissionModel(ratio)
+    return TransmissionModel.load(given or files.model)
+
+
+def _absolute(steps_deg: list[float], start_deg: float) -> list[float]:
+    targets = []
+    for step_deg in steps_deg:
+        start_deg += step_deg
+        targets.append(start_deg)
+    return targets
+
+
+def _document(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> dict[str, Any]:
+    return {
+        "schema": "hdbridge.move/1",
+        "axis": axis,
+        "model": str(model.path) if model.effects else None,
+        "stands": [
+            {
+                "target_deg": each.target_deg,
+                "load_position_deg": each.target_deg + each.error_arcsec / 3600.0,
+                "error_arcsec": each.error_arcsec,
+                "settle_s": each.settle_s,
+            }
+            for each in stands
+        ],
+    }
+
+
+def _print(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> None:
+    table = Table(title=f"Axis '{axis}' at rest", title_justify="left")
+    for name in ("target, deg", "load encoder, deg", "error, arcsec", "settled in, s"):
+        table.add_column(name, justify="right")
+    for each in stands:
+        table.add_row(
+            f"{each.target_deg:.4f}",
+            f"{each.target_deg + each.error_arcsec / 3600.0:.4f}",
+            f"{each.error_arcsec:z.2f}",
+            f"{each.settle_s:.2f}",
+        )
+    print_table(table)
+    how = f"compensated by {model.path}" if model.effects else "not compensated"
+    console.print(f"{how}; power is off", markup=False, soft_wrap=True)

@@ -1,0 +1,103 @@
+"""``hdbridge new``: a profile's folder to begin with."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.bringup.newprofile import copy_bundled, write_scanned
+from hdbridge.bringup.scan import Node, scan_bus
+from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, console, notes, write_json
+from hdbridge.clock import MonotonicClock
+from hdbridge.drive.link import Link, open_bus
+from hdbridge.errors import DriveError, InputError
+
+
+class Source(Enum):
+    """What a new profile is made of."""
+
+    DEMO = "demo"
+    ARTICLE = "article"
+    SCAN = "scan"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("new")(new)
+
+
+def new(
+    name: Annotated[Path, typer.Argument(metavar="NAME", help="The new folder; its name is the axis's.")],
+    source: Annotated[
+        Source,
+        typer.Option("--from", help="A bundled profile to copy, or the drive that answers on a bus."),
+    ] = Source.DEMO,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    bitrate_bps: Annotated[
+        int | None,
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+    ] = None,
+    node_id: Annotated[
+        int | None,
+        typer.Option("--node", min=1, max=127, help="Of a scan: which of several nodes."),
+    ] = None,
+    eds: Annotated[
+        Path | None, typer.Option("--eds", metavar="FILE", help="Of a scan: the drive's EDS file, copied.")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of itself.
+
+    With `--from scan --interface socketcan --channel can0` the axis file has the drive's identity, encoders
+    and gear, as far as it tells them; what is left to fill in is marked, and `hdbridge check` stops there.
+    Nothing is moved. A folder that is there already is refused.
+    """
+    if source is Source.SCAN:
+        written = _scanned(name, interface, channel, bitrate_bps, node_id, eds)
+    else:
+        given = {"--interface": interface, "--channel": channel, "--node": node_id, "--eds": eds}
+        for option, value in given.items():
+            if value is not None:
+                raise InputError(f"{option} says where to scan: give --from scan with it, or leave it out")
+        written = copy_bundled(source.value, name)
+    write_json(json_file, {"schema": "hdbridge.new/1", "files": [str(each) for each in written]})
+    for each in written:
+        console.print(f"wrote {each}", markup=False, soft_wrap=True)
+    try:
+        AxisConfig.load(name)
+    except InputError as problem:
+        console.print(f"to be completed: {problem}", markup=False, soft_wrap=True)
+    console.print(f"next: hdbridge check {name}", markup=False, soft_wrap=True)
+
+
+def _scanned(
+    folder: Path,
+    interface: str | None,
+    channel: str | None,
+    bitrate_bps: int | None,
+    node_id: int | None,
+    eds: Path | None,
+) -> list[Path]:
+    if interface is None or channel is None:
+        raise InputError("--from scan needs a bus: give --interface and --channel (socketcan, can0)")
+    bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+    with open_bus(bus) as opened:
+        notes.print("asking nodes ...")
+        link = Link(opened, MonotonicClock())
+        found = scan_bus(link)
+    return write_scanned(folder, bus, _chosen(link.name, found.nodes, node_id), eds)
+
+
+def _chosen(bus: str, nodes: tuple[Node, ...], node_id: int | None) -> Node:
+    usable = [each for each in nodes if each.usable and node_id in {None, each.node_id}]
+    if len(usable) == 1:
+        return usable[0]
+    there = ", ".join(f"{each.node_id} ({each.kind})" for each in nodes) or "none"
+    if not usable:
+        raise DriveError(f"{bus}: no CiA-402 drive with CSP is there; found nodes: {there}")
+    raise InputError(f"{bus}: several drives are there: {there}; say which one by --node")

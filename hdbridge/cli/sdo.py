@@ -1,0 +1,135 @@
+"""``hdbridge sdo``: read or write one object of a drive, by the type that its EDS gives it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.options import (
+    ChannelOption,
+    InterfaceOption,
+    JsonOption,
+    Profile,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    connected,
+    console,
+    load_axis,
+    write_json,
+)
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.sdo import load_eds
+from hdbridge.drive.values import Object, Value, find_object
+from hdbridge.errors import InputError
+
+ObjectArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="OBJECT", help="Its number (6064h, 0x1018:4, 60C2h:01; hexadecimal) or its name in the EDS."
+    ),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(
+        help="Read or write an object of the drive by SDO, typed by its EDS.",
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+    )
+    group.command()(get)
+    group.command("set", context_settings={"ignore_unknown_options": True})(put)
+    app.add_typer(group, name="sdo")
+
+
+def get(
+    profile: ProfileArgument,
+    object_: ObjectArgument,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Read an object of the drive. The drive is neither booted nor enabled."""
+    files = Profile.find(profile)
+    with _drive(files, simulate, truth, seed, interface, channel) as drive:
+        wanted = find_object(object_, drive.sdo.od)
+        if not wanted.readable:
+            raise InputError(f"{wanted}: can only be written, by the EDS")
+        value = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub))
+    write_json(json_file, _document(wanted, value))
+    _print(wanted, value)
+
+
+def put(
+    profile: ProfileArgument,
+    object_: ObjectArgument,
+    value: Annotated[
+        str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
+    ],
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Write an object of the drive, and read it back. The drive is neither booted nor enabled by this.
+
+    A value that does not suit the object's type or range is refused before anything is sent. What the object
+    does is up to you: 6040h moves an axis. Until the drive stores it (1010h), it lasts until it is switched
+    off; `hdbridge` itself writes what the axis file says at every boot-up.
+    """
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel)
+    wanted = find_object(object_, load_eds(axis.eds_path, axis.drive.node_id))
+    if not wanted.writable:
+        raise InputError(f"{wanted}: can only be read, by the EDS; nothing was written")
+    data = wanted.encode(value)
+    with _drive(files, simulate, truth, seed, interface, channel) as drive:
+        drive.sdo.write_bytes(wanted.index, wanted.sub, data)
+        now = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub) if wanted.readable else data)
+    write_json(json_file, _document(wanted, now))
+    _print(wanted, now)
+
+
+@contextmanager
+def _drive(
+    files: Profile,
+    simulate: bool,
+    truth: Path | None,
+    seed: int,
+    interface: str | None,
+    channel: str | None,
+) -> Iterator[Drive]:
+    """The drive, not booted: its objects are read and written as they are."""
+    axis = load_axis(files, interface, channel)
+    with (
+        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
+        Drive(bus, axis, clock) as drive,
+    ):
+        yield drive
+
+
+def _document(wanted: Object, value: Value) -> dict[str, object]:
+    return {
+        "schema": "hdbridge.sdo/1",
+        "index": wanted.index,
+        "subindex": wanted.sub,
+        "name": wanted.name,
+        "type": wanted.type_name,
+        "value": value,
+    }
+
+
+def _print(wanted: Object, value: Value) -> None:
+    also = f" ({value:#x})" if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else ""
+    console.print(f"{wanted}: {value}{also}  {wanted.type_name}", markup=False, soft_wrap=True)

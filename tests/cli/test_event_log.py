@@ -1,0 +1,63 @@
+"""`-v`, `--log` and shell completion: what stands before the command."""
+
+import json
+import os
+import subprocess
+import sys
+
+ENTRY = "import sys; sys.argv[0] = 'hdbridge'; from hdbridge.cli import main; main()"
+
+
+def test_the_log_tells_what_was_done_on_the_bus_but_nothing_of_single_cycles(here, tmp_path):
+    done = here("--log", "bus.jsonl", "move", "article", 1, "--simulate")
+    assert done.returncode == 0, done.stderr
+    events = [json.loads(each) for each in (tmp_path / "bus.jsonl").read_text().splitlines()]
+    names = [each["event"] for each in events]
+    assert names[-1] == "end"
+    assert events[-1]["exit_status"] == 0
+    for expected in ("command", "nmt", "booted", "sdo write", "enable", "disabled", "run ended"):
+        assert expected in names
+    assert {"date", "level", "where"} <= events[0].keys()
+    # Hundreds of cycles were run between the two; what writes there costs time that the loop has not.
+    (begin,) = [place for place, each in enumerate(events) if each["event"] == "enable"]
+    assert names[begin + 1].startswith("sdo") or names[begin + 1] == "disabled"
+    (run,) = [each for each in events if each["event"] == "run ended"]
+    assert run["samples"] > 100
+
+
+def test_a_log_is_continued(here, tmp_path):
+    for _ in range(2):
+        here("--log", "bus.jsonl", "sdo", "get", "article", "6064h", "--simulate")
+    lines = (tmp_path / "bus.jsonl").read_text().splitlines()
+    assert [json.loads(each)["event"] for each in lines].count("command") == 2
+
+
+def test_a_log_that_cannot_be_written_is_refused(here):
+    done = here("--log", "nowhere/bus.jsonl", "check", "article")
+    assert done.returncode == 2
+    assert "nowhere/bus.jsonl: cannot be written: No such file or directory" in done.stderr
+
+
+def test_v_tells_on_standard_error_and_vv_tells_every_transfer(here):
+    quiet, more, most = (
+        here(*v, "sdo", "get", "article", "6064h", "--simulate") for v in ((), ("-v",), ("-vv",))
+    )
+    assert "sdo read" not in quiet.stderr + more.stderr
+    assert "sdo read  node=1 object=6064h:00" in most.stderr
+    assert quiet.stdout == more.stdout == most.stdout
+
+
+def test_completion_knows_commands_and_their_options():
+    def completed(words: str, place: int) -> list[str]:
+        asked = {"_HDBRIDGE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place)}
+        return subprocess.run(
+            [sys.executable, "-c", ENTRY],
+            env={**os.environ, **asked},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        ).stdout.split()
+
+    assert completed("hdbridge st", 1) == ["step"]
+    assert completed("hdbridge step --co", 2) == ["--count"]

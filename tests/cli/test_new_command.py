@@ -1,0 +1,68 @@
+"""`hdbridge new`: a profile's folder for who has installed hdbridge from a wheel."""
+
+import pytest
+
+from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.bringup.newprofile import axis_text
+from hdbridge.bringup.scan import scan_bus
+from hdbridge.drive import Link
+from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.sim.lockstep import simulated_bench
+
+
+@pytest.fixture(scope="module")
+def node():
+    """What the scan of a simulated drive finds."""
+    axis = AxisConfig.load(bundled_profile("article"))
+    truth = axis.path.parent / "truth.yaml"
+    with simulated_bench(truth, axis.eds_path, axis.drive.node_id) as (bus, clock, _):
+        (found,) = scan_bus(Link(bus, clock)).nodes
+    return found
+
+
+@pytest.mark.parametrize("source", ["demo", "article"])
+def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(here, tmp_path, source):
+    done = here("new", "cells/my-axis", "--from", source)
+    assert done.returncode == 0, done.stderr
+    assert "next: hdbridge check cells/my-axis" in done.stdout
+    axis = AxisConfig.load(tmp_path / "cells" / "my-axis")
+    assert axis.name == "my-axis"
+    assert (tmp_path / "cells" / "my-axis" / "model.yaml").exists() is (source == "article")
+    assert here("check", "cells/my-axis").returncode == 0
+    again = here("new", "cells/my-axis")
+    assert again.returncode == 2
+    assert "is there already" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("a b",), "is no name of an axis"),
+        (("mine", "--from", "scan"), "give --interface and --channel"),
+        (("mine", "--interface", "socketcan"), "give --from scan with it"),
+    ],
+)
+def test_what_makes_no_profile_is_refused_and_nothing_written(here, tmp_path, arguments, complaint):
+    done = here("new", *arguments)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_the_drive_says_of_itself_is_an_axis_file(node):
+    text = axis_text("found", BusConfig(interface="socketcan", channel="can0"), node, "hdbridge-402.eds")
+    axis = AxisConfig.from_text(text)
+    assert (axis.bus.interface, axis.bus.channel, axis.drive.node_id) == ("socketcan", "can0", 1)
+    assert (axis.gear.ratio, axis.motor_encoder.counts_per_turn) == (50, 8000)
+    assert axis.drive.identity.vendor_id == 0x4844
+
+
+def test_what_the_drive_does_not_say_is_left_to_be_filled_in(node):
+    from dataclasses import replace
+
+    silent = replace(node, values={})
+    text = axis_text("found", BusConfig(interface="socketcan", channel="can0"), silent, "hdbridge-402.eds")
+    assert text.count("fill in") >= 4
+    with pytest.raises(InputError, match=r"axis.yaml:\d+:\d+: drive.rated_torque_nm"):
+        AxisConfig.from_text(text)
