@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Self
 
+from hdbridge.bringup import TORQUE_PERCENT
 from hdbridge.bringup.slow import SlowAxis
 from hdbridge.clock import Clock
 from hdbridge.drive.drive import Drive
@@ -23,8 +24,6 @@ Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Cl
 """Opens an axis's bus and gives the clock that goes with it."""
 Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
 """A block in which an interrupt is only a wish, which the yielded function tells."""
-
-TORQUE_PERCENT: Final = 50.0
 
 
 class BringUpContext:

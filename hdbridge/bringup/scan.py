@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import NetworkMonitor
@@ -18,9 +19,6 @@ from hdbridge.drive.objects import Address, IntegerType, Mode, NmtState
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.errors import SdoError
 
-LISTEN_S: Final = 1.0
-ASK_TIMEOUT_S: Final = 0.02
-"""Time for the first answer; a node that has answered once gets `DETAIL_TIMEOUT_S` for the rest."""
 DETAIL_TIMEOUT_S: Final = 0.3
 NODE_IDS: Final = range(1, 128)
 

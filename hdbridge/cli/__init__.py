@@ -58,8 +58,8 @@ PANELS: Final = {
 }
 """Every command, under the heading that `hdbridge --help` gives it, and what it says of it there.
 
-The command itself is the file of that name in this folder. It says the same; it is only imported to be run,
-because some need a second or two for that.
+The command itself is the file of that name in this folder. It says the same, and is imported for its own help
+or to be run; what it computes with it loads when it runs.
 """
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hdbridge.axis import AxisConfig
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import Profile, connected, notes
-from hdbridge.drive.drive import Drive
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.drive.drive import Drive
 
 
 @contextmanager
@@ -22,6 +25,8 @@ def booted(
     seed: int,
 ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
     """The booted drive, and a function that tells whether somebody wishes to end."""
+    from hdbridge.drive.drive import Drive
+
     with (
         deferred_interrupt() as interrupted,
         connected(axis, profile, simulate=simulate, truth=truth, seed=seed) as (bus, clock),

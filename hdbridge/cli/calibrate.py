@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from hdbridge.calibration import Calibration, calibrate
-from hdbridge.calibration.validation import validation_s
-from hdbridge.cli.booted import booted
-from hdbridge.cli.calibration_output import print_calibration, print_next, print_page, write_calibration_page
-from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
+from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -29,6 +25,9 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.files.outputs import Kind
+
+if TYPE_CHECKING:
+    from hdbridge.calibration import Calibration
 
 
 def register(app: typer.Typer) -> None:
@@ -57,6 +56,11 @@ def command(
     Ctrl-C stops the axis, and --resume goes on. The model is pending until `hdbridge model commit PROFILE`.
     One that does not improve on data that it has not seen is not offered.
     """
+    from hdbridge.calibration import calibrate
+    from hdbridge.calibration.validation import validation_s
+    from hdbridge.cli.booted import booted
+    from hdbridge.cli.measuring import Measurement, kept_in, phases
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     work = Measurement.asked(axis, plan, out, resume)
@@ -83,6 +87,13 @@ def report(
     result: Calibration, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Tell the result, and what comes next."""
+    from hdbridge.cli.calibration_output import (
+        print_calibration,
+        print_next,
+        print_page,
+        write_calibration_page,
+    )
+
     page = html_file or folder / "report.html"
     write_json(json_file, result.as_dict())
     write_calibration_page(page, result)

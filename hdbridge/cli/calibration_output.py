@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.calibration import Calibration, Stepped, Validation
-from hdbridge.calibration.result import Offer, unit_of
 from hdbridge.cli.options import Profile, console, print_table
-from hdbridge.cli.scattertable import print_scatter
 from hdbridge.files.atomic import write_atomically
-from hdbridge.model.difference import diff
-from hdbridge.report.calibration import calibration_page
-from hdbridge.report.page import render
+
+if TYPE_CHECKING:
+    from hdbridge.calibration import Calibration, Stepped, Validation
+    from hdbridge.calibration.result import Offer
 
 TAKEN_OFF = 0.95
 """What was fitted beside a model (a delay, orders of the load) is told where this share is left, or less."""
@@ -23,6 +22,9 @@ TAKEN_OFF = 0.95
 
 def print_calibration(result: Calibration) -> None:
     """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
+    from hdbridge.calibration.result import unit_of
+    from hdbridge.model.difference import diff
+
     fit = result.fit
     before = (
         {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
@@ -76,6 +78,9 @@ def print_calibration(result: Calibration) -> None:
 
 def write_calibration_page(path: Path, result: Calibration) -> None:
     """The result as a self-contained page."""
+    from hdbridge.report.calibration import calibration_page
+    from hdbridge.report.page import render
+
     write_atomically(path, render(calibration_page(result)))
 
 
@@ -114,6 +119,8 @@ def print_stepping(checked: Validation) -> None:
 
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
     """Scatter and mean of stepping tests, a line each."""
+    from hdbridge.cli.scattertable import print_scatter
+
     print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
 
 

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from hdbridge.axis import AxisConfig
 from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, write_json
-from hdbridge.control.bench import compensation_for
-from hdbridge.drive import load_eds, plan
-from hdbridge.evaluation.stepping import quantisation_floor_arcsec
-from hdbridge.model import TransmissionModel
 
 
 def register(app: typer.Typer) -> None:
@@ -19,6 +14,12 @@ def register(app: typer.Typer) -> None:
 
 def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
     """Read an axis file, its EDS and its model; say what they mean, or what is wrong and where."""
+    from hdbridge.axis import AxisConfig
+    from hdbridge.control.bench import compensation_for
+    from hdbridge.drive import load_eds, plan
+    from hdbridge.evaluation.stepping import quantisation_floor_arcsec
+    from hdbridge.model import TransmissionModel
+
     files = Profile.find(profile)
     axis = AxisConfig.load(files.axis)
     plan(axis, load_eds(axis.eds_path, axis.drive.node_id))

@@ -8,11 +8,8 @@ from typing import Annotated
 import typer
 
 from hdbridge.cli.options import Profile, console, load_axis, write_json
-from hdbridge.cli.step import print_result, run_comparison, write_page
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
 
 
 def register(app: typer.Typer) -> None:
@@ -35,6 +32,10 @@ def demo(
     in a SYNC-driven loop; the load encoder says how well it points. It takes half a minute to two. Table,
     JSON, records and a page go to FOLDER.
     """
+    from hdbridge.cli.step import print_result, run_comparison, write_page
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import Stepping
+
     files = Profile.find("article")
     axis = load_axis(files, None, None)
     stepping = Stepping(count=count)

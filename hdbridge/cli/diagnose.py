@@ -5,24 +5,20 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, print_table, write_json
-from hdbridge.diagnose import Diagnosis, Finding, Parameter, diagnose
-from hdbridge.diagnose.planned import plan_report
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import Kind
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.plan import Plan
-from hdbridge.records.recording import Recording
-from hdbridge.report.diagnosis import diagnosis_page
-from hdbridge.report.page import render
+
+if TYPE_CHECKING:
+    from hdbridge.diagnose import Diagnosis, Finding, Parameter
+    from hdbridge.records.recording import Recording
 
 WORTH_TELLING = 0.01
 """A coordinate that less of the difference goes with is not printed."""
@@ -64,6 +60,14 @@ def run(
     With --plan and no record: which causes the planned procedures could detect, down to how many
     arcseconds, and which they could not tell apart.
     """
+    from hdbridge.diagnose import diagnose
+    from hdbridge.diagnose.planned import plan_report
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.plan import Plan
+    from hdbridge.records.recording import Recording
+    from hdbridge.report.diagnosis import diagnosis_page
+    from hdbridge.report.page import render
+
     if model is None:
         raise InputError("--model is missing; name the model file that the records are compared with")
     known = TransmissionModel.load(model)
@@ -183,6 +187,8 @@ def _title(recording: Recording, records: Sequence[Path]) -> str:
 
 
 def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> list[tuple[str, str]]:
+    import numpy as np
+
     rows = [("record", str(each)) for each in records]
     rows += [("model", str(model))]
     rows += [

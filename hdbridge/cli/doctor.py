@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.bringup.checks import Outcome, Row, run_checks
-from hdbridge.bringup.context import TORQUE_PERCENT, BringUpContext
-from hdbridge.bringup.doctor import CHECKS
+from hdbridge.bringup import TORQUE_PERCENT
+from hdbridge.bringup.checks import Outcome
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     ChannelOption,
@@ -26,6 +25,10 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.errors import DriveError
+
+if TYPE_CHECKING:
+    from hdbridge.bringup.checks import Row
+    from hdbridge.bringup.context import BringUpContext
 
 _MARKS = {
     Outcome.PASS: "[green]pass[/green]        ",
@@ -76,6 +79,10 @@ def doctor(
     Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed. This is no safety
     function: an emergency stop stays in hardware.
     """
+    from hdbridge.bringup.checks import run_checks
+    from hdbridge.bringup.context import BringUpContext
+    from hdbridge.bringup.doctor import CHECKS
+
     files = Profile.find(profile)
     refused: list[str] = []
 

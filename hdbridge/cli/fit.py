@@ -7,14 +7,9 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.axis import AxisConfig
-from hdbridge.calibration import fit
-from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
-from hdbridge.model import TransmissionModel
-from hdbridge.records.recording import Recording
 
 
 def register(app: typer.Typer) -> None:
@@ -59,6 +54,12 @@ def command(
     `motor_target_deg` helps. Nothing is activated: a fit that shall be used goes to a profile by --out.
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
+    from hdbridge.axis import AxisConfig
+    from hdbridge.calibration import fit
+    from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
+    from hdbridge.model import TransmissionModel
+    from hdbridge.records.recording import Recording
+
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
     compared = TransmissionModel.load(active) if active else None
     found = fit(

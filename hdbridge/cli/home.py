@@ -21,7 +21,6 @@ from hdbridge.cli.options import (
     notes,
     write_json,
 )
-from hdbridge.drive.drive import Drive
 
 TOWARDS_SWITCH = 0.1
 """Of the axis's highest speed."""
@@ -77,6 +76,8 @@ def home(
     The drive moves by itself, within the speeds given. Ctrl-C stops it (exit status 130). A model belongs to
     the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
     """
+    from hdbridge.drive.drive import Drive
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     with (

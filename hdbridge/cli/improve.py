@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from hdbridge.calibration.validation import worse_ways
-from hdbridge.cli.booted import booted
-from hdbridge.cli.calibration_output import print_next, print_page, print_stepping, print_steps, print_worse
-from hdbridge.cli.diagnose import print_diagnosis
-from hdbridge.cli.measuring import Measurement, PlanOption, kept_in, out_option, phases, resume_option
+from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -31,12 +27,10 @@ from hdbridge.cli.options import (
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import Kind
-from hdbridge.improvement import Improvement, Source, improve
-from hdbridge.improvement.trial import trial_s
-from hdbridge.model import TransmissionModel
-from hdbridge.records.recording import Recording
-from hdbridge.report.diagnosis import diagnosis_page
-from hdbridge.report.page import render
+
+if TYPE_CHECKING:
+    from hdbridge.improvement import Improvement
+    from hdbridge.model import TransmissionModel
 
 LEFT_OF_FLOOR = 1.5
 """A stepping test this far above its floor has something left to find."""
@@ -87,6 +81,12 @@ def command(
     Where nothing is found, or nothing that can be compensated, or where the axis does not point better
     with the extended model, nothing is proposed. The model is used after `hdbridge model commit PROFILE`.
     """
+    from hdbridge.cli.booted import booted
+    from hdbridge.cli.measuring import Measurement, kept_in, phases
+    from hdbridge.improvement import Source, improve
+    from hdbridge.improvement.trial import trial_s
+    from hdbridge.records.recording import Recording
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     active = _active(files)
@@ -125,6 +125,16 @@ def report(
     result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Tell the result, and what comes next."""
+    from hdbridge.calibration.validation import worse_ways
+    from hdbridge.cli.calibration_output import (
+        print_next,
+        print_page,
+        print_stepping,
+        print_steps,
+        print_worse,
+    )
+    from hdbridge.cli.diagnose import print_diagnosis
+
     page = html_file or (folder / "report.html" if folder.is_dir() else None)
     write_json(json_file, result.as_dict())
     if page is not None:
@@ -158,6 +168,9 @@ def report(
 
 def write_page(path: Path, result: Improvement) -> None:
     """The diagnosis with the stepping test, as a self-contained page."""
+    from hdbridge.report.diagnosis import diagnosis_page
+    from hdbridge.report.page import render
+
     provenance = {
         "axis": result.axis,
         "recordings": ", ".join(result.recordings),
@@ -176,6 +189,8 @@ def write_page(path: Path, result: Improvement) -> None:
 
 
 def _active(files: Profile) -> TransmissionModel:
+    from hdbridge.model import TransmissionModel
+
     if not files.model.exists():
         raise InputError(
             f"{files.model}: there is no active model to improve; calibrate first: hdbridge calibrate "

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hdbridge.cli.options import JsonOption, console, notes, write_json
 from hdbridge.clock import MonotonicClock
-from hdbridge.control.latency import CANDIDATES_S, Measurement, measure
-from hdbridge.control.realtime import prepare_realtime
+
+if TYPE_CHECKING:
+    from hdbridge.control.latency import Measurement
 
 
 def register(app: typer.Typer) -> None:
@@ -35,6 +36,9 @@ def latency(
 
     Run it on the machine that will drive the axis, with its usual load, for minutes rather than seconds.
     """
+    from hdbridge.control.latency import CANDIDATES_S, measure
+    from hdbridge.control.realtime import prepare_realtime
+
     periods = tuple(each / 1000.0 for each in cycle_ms) if cycle_ms else CANDIDATES_S
 
     def tell(done: Measurement) -> None:

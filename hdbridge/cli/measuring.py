@@ -7,19 +7,20 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from rich.markup import escape
 
-from hdbridge.axis import AxisConfig
-from hdbridge.calibration import Journal, start_journal
-from hdbridge.calibration.measure import outlook
 from hdbridge.cli.options import notes, progress_bar
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, new_folder
-from hdbridge.procedures.plan import Plan
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.calibration import Journal
+    from hdbridge.drive.drive import Drive
+    from hdbridge.procedures.plan import Plan
 
 PlanOption = Annotated[
     str,
@@ -54,6 +55,10 @@ class Measurement:
 
         The folder is made here: a place that cannot be written is refused before a drive is connected.
         """
+        from hdbridge.calibration import Journal
+        from hdbridge.calibration.measure import outlook
+        from hdbridge.procedures.plan import Plan
+
         date = datetime.now().astimezone()
         if resume is None:
             loaded = Plan.load(plan)
@@ -68,6 +73,8 @@ class Measurement:
 
     def announce(self, after: str) -> None:
         """Tell what is left of the plan and how long that takes; ``after`` says what comes then."""
+        from hdbridge.calibration.measure import outlook
+
         done = self.journal.done if self.journal else ()
         left = outlook(self.plan, self.axis, done)
         for each in left.notes:
@@ -81,6 +88,8 @@ class Measurement:
 
     def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
         """The journal that goes on, else a new one of this booted drive."""
+        from hdbridge.calibration import start_journal
+
         if self.journal is not None:
             return self.journal
         about = {} if simulated_seed is None else {"simulated": True, "seed": simulated_seed}

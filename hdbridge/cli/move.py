@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from hdbridge.cli.booted import booted
 from hdbridge.cli.options import (
     ChannelOption,
     InterfaceOption,
@@ -27,11 +26,11 @@ from hdbridge.cli.options import (
     progress_bar,
     write_json,
 )
-from hdbridge.control.bench import Bench
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Standing
-from hdbridge.procedures.waypoints import Hold, WayPoints
+
+if TYPE_CHECKING:
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import Standing
 
 KEPT_S = 60.0
 """While it is held only the last minute of samples is kept."""
@@ -80,6 +79,10 @@ def move(
     where it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
     ends the command in good order. Then power is off: what hangs on the axis needs a brake.
     """
+    from hdbridge.cli.booted import booted
+    from hdbridge.control.bench import Bench
+    from hdbridge.procedures.waypoints import Hold, WayPoints
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
@@ -110,6 +113,8 @@ def move(
 
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
     """The model that compensates; one without effects where there is none, or none is wanted."""
+    from hdbridge.model import TransmissionModel
+
     if not compensated:
         if given is not None:
             raise InputError("--uncompensated uses no model: leave out --model")

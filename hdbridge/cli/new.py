@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.axis import AxisConfig, BusConfig
-from hdbridge.bringup.newprofile import copy_bundled, write_scanned
-from hdbridge.bringup.scan import Node, scan_bus
 from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, console, notes, write_json
 from hdbridge.clock import MonotonicClock
-from hdbridge.drive.link import Link, open_bus
 from hdbridge.errors import DriveError, InputError
+
+if TYPE_CHECKING:
+    from hdbridge.bringup.scan import Node
 
 
 class Source(Enum):
@@ -57,6 +56,9 @@ def new(
     and gear, as far as it tells them; what is left to fill in is marked, and `hdbridge check` stops there.
     Nothing is moved. A folder that is there already is refused.
     """
+    from hdbridge.axis import AxisConfig
+    from hdbridge.bringup.newprofile import copy_bundled
+
     if source is Source.SCAN:
         written = _scanned(name, interface, channel, bitrate_bps, node_id, eds)
     else:
@@ -83,6 +85,11 @@ def _scanned(
     node_id: int | None,
     eds: Path | None,
 ) -> list[Path]:
+    from hdbridge.axis import BusConfig
+    from hdbridge.bringup.newprofile import write_scanned
+    from hdbridge.bringup.scan import scan_bus
+    from hdbridge.drive.link import Link, open_bus
+
     if interface is None or channel is None:
         raise InputError("--from scan needs a bus: give --interface and --channel (socketcan, can0)")
     bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import can
 import typer
 from rich.console import Console
 from rich.measure import Measurement
@@ -17,15 +16,16 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.control.realtime import prepare_realtime
-from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import is_stream, write_atomically
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.files.outputs import Kind
-from hdbridge.sim.lockstep import simulated_bench
+
+if TYPE_CHECKING:
+    import can
+
+    from hdbridge.axis import AxisConfig
 
 console = Console(highlight=False)
 """Tables for people: standard output."""
@@ -90,6 +90,8 @@ class Profile:
 
 def load_axis(profile: Profile, interface: str | None, channel: str | None) -> AxisConfig:
     """The axis file, with the bus replaced where options say so."""
+    from hdbridge.axis import AxisConfig
+
     axis = AxisConfig.load(profile.axis)
     changes = {
         name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
@@ -102,6 +104,10 @@ def connected(
     axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int
 ) -> Iterator[tuple[can.BusABC, Clock]]:
     """The axis's bus and the clock that goes with it: a simulated drive's, or the real ones."""
+    from hdbridge.control.realtime import prepare_realtime
+    from hdbridge.drive.link import open_bus
+    from hdbridge.sim.lockstep import simulated_bench
+
     if not simulate:
         if truth is not None:
             raise InputError("--truth says what a simulated axis is like: give --simulate with it")

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.calibration import concluded
-from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
@@ -25,6 +23,9 @@ def command(
     html_file: HtmlOption = None,
 ) -> None:
     """Fit a recording again and tell its result; no axis is needed, nothing moves."""
+    from hdbridge.calibration import concluded
+    from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
+
     result = concluded(recording)
     page = html_file or recording / "report.html"
     write_json(json_file, result.as_dict())

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import can
 import typer
 
-from hdbridge.axis import AxisConfig, BusConfig
-from hdbridge.bringup.match import axis_lines, compare
-from hdbridge.bringup.scan import ASK_TIMEOUT_S, LISTEN_S, Node, Scan, scan_bus
+from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.cli.options import (
     ChannelOption,
     InterfaceOption,
@@ -28,8 +25,13 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.drive.link import Link, open_bus
 from hdbridge.errors import DriveError, InputError
+
+if TYPE_CHECKING:
+    import can
+
+    from hdbridge.axis import AxisConfig, BusConfig
+    from hdbridge.bringup.scan import Node, Scan
 
 
 def register(app: typer.Typer) -> None:
@@ -69,6 +71,11 @@ def scan(
 
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
     """
+    from hdbridge.axis import BusConfig
+    from hdbridge.bringup.match import compare
+    from hdbridge.bringup.scan import scan_bus
+    from hdbridge.drive.link import Link
+
     axis = None
     if profile is not None:
         files = Profile.find(profile)
@@ -100,11 +107,15 @@ def scan(
 
 @contextmanager
 def _opened(settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
+    from hdbridge.drive.link import open_bus
+
     with open_bus(settings) as bus:
         yield bus, MonotonicClock()
 
 
 def _print(name: str, found: Scan) -> None:
+    from hdbridge.bringup.match import axis_lines
+
     count = len(found.nodes)
     console.print(f"{name}: {count} node{'' if count == 1 else 's'}", soft_wrap=True)
     for node in found.nodes:
@@ -153,6 +164,8 @@ def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> No
 
 
 def _as_dict(name: str, found: Scan) -> dict[str, Any]:
+    from hdbridge.bringup.match import axis_lines
+
     return {
         "schema": "hdbridge.scan/1",
         "bus": name,

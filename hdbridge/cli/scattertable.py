@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from hdbridge.cli.options import print_table
-from hdbridge.evaluation.stepping import Scatter
+
+if TYPE_CHECKING:
+    from hdbridge.evaluation.stepping import Scatter
 
 
 def print_scatter(

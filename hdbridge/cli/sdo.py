@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,10 +23,11 @@ from hdbridge.cli.options import (
     load_axis,
     write_json,
 )
-from hdbridge.drive.drive import Drive
-from hdbridge.drive.sdo import load_eds
-from hdbridge.drive.values import Object, Value, find_object
 from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.drive.drive import Drive
+    from hdbridge.drive.values import Object, Value
 
 ObjectArgument = Annotated[
     str,
@@ -59,6 +60,8 @@ def get(
     json_file: JsonOption = None,
 ) -> None:
     """Read an object of the drive. The drive is neither booted nor enabled."""
+    from hdbridge.drive.values import find_object
+
     files = Profile.find(profile)
     with _drive(files, simulate, truth, seed, interface, channel) as drive:
         wanted = find_object(object_, drive.sdo.od)
@@ -88,6 +91,9 @@ def put(
     does is up to you: 6040h moves an axis. Until the drive stores it (1010h), it lasts until it is switched
     off; `hdbridge` itself writes what the axis file says at every boot-up.
     """
+    from hdbridge.drive.sdo import load_eds
+    from hdbridge.drive.values import find_object
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     wanted = find_object(object_, load_eds(axis.eds_path, axis.drive.node_id))
@@ -111,6 +117,8 @@ def _drive(
     channel: str | None,
 ) -> Iterator[Drive]:
     """The drive, not booted: its objects are read and written as they are."""
+    from hdbridge.drive.drive import Drive
+
     axis = load_axis(files, interface, channel)
     with (
         connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),

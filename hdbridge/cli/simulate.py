@@ -18,13 +18,7 @@ from hdbridge.cli.options import (
     notes,
 )
 from hdbridge.clock import MonotonicClock
-from hdbridge.drive.link import open_bus
 from hdbridge.errors import InputError
-from hdbridge.sim.lockstep import nameplate_of
-from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
-from hdbridge.sim.run import run
-from hdbridge.sim.truth import Truth
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +44,13 @@ def simulate(
 
         hdbridge step article --interface socketcan --channel vcan0
     """
+    from hdbridge.drive.link import open_bus
+    from hdbridge.sim.lockstep import nameplate_of
+    from hdbridge.sim.machine import Machine
+    from hdbridge.sim.node import SimulatedDrive
+    from hdbridge.sim.run import run
+    from hdbridge.sim.truth import Truth
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     if axis.bus.interface == "virtual":

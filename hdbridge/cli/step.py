@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.axis import AxisConfig
-from hdbridge.cli.booted import booted
 from hdbridge.cli.options import (
     ChannelOption,
     HtmlOption,
@@ -27,17 +25,17 @@ from hdbridge.cli.options import (
     progress_bar,
     write_json,
 )
-from hdbridge.cli.scattertable import print_scatter
-from hdbridge.control.bench import Run
 from hdbridge.errors import InputError
-from hdbridge.evaluation.comparison import Comparison, compare_schemes
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.files.outputs import Kind
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping, SteppingOutcome
-from hdbridge.report.page import render
-from hdbridge.report.stepping import stepping_page
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.control.bench import Run
+    from hdbridge.evaluation.comparison import Comparison
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 
 
 def register(app: typer.Typer) -> None:
@@ -77,6 +75,9 @@ def step(
 
     The article's four schemes, and the whole model where it has more than their two parts.
     """
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import Stepping
+
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
@@ -113,6 +114,9 @@ def run_comparison(
     record: Path | None = None,
 ) -> Comparison:
     """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there."""
+    from hdbridge.cli.booted import booted
+    from hdbridge.evaluation.comparison import compare_schemes
+
     offered = Scheme.offered_by(model)
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
@@ -153,6 +157,8 @@ def run_comparison(
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
     """The result for a person."""
+    from hdbridge.cli.scattertable import print_scatter
+
     print_scatter(
         f"Load error at rest, arcsec: axis '{axis.name}'",
         "compensation",
@@ -177,6 +183,9 @@ def write_page(
     simulated_seed: int | None,
 ) -> None:
     """The result as a self-contained page; it says what was stepped, when, and by which model."""
+    from hdbridge.report.page import render
+    from hdbridge.report.stepping import stepping_page
+
     cycle = f"cycle {axis.drive.cycle_ms:g} ms"
     drive = (
         f"node {axis.drive.node_id} on {axis.bus.interface}:{axis.bus.channel}, {cycle}"

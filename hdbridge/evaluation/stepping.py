@@ -6,13 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import SteppingOutcome
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+if TYPE_CHECKING:
+    from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.stepping import SteppingOutcome
 
 
 class Scheme(Enum):

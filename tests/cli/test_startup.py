@@ -27,6 +27,7 @@ print("scipy" in sys.modules, status)
         (("model", "log", "article"), 0),
         (("scan", "--interface", "socketcan"), 2),
         (("doctor", "--help"), 0),
+        (("check", "article"), 0),
     ],
 )
 def test_scipy_is_not_loaded_where_nothing_is_fitted(arguments, status, tmp_path):
@@ -52,3 +53,15 @@ def test_the_overview_says_what_the_command_says(name, summary):
     said += [each.typer_instance.info.help for each in loaded.registered_groups]
     (words,) = said
     assert " ".join(inspect.cleandoc(words).split("\n\n")[0].split()) == summary
+
+
+def test_no_help_waits_for_what_computes_or_talks_to_a_bus():
+    """All commands are imported as their help needs them; what they run with is not."""
+    program = (
+        "import sys\nfrom hdbridge.cli import PANELS, load\n"
+        "for panel in PANELS.values():\n    for name in panel:\n        load(name)\n"
+        "print(sorted({'scipy', 'can', 'canopen', 'ruckig', 'jinja2'} & set(sys.modules)))"
+    )
+    asked = [sys.executable, "-c", program]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "[]\n"
