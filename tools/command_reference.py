@@ -38,6 +38,10 @@ measurements is new or empty. A model goes to a profile as `PROFILE/pending.yaml
 `hdbridge model commit`. Pipes and character devices are written straight through; `-` is the standard output,
 and what is printed for a person then goes to the standard error.
 
+**Before the command** stand `-v` (tell on standard error what is done on the bus; `-vv`: every SDO
+transfer), `--log FILE` (append all of it, a JSON object per line: `date`, `level`, `where`, `event` and its
+facts; nothing is written while the axis is in its control cycle), and `--install-completion` for your shell.
+
 **Ctrl-C** (and SIGTERM) lets the control cycle end its period and stops the axis; what was measured is kept.
 The third one ends the program at once.
 
