@@ -8,8 +8,8 @@ import sys
 ENTRY = "import sys; sys.argv[0] = 'hdbridge'; from hdbridge.cli import main; main()"
 
 
-def test_the_log_tells_what_was_done_on_the_bus_but_nothing_of_single_cycles(here, tmp_path):
-    done = here("--log", "bus.jsonl", "move", "article", 1, "--simulate")
+def test_the_log_tells_what_was_done_on_the_bus_but_nothing_of_single_cycles(hdbridge, tmp_path):
+    done = hdbridge("--log", "bus.jsonl", "move", "article", 1, "--simulate")
     assert done.returncode == 0, done.stderr
     events = [json.loads(each) for each in (tmp_path / "bus.jsonl").read_text().splitlines()]
     names = [each["event"] for each in events]
@@ -25,22 +25,22 @@ def test_the_log_tells_what_was_done_on_the_bus_but_nothing_of_single_cycles(her
     assert run["samples"] > 100
 
 
-def test_a_log_is_continued(here, tmp_path):
+def test_a_log_is_continued(hdbridge, tmp_path):
     for _ in range(2):
-        here("--log", "bus.jsonl", "sdo", "get", "article", "6064h", "--simulate")
+        hdbridge("--log", "bus.jsonl", "sdo", "get", "article", "6064h", "--simulate")
     lines = (tmp_path / "bus.jsonl").read_text().splitlines()
     assert [json.loads(each)["event"] for each in lines].count("command") == 2
 
 
-def test_a_log_that_cannot_be_written_is_refused(here):
-    done = here("--log", "nowhere/bus.jsonl", "check", "article")
+def test_a_log_that_cannot_be_written_is_refused(hdbridge):
+    done = hdbridge("--log", "nowhere/bus.jsonl", "check", "article")
     assert done.returncode == 2
     assert "nowhere/bus.jsonl: cannot be written: No such file or directory" in done.stderr
 
 
-def test_v_tells_on_standard_error_and_vv_tells_every_transfer(here):
+def test_v_tells_on_standard_error_and_vv_tells_every_transfer(hdbridge):
     quiet, more, most = (
-        here(*v, "sdo", "get", "article", "6064h", "--simulate") for v in ((), ("-v",), ("-vv",))
+        hdbridge(*v, "sdo", "get", "article", "6064h", "--simulate") for v in ((), ("-v",), ("-vv",))
     )
     assert "sdo read" not in quiet.stderr + more.stderr
     assert "sdo read  node=1 object=6064h:00" in most.stderr

@@ -14,8 +14,8 @@ def stands(path):
     return [(each["target_deg"], each["error_arcsec"]) for each in json.loads(path.read_text())["stands"]]
 
 
-def test_way_points_are_reached_compensated(here, tmp_path):
-    done = here("move", "article", 10, -5.5, "--simulate", "--json", "out.json")
+def test_way_points_are_reached_compensated(hdbridge, tmp_path):
+    done = hdbridge("move", "article", 10, -5.5, "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     found = stands(tmp_path / "out.json")
     assert [target for target, _ in found] == [10.0, -5.5]
@@ -24,22 +24,22 @@ def test_way_points_are_reached_compensated(here, tmp_path):
     assert "model.yaml; power is off" in done.stdout
 
 
-def test_relative_angles_count_from_where_the_axis_stood(here, tmp_path):
-    done = here("move", "article", 1, 2, -0.5, "--relative", "--simulate", "--json", "out.json")
+def test_relative_angles_count_from_where_the_axis_stood(hdbridge, tmp_path):
+    done = hdbridge("move", "article", 1, 2, -0.5, "--relative", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert [target for target, _ in stands(tmp_path / "out.json")] == pytest.approx([1.0, 3.0, 2.5])
 
 
-def test_without_compensation_the_gear_shows(here, tmp_path):
-    done = here("move", "article", -5, "--uncompensated", "--simulate", "--hold", 1, "--json", "out.json")
+def test_without_compensation_the_gear_shows(hdbridge, tmp_path):
+    done = hdbridge("move", "article", -5, "--uncompensated", "--simulate", "--hold", 1, "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "not compensated" in done.stdout
     assert abs(stands(tmp_path / "out.json")[0][1]) > 20.0
     assert json.loads((tmp_path / "out.json").read_text())["model"] is None
 
 
-def test_a_profile_without_a_model_moves_uncompensated_and_says_so(here):
-    done = here("move", "demo", 1, "--simulate")
+def test_a_profile_without_a_model_moves_uncompensated_and_says_so(hdbridge):
+    done = hdbridge("move", "demo", 1, "--simulate")
     assert done.returncode == 0, done.stderr
     assert "not compensated" in done.stdout
     assert "model.yaml does not exist" in done.stderr
@@ -56,15 +56,15 @@ def test_a_profile_without_a_model_moves_uncompensated_and_says_so(here):
         ((1, "--velocity", 0), "--velocity: found '0'; expected a number of at least 1e-06"),
     ],
 )
-def test_what_cannot_be_moved_to_is_refused(here, arguments, complaint):
-    done = here("move", "article", *arguments, "--simulate")
+def test_what_cannot_be_moved_to_is_refused(hdbridge, arguments, complaint):
+    done = hdbridge("move", "article", *arguments, "--simulate")
     assert done.returncode == 2
     assert complaint in done.stderr
     assert done.stdout == ""
 
 
 @pytest.mark.parametrize(("leg", "status"), [(Hold, 0), (Settle, 130)])
-def test_ctrl_c_ends_the_holding_in_good_order_and_stops_what_is_on_its_way(here, monkeypatch, leg, status):
+def test_ctrl_c_ends_the_holding_in_good_order_and_stops_a_move(hdbridge, monkeypatch, leg, status):
     ended = leg.ended
 
     def interrupted(self, samples):
@@ -73,21 +73,21 @@ def test_ctrl_c_ends_the_holding_in_good_order_and_stops_what_is_on_its_way(here
         return ended(self, samples) and len(samples) > 30
 
     monkeypatch.setattr(leg, "ended", interrupted)
-    done = here("-v", "move", "article", 1, "--simulate", "--hold", 1e9 if leg is Hold else 0)
+    done = hdbridge("-v", "move", "article", 1, "--simulate", "--hold", 1e9 if leg is Hold else 0)
     assert done.returncode == status, done.stderr
     assert ("power is off" in done.stdout) is (status == 0)
     assert "disabled  node=1" in done.stderr
 
 
-def test_homing_says_where_the_axis_is(here, tmp_path):
-    done = here("home", "article", "--method", 35, "--simulate", "--json", "out.json")
+def test_homing_says_where_the_axis_is(hdbridge, tmp_path):
+    done = hdbridge("home", "article", "--method", 35, "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "homed by method 35" in done.stdout
     found = json.loads((tmp_path / "out.json").read_text())
     assert found["load_position_by_motor_deg"] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_method_that_the_drive_lacks_is_its_refusal(here):
-    done = here("home", "article", "--method", 17, "--simulate")
+def test_a_method_that_the_drive_lacks_is_its_refusal(hdbridge):
+    done = hdbridge("home", "article", "--method", 17, "--simulate")
     assert done.returncode == 4
     assert "6098h" in done.stderr

@@ -22,15 +22,15 @@ def node():
 
 
 @pytest.mark.parametrize("source", ["demo", "article"])
-def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(here, tmp_path, source):
-    done = here("new", "cells/my-axis", "--from", source)
+def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(hdbridge, tmp_path, source):
+    done = hdbridge("new", "cells/my-axis", "--from", source)
     assert done.returncode == 0, done.stderr
     assert "next: hdbridge check cells/my-axis" in done.stdout
     axis = AxisConfig.load(tmp_path / "cells" / "my-axis")
     assert axis.name == "my-axis"
     assert (tmp_path / "cells" / "my-axis" / "model.yaml").exists() is (source == "article")
-    assert here("check", "cells/my-axis").returncode == 0
-    again = here("new", "cells/my-axis")
+    assert hdbridge("check", "cells/my-axis").returncode == 0
+    again = hdbridge("new", "cells/my-axis")
     assert again.returncode == 2
     assert "is there already" in again.stderr
 
@@ -43,8 +43,8 @@ def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(here, tmp_path, sou
         (("mine", "--interface", "socketcan"), "give --from scan with it"),
     ],
 )
-def test_what_makes_no_profile_is_refused_and_nothing_written(here, tmp_path, arguments, complaint):
-    done = here("new", *arguments)
+def test_what_makes_no_profile_is_refused_and_nothing_written(hdbridge, tmp_path, arguments, complaint):
+    done = hdbridge("new", *arguments)
     assert done.returncode == 2
     assert complaint in done.stderr
     assert list(tmp_path.iterdir()) == []

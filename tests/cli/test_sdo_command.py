@@ -22,14 +22,14 @@ from hdbridge.errors import InputError
         ("1008", "1008h:00 'Manufacturer device name': hdbridge simulated CiA-402 servo drive  text"),
     ],
 )
-def test_an_object_is_read_by_number_or_name(here, object_, line):
-    done = here("sdo", "get", "article", object_, "--simulate")
+def test_an_object_is_read_by_number_or_name(hdbridge, object_, line):
+    done = hdbridge("sdo", "get", "article", object_, "--simulate")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [line]
 
 
-def test_an_object_is_written_and_read_back(here, tmp_path):
-    done = here("sdo", "set", "article", "6065h", "0x4e20", "--simulate", "--json", "out.json")
+def test_an_object_is_written_and_read_back(hdbridge, tmp_path):
+    done = hdbridge("sdo", "set", "article", "6065h", "0x4e20", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "out.json").read_text())
     assert (found["value"], found["type"], found["name"]) == (20000, "uint32", "Following error window")
@@ -46,9 +46,9 @@ def test_an_object_is_written_and_read_back(here, tmp_path):
         (("set", "6065h", "few"), "found 'few'; expected an integer"),
     ],
 )
-def test_what_the_eds_does_not_permit_is_refused_before_it_is_sent(here, arguments, complaint):
+def test_what_the_eds_does_not_permit_is_refused_before_it_is_sent(hdbridge, arguments, complaint):
     doing, *rest = arguments
-    done = here("sdo", doing, "article", *rest, "--simulate")
+    done = hdbridge("sdo", doing, "article", *rest, "--simulate")
     assert done.returncode == 2
     assert complaint in done.stderr
 

@@ -25,8 +25,8 @@ import pytest
         (("step", "article", "--count", "1\n2"), r"--count: found '1\n2'"),
     ],
 )
-def test_one_line_says_what_was_given_and_what_is_expected(here, arguments, line):
-    done = here(*arguments)
+def test_one_line_says_what_was_given_and_what_is_expected(hdbridge, arguments, line):
+    done = hdbridge(*arguments)
     assert done.returncode == 2
     assert done.stdout == ""
     (said,) = done.stderr.splitlines()
@@ -35,8 +35,8 @@ def test_one_line_says_what_was_given_and_what_is_expected(here, arguments, line
 
 
 @pytest.mark.parametrize("arguments", [(), ("model",)])
-def test_without_a_command_it_shows_what_there_is(here, arguments):
-    done = here(*arguments)
+def test_without_a_command_it_shows_what_there_is(hdbridge, arguments):
+    done = hdbridge(*arguments)
     assert done.returncode == 2
     assert "Usage" in done.stdout
     assert done.stderr == ""
