@@ -169,6 +169,8 @@ PAIRS = dict(
         pair("torque_modulation", "amplitude_drift", (*TORQUES, *AGAIN)),
     )
 )
+QUICK = ("motor_order and channel_skew",)
+"""Pairs that are part of every run; `make test-slow` has all of them, and all causes with more seeds."""
 UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",))}
 OTHER_LAW = {"Bouc-Wen": Bench(FAST, (), truth=bouc_wen())}
 LAGGING = {"zero_drift behind its sensor": Bench(AGAIN, ("zero_drift",), truth=lagging())}
@@ -178,7 +180,11 @@ NONE = {"nothing": Bench((*FAST, *TURN), ())}
 def of(benches: dict[str, Bench]) -> list[Any]:
     """Parameters: a bench and a seed each."""
     return [
-        pytest.param((bench, seed), id=name if len(SEEDS) == 1 else f"{name}-{seed}")
+        pytest.param(
+            (bench, seed),
+            id=name if len(SEEDS) == 1 else f"{name}-{seed}",
+            marks=[pytest.mark.slow] if seed != SEEDS[0] or (name in PAIRS and name not in QUICK) else [],
+        )
         for name, bench in benches.items()
         for seed in SEEDS
     ]
