@@ -80,12 +80,13 @@ def move(
     ends the command in good order. Then power is off: what hangs on the axis needs a brake.
     """
     from hdbridge.cli.booted import booted
-    from hdbridge.control.bench import Bench
+    from hdbridge.control.bench import Bench, compensation_for
     from hdbridge.procedures.waypoints import Hold, WayPoints
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel)
     chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
+    compensation = compensation_for(axis, chosen)  # refused before anything is connected
     with booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted):
         if simulate and hold_s is None:
             hold_s = 0.0  # nobody sees a simulated axis stand
@@ -93,7 +94,7 @@ def move(
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
         targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
         way = WayPoints(tuple(targets_deg), hold, velocity_deg_s)
-        bench = Bench(drive, chosen, interrupted=lambda: interrupted() and not hold.begun)
+        bench = Bench(drive, compensation, interrupted=lambda: interrupted() and not hold.begun)
         with progress_bar() as bar:
             task = bar.add_task("moving", total=1.0)
 

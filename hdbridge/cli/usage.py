@@ -7,8 +7,6 @@ from typing import Any
 
 import typer
 
-from hdbridge.files.expectation import nearest, one_line
-
 UsageError: Any = typer.BadParameter.__mro__[1]
 """What is wrong with a command line. typer has it from click or brings its own; it exports only an heir."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
@@ -16,6 +14,8 @@ _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 def refusal(error: Any) -> str:
     """One line: the option, what was found, what is expected, and where all of them are listed."""
+    from hdbridge.files.expectation import one_line
+
     context = getattr(error, "ctx", None)
     line = _about_value(error) or _about_line(error)
     path = getattr(context, "command_path", "hdbridge")
@@ -32,6 +32,8 @@ def _about_value(error: Any) -> str | None:
     param, cause = getattr(error, "param", None), error.__cause__
     if param is None or not hasattr(cause, "errors"):
         return None
+    from hdbridge.files.expectation import nearest
+
     first = cause.errors()[0]
     found, kind = first["input"], str(first["type"]).split("_")[0]
     choices = re.findall(r"'([^']*)'", str(first["msg"]).partition("not one of")[2])
@@ -46,6 +48,8 @@ def _about_value(error: Any) -> str | None:
 
 def _about_line(error: Any) -> str:
     """Of a line that has too much or too little."""
+    from hdbridge.files.expectation import nearest
+
     message = str(error.format_message()).strip().rstrip(".")
     option = getattr(error, "option_name", None)
     possible = getattr(error, "possibilities", None)
