@@ -3,6 +3,7 @@
     HdbridgeError
     ├── InputError        2   a file, option or value is wrong: nothing was written, nothing moved
     ├── BusError          3   the CAN interface cannot be opened, or it went away
+    │   └── BusInUseError     another master is heard on it, or holds its lock: nothing was sent
     ├── DriveError        4   the drive is absent, refuses, is not the one expected, or reports a fault
     │   ├── SdoError          an object could not be read or written
     │   ├── IdentityError     object 1018h, the ratio or the direction is not what the axis file says
@@ -32,6 +33,10 @@ class BusError(HdbridgeError):
     """The CAN interface cannot be opened or has gone away."""
 
     exit_status = 3
+
+
+class BusInUseError(BusError):
+    """Somebody else masters the bus. Nothing was sent."""
 
 
 class DriveError(HdbridgeError):

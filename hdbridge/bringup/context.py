@@ -31,6 +31,7 @@ class BringUpContext:
 
     ``load`` reads the axis file, ``connect`` opens its bus: both are checks, so they come as functions.
     ``torque_percent`` limits every motion, of the rated torque, besides the axis file's own limit.
+    ``force`` speaks even where another master is heard on the bus.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class BringUpContext:
         connect: Connect,
         *,
         torque_percent: float = TORQUE_PERCENT,
+        force: bool = False,
         interruptible: Interruptible = lambda: nullcontext(lambda: False),
     ) -> None:
         self.load = load
@@ -54,6 +56,7 @@ class BringUpContext:
         """Feedback of the long move forth, and of the stand at its end."""
         self.rest_begins = 0
         self._connect = connect
+        self._force = force
         self._stack = ExitStack()
         self._axis: AxisConfig | None = None
         self._od: ObjectDictionary | None = None
@@ -74,9 +77,9 @@ class BringUpContext:
         self._axis, self._od = axis, od
 
     def connect(self) -> None:
-        """Open the bus. Raises `BusError`."""
+        """Open the bus; nothing is sent yet. Raises `BusError`."""
         bus, clock = self._stack.enter_context(self._connect(self.axis))
-        self._drive = self._stack.enter_context(Drive(bus, self.axis, clock, self._od))
+        self._drive = self._stack.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
     @property
     def axis(self) -> AxisConfig:

@@ -13,6 +13,7 @@ from typing import Final
 from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.drive import objects
 from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.manners import Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import IDENTITY
 from hdbridge.drive.objects import Address, IntegerType, Mode, NmtState
@@ -119,7 +120,7 @@ class Scan:
         return next((each for each in self.nodes if each.node_id == node_id), None)
 
 
-class _Ear:
+class _Hearing:
     """Takes every frame that comes and notes whose it is."""
 
     def __init__(self, link: Link) -> None:
@@ -130,8 +131,10 @@ class _Ear:
         self.busy: set[int] = set()
         self.syncs = 0
         self.commands = 0
+        self.masters = Ear(NODE_IDS)
 
     def take(self, frame: Frame) -> None:
+        self.masters.take(frame)
         can_id, node_id = frame.can_id, frame.can_id & 0x7F
         function = can_id - node_id
         if self.monitor.dispatch(frame):
@@ -173,13 +176,20 @@ def scan_bus(
     listen_s: float = LISTEN_S,
     timeout_s: float = ASK_TIMEOUT_S,
     progress: Callable[[float], None] = lambda _: None,
+    force: bool = False,
 ) -> Scan:
     """Listen for ``listen_s``, then ask every node id for its device type, and those that answer for more.
 
-    ``progress`` receives the share done. Raises `BusError` when the interface fails.
+    ``progress`` receives the share done. Raises `BusInUseError` before anything is sent when another master
+    is heard (a request may stop the axis that it moves), and listens for as long as that takes; ``force``
+    asks all the same. Raises `BusError` when the interface fails.
     """
-    ear = _Ear(link)
-    ear.listen(listen_s)
+    force = force or link.private
+    ear = _Hearing(link)
+    duration_s = listen_s if force else max(listen_s, listening_s())
+    ear.listen(duration_s)
+    if not force:
+        ear.masters.refuse(link.name, duration_s)
     nodes: dict[int, Node] = {}
     for place, node_id in enumerate(NODE_IDS):
         if node_id in ear.busy:
@@ -195,7 +205,7 @@ def scan_bus(
     return Scan(tuple(nodes[each] for each in sorted(nodes)), tuple(ear.remarks()))
 
 
-def _ask(ear: _Ear, node_id: int, timeout_s: float) -> Node:
+def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
     node = Node(node_id)
     sdo = SdoClient(ear.link, ear.monitor, node_id, None, timeout_s, attempts=1)
     try:

@@ -61,10 +61,11 @@ def files(context: BringUpContext) -> Verdict:
 
 
 def bus(context: BringUpContext) -> Verdict:
-    """The bus opens."""
+    """The bus opens, and nobody else masters it."""
     context.connect()
+    context.drive.listen()
     link = context.drive.link
-    return passed(f"{link.name} is open", bus=link.name)
+    return passed(f"{link.name} is open, no other master is heard", bus=link.name)
 
 
 def answers(context: BringUpContext) -> Verdict:
@@ -75,15 +76,10 @@ def answers(context: BringUpContext) -> Verdict:
     except SdoAbortError:
         raise
     except SdoError:
-        found = scan_bus(drive.link, listen_s=0.3)
+        found = scan_bus(drive.link, listen_s=0.3, force=True)
         _, lines = compare(axis, found)
         others = ", ".join(f"node {each.node_id} ({each.kind})" for each in found.nodes) or "nobody"
         wiring = "check power, cable, termination (60 ohm between CAN_H and CAN_L) and bit rate"
-        if axis.bus.interface == "virtual":
-            wiring = (
-                f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
-                "expected the interface of the bus (socketcan), or give --simulate"
-            )
         return failed(
             f"node {axis.drive.node_id} does not answer; on the bus: {others}",
             *(lines if found.nodes else (wiring, *lines)),

@@ -23,14 +23,18 @@ def booted(
     simulate: bool,
     truth: Path | None,
     seed: int,
+    force: bool,
 ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-    """The booted drive, and a function that tells whether somebody wishes to end."""
+    """The booted drive, and a function that tells whether somebody wishes to end.
+
+    ``force`` speaks even where another master is heard.
+    """
     from hdbridge.drive.drive import Drive
 
     with (
         deferred_interrupt() as interrupted,
-        connected(axis, profile, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
+        connected(axis, profile, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
+        Drive(bus, axis, clock, force=force) as drive,
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")

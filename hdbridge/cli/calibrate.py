@@ -11,6 +11,7 @@ from rich.markup import escape
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     HtmlOption,
     InterfaceOption,
     JsonOption,
@@ -47,6 +48,7 @@ def command(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -62,12 +64,12 @@ def command(
     from hdbridge.cli.measuring import Measurement, kept_in, phases
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     work = Measurement.asked(axis, plan, out, resume)
     work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
     with (
         kept_in(work.folder),
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):
         journal = work.begun(drive, seed if simulate else None)
         with phases() as progress:

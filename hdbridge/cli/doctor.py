@@ -11,6 +11,7 @@ from hdbridge.bringup.checks import Outcome
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     InterfaceOption,
     JsonOption,
     Profile,
@@ -18,6 +19,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
+    check_bus_options,
     connected,
     console,
     load_axis,
@@ -56,6 +58,7 @@ def doctor(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     torque_percent: Annotated[
         float,
         typer.Option(
@@ -83,6 +86,7 @@ def doctor(
     from hdbridge.bringup.context import BringUpContext
     from hdbridge.bringup.doctor import CHECKS
 
+    check_bus_options(interface, channel, simulate=simulate)
     files = Profile.find(profile)
     refused: list[str] = []
 
@@ -96,8 +100,9 @@ def doctor(
 
     with BringUpContext(
         lambda: load_axis(files, interface, channel),
-        lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed),
+        lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force),
         torque_percent=torque_percent,
+        force=force,
         interruptible=deferred_interrupt,
     ) as context:
         rows = run_checks(context, CHECKS, permitted=permitted, tell=_tell)

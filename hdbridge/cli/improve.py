@@ -11,6 +11,7 @@ from rich.markup import escape
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     HtmlOption,
     InterfaceOption,
     JsonOption,
@@ -72,6 +73,7 @@ def command(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -88,7 +90,7 @@ def command(
     from hdbridge.records.recording import Recording
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     active = _active(files)
     if given and resume is not None:
         raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
@@ -103,7 +105,7 @@ def command(
         work.announce(trial)
     with (
         kept_in(work.folder),
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):
         journal = None if recordings else work.begun(drive, seed if simulate else None)
         with phases() as progress:

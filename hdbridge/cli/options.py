@@ -58,6 +58,10 @@ InterfaceOption = Annotated[
     str | None, typer.Option("--interface", help="python-can interface, instead of the axis file's.")
 ]
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
+ForceOption = Annotated[
+    bool,
+    typer.Option("--force", help="Speak even where another master is heard on the bus, or has its lock."),
+]
 JsonOption = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write the result for machines; - is standard output."),
@@ -88,10 +92,22 @@ class Profile:
         return cls(axis, folder / "model.yaml", folder / "truth.yaml")
 
 
-def load_axis(profile: Profile, interface: str | None, channel: str | None) -> AxisConfig:
+def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
+    """Refuse a simulated drive on a bus that is named: it would not be used."""
+    if simulate and (interface is not None or channel is not None):
+        raise InputError(
+            "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
+            "simulated drive on a bus is 'hdbridge simulate' in another process"
+        )
+
+
+def load_axis(
+    profile: Profile, interface: str | None, channel: str | None, *, simulate: bool = False
+) -> AxisConfig:
     """The axis file, with the bus replaced where options say so."""
     from hdbridge.axis import AxisConfig
 
+    check_bus_options(interface, channel, simulate=simulate)
     axis = AxisConfig.load(profile.axis)
     changes = {
         name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
@@ -101,9 +117,12 @@ def load_axis(profile: Profile, interface: str | None, channel: str | None) -> A
 
 @contextmanager
 def connected(
-    axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int
+    axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
 ) -> Iterator[tuple[can.BusABC, Clock]]:
-    """The axis's bus and the clock that goes with it: a simulated drive's, or the real ones."""
+    """The axis's bus and the clock that goes with it: a simulated drive's, or the real ones.
+
+    ``force`` opens the bus even where another process of this machine masters it.
+    """
     from hdbridge.control.realtime import prepare_realtime
     from hdbridge.drive.link import open_bus
     from hdbridge.sim.lockstep import simulated_bench
@@ -112,9 +131,13 @@ def connected(
         if truth is not None:
             raise InputError("--truth says what a simulated axis is like: give --simulate with it")
         if axis.bus.interface == "virtual":
-            notes.print("the bus 'virtual' ends in this process; --simulate puts a simulated drive there")
-        wanted = axis.realtime
-        with prepare_realtime(wanted.priority, wanted.cpus) as conditions, open_bus(axis.bus) as bus:
+            raise InputError(
+                f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
+                "expected the interface of the bus (socketcan), or give --simulate, which puts a simulated "
+                "drive there"
+            )
+        wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=force)
+        with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
             notes.print(f"this process: {conditions}")
             yield bus, MonotonicClock()
         return

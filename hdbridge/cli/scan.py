@@ -11,6 +11,7 @@ import typer
 from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     InterfaceOption,
     JsonOption,
     Profile,
@@ -49,12 +50,14 @@ def scan(
     ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     bitrate_bps: Annotated[
         int | None,
         typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
     ] = None,
     listen_s: Annotated[
-        float, typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking.")
+        float,
+        typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51."),
     ] = LISTEN_S,
     timeout_ms: Annotated[
         float, typer.Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
@@ -66,7 +69,8 @@ def scan(
 ) -> None:
     """List the nodes on a CAN bus: what they are, their identity, their state, and lines for an axis file.
 
-    It listens, then reads a few objects of every node id from 1 to 127. It writes no object, sends no NMT
+    It listens, and asks nothing where another master is heard: a request may stop the axis that it moves.
+    Then it reads a few objects of every node id from 1 to 127. It writes no object, sends no NMT
     command and enables nothing; a node that another SDO client is talking to is left alone.
 
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
@@ -79,12 +83,12 @@ def scan(
     axis = None
     if profile is not None:
         files = Profile.find(profile)
-        axis = load_axis(files, interface, channel)
-        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed)
+        axis = load_axis(files, interface, channel, simulate=simulate)
+        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force)
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        opened = _opened(BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps))
+        opened = _opened(BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps), force)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)
@@ -92,6 +96,7 @@ def scan(
             link,
             listen_s=listen_s,
             timeout_s=timeout_ms / 1000.0,
+            force=force,
             progress=lambda share: bar.update(task, completed=share),
         )
     matches, lines = (False, []) if axis is None else compare(axis, found)
@@ -106,10 +111,10 @@ def scan(
 
 
 @contextmanager
-def _opened(settings: BusConfig) -> Iterator[tuple[can.BusABC, Clock]]:
+def _opened(settings: BusConfig, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
     from hdbridge.drive.link import open_bus
 
-    with open_bus(settings) as bus:
+    with open_bus(settings, shared=force) as bus:
         yield bus, MonotonicClock()
 
 

@@ -61,7 +61,7 @@ def simulate(
         )
     known = Truth.load(truth or files.truth)
     clock = MonotonicClock()
-    with deferred_interrupt() as interrupted, open_bus(axis.bus) as bus:
+    with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
         node = SimulatedDrive(
             bus, Machine(known, seed), axis.eds_path, axis.drive.node_id, clock, nameplate_of(known)
         )

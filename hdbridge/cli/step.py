@@ -10,6 +10,7 @@ import typer
 
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     HtmlOption,
     InterfaceOption,
     JsonOption,
@@ -63,6 +64,7 @@ def step(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     record: Annotated[
@@ -79,7 +81,7 @@ def step(
     from hdbridge.procedures.stepping import Stepping
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     chosen: Path | None = model or files.model
     if scheme and set(scheme) == {Scheme.NONE} and model is None:
@@ -93,6 +95,7 @@ def step(
         simulate=simulate,
         truth=truth,
         seed=seed,
+        force=force,
         record=record,
     )
     write_json(json_file, comparison.as_dict())
@@ -111,6 +114,7 @@ def run_comparison(
     simulate: bool,
     truth: Path | None,
     seed: int,
+    force: bool = False,
     record: Path | None = None,
 ) -> Comparison:
     """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there."""
@@ -129,7 +133,7 @@ def run_comparison(
             run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
 
     with (
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
         progress_bar() as bar,
     ):
         bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}

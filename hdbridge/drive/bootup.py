@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
+from hdbridge.drive.manners import heartbeat_of
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import (
     IDENTITY,
@@ -57,17 +58,25 @@ class BootReport:
 
 
 class BootUp:
-    """One boot-up. ``clients`` has an SDO client for the drive, and one for a separate load encoder."""
+    """One boot-up. ``clients`` has an SDO client for the drive, and one for a separate load encoder.
+
+    ``others_heard`` are other nodes that have shown themselves before.
+    """
 
     def __init__(
-        self, link: Link, monitor: NetworkMonitor, axis: AxisConfig, clients: dict[int, SdoClient]
+        self,
+        link: Link,
+        monitor: NetworkMonitor,
+        axis: AxisConfig,
+        clients: dict[int, SdoClient],
+        others_heard: Iterable[int] = (),
     ) -> None:
         self._link = link
         self._monitor = monitor
         self._axis = axis
         self._clients = clients
         self._sdo = clients[axis.drive.node_id]
-        self._others_heard: set[int] = set()
+        self._others_heard = set(others_heard)
 
     def run(self, *, reset: bool) -> BootReport:
         """All of it, in order. Raises `DriveError` (or a kind of it) at the first thing that is wrong."""
@@ -104,8 +113,7 @@ class BootUp:
         if frame is None:
             return False
         self._monitor.dispatch(frame)
-        node_id = frame.can_id - objects.COB_HEARTBEAT
-        if 0 < node_id < 128 and node_id not in self._clients:
+        if (node_id := heartbeat_of(frame)) is not None and node_id not in self._clients:
             self._others_heard.add(node_id)
         return frame.time_s <= deadline_s
 

@@ -23,6 +23,7 @@ from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
+from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
 from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient, load_eds
@@ -54,6 +55,7 @@ class Drive:
     """One drive on one bus. A context manager: on every way out the drive is stopped and disabled.
 
     The bus stays the caller's and open. ``od`` replaces the EDS of the axis file (for a test, or a DCF).
+    ``force`` speaks even where another master is heard on the bus.
     """
 
     def __init__(
@@ -63,6 +65,8 @@ class Drive:
         clock: Clock | None = None,
         od: ObjectDictionary | None = None,
         sdo_timeout_s: float = DEFAULT_TIMEOUT_S,
+        *,
+        force: bool = False,
     ) -> None:
         self.axis = axis
         self.link = Link(bus, clock if clock is not None else MonotonicClock())
@@ -79,20 +83,39 @@ class Drive:
         self._commander = Commander(self.link, self.monitor, self.sdo, self.image)
         self._mode: Mode | None = None
         self._touched = False
+        self._may_speak = force or self.link.private
+        self._heard: frozenset[int] = frozenset()
         self.report: BootReport | None = None
         """What the last boot-up found and did."""
+
+    def listen(self) -> None:
+        """Hear, once, whether somebody else masters the bus; `BusInUseError` then, and nothing is sent.
+
+        It takes two heartbeats, and at least the 0.51 s in which the slowest other master sends two SYNCs.
+        `boot` does it; call it before reading objects of a drive that is not booted.
+        """
+        if self._may_speak:
+            return
+        drive = self.axis.drive
+        ear = Ear({drive.node_id}, {drive.master_node_id, USUAL_MASTER}, self._clients)
+        duration_s = listening_s(drive.heartbeat_ms)
+        ear.listen(self.link, duration_s, self.monitor.dispatch)
+        ear.refuse(self.link.name, duration_s)
+        self._heard = frozenset(ear.nodes.difference(self._clients))
+        self._may_speak = True
 
     def boot(self, *, reset: bool = True) -> BootReport:
         """Boot the drive up to OPERATIONAL, power off: see docs/master.md for each step.
 
         ``reset`` resets the node's communication first, so that it starts from known settings. Raises
         `DriveError` when it is absent or refuses, `IdentityError` when it is another drive or scales
-        differently, `BusError`.
+        differently, `BusInUseError` before anything is sent when another master is heard, `BusError`.
         """
+        self.listen()
         self._touched = True
         self.report = None
         self._mode = None
-        self.report = BootUp(self.link, self.monitor, self.axis, self._clients).run(reset=reset)
+        self.report = BootUp(self.link, self.monitor, self.axis, self._clients, self._heard).run(reset=reset)
         _log.info("booted", {"node": self.axis.drive.node_id, "bus": self.link.name, **self.report.identity})
         return self.report
 

@@ -12,13 +12,14 @@ import logging
 import os
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol
 
 import can
 
 from hdbridge.clock import Clock
+from hdbridge.drive.interfacelock import interface_lock
 from hdbridge.errors import BusError
 
 _log = logging.getLogger(__name__)
@@ -88,6 +89,7 @@ class Link:
 
     __slots__ = (
         "_down", "_mark", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now",
+        "private",
     )  # fmt: skip
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
@@ -96,6 +98,8 @@ class Link:
         self.now = clock.now
         self.name = str(getattr(bus, "channel_info", "") or type(bus).__name__)
         self.dropped = Dropped()
+        self.private: bool = getattr(bus, "private", False)
+        """Nobody but the drive and this link can be on the bus: it says so itself."""
         self._down: str | None = None
         self._mark = _mark(bus)
         self._send = bus.send
@@ -219,11 +223,20 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 @contextmanager
-def open_bus(settings: BusSettings) -> Iterator[can.BusABC]:
+def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.BusABC]:
     """Open the bus of an axis file; `BusError` in one line when that is not possible.
 
+    One process of a machine opens an interface, the next is refused with `BusInUseError`: two masters on one
+    bus stop each other's axes. ``shared`` is for a program that is no master, and for one that insists.
     Configuration files of python-can in the home folder are ignored: the axis file says it all.
     """
+    lock = nullcontext() if shared else interface_lock(settings.interface, settings.channel)
+    with lock, _opened(settings) as bus:
+        yield bus
+
+
+@contextmanager
+def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
     name = f"{settings.interface}:{settings.channel}"
     options: dict[str, Any] = dict(settings.options)
     if settings.bitrate_bps is not None:

@@ -125,6 +125,8 @@ class LockstepBus(can.BusABC):
         self._inner = _PolledBus(channel)
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
+        self.private = False
+        """Nobody but the master and the drives of the clock knows the channel."""
         self.channel_info = "the simulated bus"
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -188,6 +190,7 @@ def lockstep_bench(
     ``channel`` names the python-can virtual channel (by default one of its own), so that a test may listen
     or interfere there. ``others`` are further nodes to be polled.
     """
+    private = channel is None
     channel = channel or f"hdbridge-{uuid4()}"
     clock = VirtualClock()
     with _PolledBus(channel) as node_bus:
@@ -195,6 +198,7 @@ def lockstep_bench(
         node.poll(clock.now())
         clock.nodes += [node, *others]
         with LockstepBus(channel, clock) as bus:
+            bus.private = private
             yield bus, clock, node
 
 

@@ -14,11 +14,13 @@ from hdbridge.bringup.match import axis_lines, compare
 from hdbridge.bringup.scan import Node, Scan, scan_bus
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
+from hdbridge.errors import BusInUseError
 from hdbridge.files.bundled import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
+from tests.support.chatter import Chatter
 
 AXIS = AxisConfig.load(bundled_profile("article"))
 EDS = bundled_folder("eds") / "hdbridge-402.eds"
@@ -51,24 +53,6 @@ class Encoder:
                 self.bus.send(
                     can.Message(arbitration_id=0x580 + self.node_id, data=answer, is_extended_id=False)
                 )
-
-
-class Chatter:
-    """Somebody who sends frames of his own, every 0.1 s."""
-
-    def __init__(self, bus: can.BusABC, *frames: tuple[int, bytes]) -> None:
-        self.bus, self.frames, self.due_s = bus, frames, 0.1
-
-    def next_event_s(self) -> float:
-        return self.due_s
-
-    def poll(self, now_s: float) -> None:
-        while self.bus.recv(0) is not None:
-            pass
-        if now_s >= self.due_s:
-            self.due_s = now_s + 0.1
-            for can_id, data in self.frames:
-                self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
 
 @contextmanager
@@ -139,7 +123,7 @@ def test_a_node_that_another_client_talks_to_is_left_alone() -> None:
 
 def test_another_master_and_silent_nodes_are_told() -> None:
     with bench((0x080, b""), (0x000, b"\x01\x00"), (0x714, b"\x04")) as (link, _, _):
-        found = scan_bus(link)
+        found = scan_bus(link, force=True)
     stopped = found.node(0x14)
     assert stopped is not None
     assert (stopped.answers, stopped.state) == (False, "stopped")
@@ -147,11 +131,21 @@ def test_another_master_and_silent_nodes_are_told() -> None:
     assert "NMT" in found.remarks[1]
 
 
+@pytest.mark.parametrize("can_id", [0x080, 0x000, 0x77F, 0x201, 0x405], ids=hex)
+def test_nothing_is_asked_while_another_master_runs(can_id: int) -> None:
+    with (
+        bench((can_id, b"\x05\x00")) as (link, _, seen),
+        pytest.raises(BusInUseError, match=rf"somebody else masters this bus.*\({can_id:03X}h\)"),
+    ):
+        scan_bus(link, listen_s=0.0)
+    assert not [each for each in seen if 0x600 < each.arbitration_id < 0x680]
+
+
 def test_an_empty_bus() -> None:
     with can.Bus(interface="virtual", channel=str(uuid4()), ignore_config=True) as bus:
         from hdbridge.clock import MonotonicClock
 
-        found = scan_bus(Link(bus, MonotonicClock()), listen_s=0.0, timeout_s=0.0005)
+        found = scan_bus(Link(bus, MonotonicClock()), listen_s=0.0, timeout_s=0.0005, force=True)
     assert found.nodes == ()
 
 

@@ -63,11 +63,6 @@ def test_wrong_identity_is_refused_by_the_drive(hdbridge, profile):
     refused(done, 4, "1018h", "product_code")
 
 
-def test_absent_node(hdbridge, profile):
-    done = hdbridge("step", profile("channel: hdbridge", "channel: nobody-there"))
-    refused(done, 4, "node 1", "Virtual bus channel nobody-there", "drive.node_id")
-
-
 def test_absent_interface(hdbridge, profile):
     done = hdbridge("step", profile.folder, "--interface", "socketcan", "--channel", "nocan7")
     refused(done, 3, "socketcan:nocan7")
@@ -98,3 +93,18 @@ def test_usage_errors_have_status_2(hdbridge):
     done = hdbridge("step")
     assert done.returncode == 2
     assert "PROFILE" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["step", "calibrate", "improve", "scan", "doctor"])
+def test_a_simulated_drive_has_no_bus_to_choose(here, command):
+    done = here(command, "article", "--simulate", "--interface", "socketcan")
+    assert done.returncode == 2
+    assert "leave out --interface and --channel" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["step", "calibrate", "scan"])
+def test_the_virtual_bus_without_a_drive_is_refused_at_once(here, command):
+    done = here(command, "article")
+    assert done.returncode == 2
+    assert "bus.interface: found virtual, which reaches nothing outside this process" in done.stderr
+    assert "--simulate" in done.stderr

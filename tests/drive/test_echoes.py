@@ -34,7 +34,7 @@ def multicast() -> BusConfig:
     """A multicast channel of this test's own; the test is skipped where the machine carries none."""
     config = BusConfig(interface="udp_multicast", channel=GROUP, options={"port": free_port()})
     try:
-        with open_bus(config) as near, open_bus(config) as far:
+        with open_bus(config, shared=True) as near, open_bus(config, shared=True) as far:
             near.send(can.Message(arbitration_id=1, is_extended_id=False))
             arrived = far.recv(1.0) is not None
     except Exception as error:
@@ -48,7 +48,7 @@ def multicast() -> BusConfig:
 def links(multicast: BusConfig) -> Iterator[tuple[Link, Link]]:
     """Two masters on the channel."""
     with ExitStack() as stack:
-        one, two = (stack.enter_context(open_bus(multicast)) for _ in range(2))
+        one, two = (stack.enter_context(open_bus(multicast, shared=True)) for _ in range(2))
         yield Link(one, MonotonicClock()), Link(two, MonotonicClock())
 
 
@@ -79,7 +79,7 @@ def test_a_frame_of_a_node_that_marks_nothing_is_received(
     links: tuple[Link, Link], multicast: BusConfig
 ) -> None:
     near, _ = links
-    with open_bus(multicast) as node:
+    with open_bus(multicast, shared=True) as node:
         node.send(can.Message(arbitration_id=0x181, data=b"\x01", is_extended_id=False))
         assert heard(near) == (0x181, b"\x01")
 

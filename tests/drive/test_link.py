@@ -193,7 +193,7 @@ def test_what_the_interface_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         return FakeBus()
 
     monkeypatch.setattr("can.Bus", bus)
-    with open_bus(BusConfig(interface="socketcan", channel="can0", bitrate_bps=500_000)):
+    with open_bus(BusConfig(interface="socketcan", channel="can0", bitrate_bps=500_000), shared=True):
         pass
     assert told == {
         "interface": "socketcan",

@@ -172,10 +172,11 @@ class Master:
 
 
 @contextmanager
-def master_on(channel: str, profile: Path | None = None) -> Iterator[Master]:
+def master_on(channel: str, profile: Path | None = None, *, shared: bool = False) -> Iterator[Master]:
+    """``shared`` for a master beside one of this process whose link has died."""
     axis = AxisConfig.load(profile or unhurried_profile())
     settings = axis.bus.model_copy(update={"interface": "socketcan", "channel": channel})
-    with open_bus(settings) as bus:
+    with open_bus(settings, shared=shared) as bus:
         drive = Drive(bus, axis, MonotonicClock())
         supervision = Supervision()
         cycle = Cycle(
@@ -208,7 +209,7 @@ def master(interface: str, simulated: subprocess.Popen[bytes]) -> Iterator[Maste
 
 
 @pytest.fixture
-def another_master() -> Callable[[str], AbstractContextManager[Master]]:
+def another_master() -> Callable[..., AbstractContextManager[Master]]:
     """Makes a second master, for after the first is gone."""
     return master_on
 

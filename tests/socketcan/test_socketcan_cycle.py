@@ -89,7 +89,7 @@ def test_link_down_latches_and_the_way_back_is_a_new_link(
         master.drive.link.send(0x080, b"")
     may_configure("link", "set", "up", interface)
     time.sleep(0.5)
-    with another_master(interface) as again:
+    with another_master(interface, shared=True) as again:
         again.boot()
         assert again.run(50)[-1].fresh
 

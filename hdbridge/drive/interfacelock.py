@@ -1,0 +1,68 @@
+"""One master per CAN interface on this machine: a lock that goes with the process that holds it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+from hdbridge.errors import BusError, BusInUseError
+
+try:
+    import fcntl
+except ImportError:  # a system without flock has no lock
+    fcntl = None  # type: ignore[assignment]
+
+_SHARED_BY_ALL_USERS: Final = Path("/run/lock")
+_IN_ONE_PROCESS: Final = frozenset({"virtual"})
+"""Interfaces of python-can that end in their process."""
+
+
+@contextmanager
+def interface_lock(interface: str, channel: object, folder: Path | None = None) -> Iterator[None]:
+    """Hold the lock of an interface; `BusInUseError` where somebody on this machine has it.
+
+    The lock file stays: to remove it would give the next two processes a lock each. ``folder`` is where it
+    lies, by default one that all users of the machine share.
+    """
+    if fcntl is None or interface in _IN_ONE_PROCESS:
+        yield
+        return
+    path = (folder or _folder()) / f"hdbridge-{quote(f'{interface}-{channel}', safe='')}.lock"
+    handle = _open(path)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BusInUseError(
+                f"{interface}:{channel}: another hdbridge on this machine masters it (it holds {path}); end "
+                "that one first (--force, in the library shared=True, opens the bus all the same)"
+            ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _folder() -> Path:
+    return _SHARED_BY_ALL_USERS if os.access(_SHARED_BY_ALL_USERS, os.W_OK) else Path(tempfile.gettempdir())
+
+
+def _open(path: Path) -> int:
+    """Open for reading, which is enough to lock it: the file may be another user's."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW
+    try:
+        try:
+            handle = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644)
+            os.fchmod(handle, 0o644)  # whatever the umask: the next one may be another user
+        except FileExistsError:
+            return os.open(path, flags)
+        return handle
+    except OSError as error:
+        raise BusError(
+            f"{path}: the lock of the CAN interface cannot be opened: {error.strerror}; remove it, or give "
+            "--force (in the library shared=True) to do without"
+        ) from error

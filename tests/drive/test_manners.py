@@ -1,0 +1,171 @@
+"""A master listens before it speaks, and holds a lock on its interface while it does."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import can
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.link import open_bus
+from hdbridge.errors import BusError, BusInUseError
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.sim.lockstep import VirtualClock, lockstep_bench, simulated_bench
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+from tests.support.chatter import Chatter
+
+AXIS = AxisConfig.load(bundled_profile("article"))
+SDO_REQUEST = (0x601, b"\x40\x00\x10\0\0\0\0\0")
+
+
+@contextmanager
+def bench(
+    *frames: tuple[int, bytes], period_s: float = 0.1
+) -> Iterator[tuple[can.BusABC, VirtualClock, can.BusABC]]:
+    """The master's end of a bus on which somebody sends ``frames``, and a witness that hears what is sent."""
+    channel = f"manners-{uuid4()}"
+    truth = Truth.load(bundled_profile("article"))
+    with ExitStack() as stack:
+        chatter, witness = (
+            stack.enter_context(can.Bus(interface="virtual", channel=channel, ignore_config=True))
+            for _ in range(2)
+        )
+        others: Any = [Chatter(chatter, *frames, period_s=period_s)]
+        bus, clock, _ = stack.enter_context(
+            lockstep_bench(Machine(truth, 0), AXIS.eds_path, 1, channel, others=others)
+        )
+        yield bus, clock, witness
+
+
+def identifiers(witness: can.BusABC) -> set[int]:
+    seen = set()
+    while (message := witness.recv(0)) is not None:
+        seen.add(message.arbitration_id)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("frame", "name"),
+    [
+        ((0x080, b""), "SYNC"),
+        ((0x000, b"\x01\x05"), "NMT commands"),
+        ((0x77F, b"\x05"), "heartbeats of master 127"),
+        ((0x201, bytes(6)), "set-points of node 1"),
+        ((0x301, bytes(6)), "set-points of node 1"),
+        ((0x501, bytes(6)), "set-points of node 1"),
+        (SDO_REQUEST, "SDO requests to node 1"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else f"{value[0]:03X}h",
+)
+def test_a_drive_that_another_master_has_is_left_alone(frame: tuple[int, bytes], name: str) -> None:
+    with bench(frame) as (bus, clock, witness), Drive(bus, AXIS, clock) as drive:
+        with pytest.raises(BusInUseError, match=f"somebody else masters this bus: .*{name}") as refused:
+            drive.boot()
+        assert "\n" not in str(refused.value)
+        drive.close()
+        assert identifiers(witness) <= {frame[0], 0x701, 0x581}
+    assert refused.value.exit_status == 3
+
+
+def test_the_slowest_other_master_is_heard() -> None:
+    with bench((0x080, b""), period_s=0.255) as (bus, clock, _), pytest.raises(BusInUseError):
+        Drive(bus, AXIS, clock).boot()
+
+
+def test_frames_of_other_nodes_are_no_master() -> None:
+    others = ((0x702, b"\x05"), (0x182, bytes(8)), (0x202, bytes(6)), (0x602, bytes(8)), (0x081, bytes(8)))
+    with bench(*others) as (bus, clock, _), Drive(bus, AXIS, clock) as drive:
+        drive.boot()
+
+
+def test_what_waited_before_is_not_of_now() -> None:
+    with bench() as (bus, clock, witness), Drive(bus, AXIS, clock) as drive:
+        witness.send(can.Message(arbitration_id=0x080, is_extended_id=False))
+        drive.boot()
+
+
+def test_who_insists_speaks() -> None:
+    with bench((0x77F, b"\x05")) as (bus, clock, _), Drive(bus, AXIS, clock, force=True) as drive:
+        drive.boot()
+
+
+def test_it_listens_once_and_not_on_a_bus_of_its_own() -> None:
+    with bench() as (bus, clock, _), Drive(bus, AXIS, clock) as drive:
+        drive.listen()
+        begun_s = clock.now()
+        drive.listen()
+        assert clock.now() == begun_s
+    with simulated_bench(bundled_profile("article"), AXIS.eds_path) as (bus, clock, _):
+        Drive(bus, AXIS, clock).listen()
+        assert clock.now() == 0.0
+
+
+# ------------------------------------------------------------------ the lock
+
+
+def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
+    with interface_lock("socketcan", "can0", tmp_path):
+        with (
+            pytest.raises(BusInUseError, match="socketcan:can0: another hdbridge on this machine"),
+            interface_lock("socketcan", "can0", tmp_path),
+        ):
+            pass
+        with interface_lock("socketcan", "can1", tmp_path), interface_lock("slcan", "/dev/ttyUSB0", tmp_path):
+            pass
+    with interface_lock("socketcan", "can0", tmp_path):
+        pass
+
+
+def test_the_virtual_bus_needs_no_lock(tmp_path: Path) -> None:
+    with interface_lock("virtual", "x", tmp_path), interface_lock("virtual", "x", tmp_path):
+        assert not list(tmp_path.iterdir())
+
+
+def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
+    program = (
+        "import sys, time; from pathlib import Path\n"
+        "from hdbridge.drive.interfacelock import interface_lock\n"
+        "with interface_lock('socketcan', 'can0', Path(sys.argv[1])):\n"
+        "    print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(BusInUseError), interface_lock("socketcan", "can0", tmp_path):
+            pass
+        holder.kill()
+        holder.wait()
+        with interface_lock("socketcan", "can0", tmp_path):
+            pass
+
+
+def test_a_lock_that_cannot_be_opened_is_said(tmp_path: Path) -> None:
+    (tmp_path / "hdbridge-socketcan-can0.lock").symlink_to(tmp_path / "elsewhere")
+    with (
+        pytest.raises(BusError, match="lock of the CAN interface"),
+        interface_lock("socketcan", "can0", tmp_path),
+    ):
+        pass
+
+
+def test_opening_a_bus_takes_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What the interface is does not matter: nothing of it is opened before the lock is there."""
+    monkeypatch.setattr("hdbridge.drive.interfacelock._folder", lambda: tmp_path)
+    settings = AXIS.on_bus(interface="socketcan", channel="absent0").bus
+    with interface_lock("socketcan", "absent0"):
+        with pytest.raises(BusInUseError), open_bus(settings):
+            pass
+        with pytest.raises(BusError, match="cannot open it"), open_bus(settings, shared=True):
+            pass
+    with pytest.raises(BusError, match="cannot open it"), open_bus(settings):
+        pass
