@@ -78,6 +78,10 @@ class DriveConfig(_Part):
     quick_stop_option: int = Field(
         6, ge=1, le=8, description="605Ah: 5 to 8 stay in QUICK STOP ACTIVE, 1 to 4 end in SWITCH ON DISABLED"
     )
+    feed_scales: bool = Field(
+        True,
+        description="whether 6092h (feed) scales positions, as CiA 402 has it; false where it only informs",
+    )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
     rated_torque_nm: float = Field(
         gt=0, le=10_000, description="rated torque of the motor, 6076h; unit of 6077h"

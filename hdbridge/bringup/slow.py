@@ -130,7 +130,8 @@ class SlowAxis:
     def enabled(self) -> Iterator[Feedback]:
         """Power on at rest, off again at the end; gives the first feedback under power."""
         drive, power = self._drive, self.image.power
-        drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
+        if drive.sdo.has(objects.MAX_TORQUE.index, objects.MAX_TORQUE.sub):
+            drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
         drive.enable(Mode.CSP)
         self.cycle.restart()
         try:

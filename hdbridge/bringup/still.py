@@ -24,24 +24,10 @@ from hdbridge.drive.nameplate import (
 )
 from hdbridge.drive.objects import Address, IntegerType
 from hdbridge.drive.sdo import SdoAbortError, load_eds
-from hdbridge.drive.writes import plan
+from hdbridge.drive.writes import left_out, plan
 from hdbridge.errors import SdoError
 
 REST_S: Final = 1.0
-_REQUIRED: Final = (
-    objects.CONTROLWORD,
-    objects.STATUSWORD,
-    objects.MODE,
-    objects.MODE_DISPLAY,
-    objects.POSITION_ACTUAL,
-    objects.TARGET_POSITION,
-    objects.POSITION_DEMAND,
-    objects.TORQUE_ACTUAL,
-    objects.CYCLE_MANTISSA,
-    objects.CYCLE_EXPONENT,
-    objects.SUPPORTED_MODES,
-)
-"""What the control cycle cannot do without."""
 _ABSENT: Final = (0x0602_0000, 0x0609_0011)
 """Abort codes: no such object, no such sub-index."""
 
@@ -50,13 +36,16 @@ def files(context: BringUpContext) -> Verdict:
     """The axis file and the EDS can be read, and every value of the boot-up fits its object."""
     axis = context.load()
     od = load_eds(axis.eds_path, axis.drive.node_id)
-    rows = plan(axis, od)
+    rows, lacking = plan(axis, od), left_out(axis, od)
     context.admit(axis, od)
+    names = ", ".join(f"{each.index:04X}h:{each.sub:02X} ({each.why})" for each in lacking)
     return passed(
-        f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to write",
+        f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to write"
+        + (f"; the EDS lacks, so what the drive has holds: {names}" if lacking else ""),
         axis_file=str(axis.path),
         eds=str(axis.eds_path),
         writes=len(rows),
+        lacking=len(lacking),
     )
 
 
@@ -109,11 +98,7 @@ def eds(context: BringUpContext) -> Verdict:
     """The EDS describes this drive: the objects that are used exist, with the type that it says."""
     axis, drive = context.axis, context.drive
     where = axis.where("drive.eds")
-    wrong = [
-        f"the EDS does not list {each}, which the control cycle needs"
-        for each in _REQUIRED
-        if not drive.sdo.has(each.index, each.sub)
-    ]
+    wrong: list[str] = []
     looked_at = 0
     for index, sub in dict.fromkeys(_listed(context)):
         looked_at += 1
@@ -148,7 +133,7 @@ def eds(context: BringUpContext) -> Verdict:
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
     """The objects to look at: those that are used, as far as the EDS lists them."""
     axis, sdo = context.axis, context.drive.sdo
-    for address in (*_REQUIRED, objects.RATED_TORQUE, objects.ERROR_CODE, *scaling_addresses(axis)):
+    for address in (*objects.REQUIRED, objects.RATED_TORQUE, objects.ERROR_CODE, *scaling_addresses(axis)):
         if sdo.has(address.index, address.sub):
             yield address.index, address.sub
     for row in plan(axis, sdo.od):

@@ -17,12 +17,14 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
     from hdbridge.axis import AxisConfig
     from hdbridge.control.bench import compensation_for
     from hdbridge.drive import load_eds, plan
+    from hdbridge.drive.writes import left_out
     from hdbridge.evaluation.stepping import quantisation_floor_arcsec
     from hdbridge.model import TransmissionModel
 
     files = Profile.find(profile)
     axis = AxisConfig.load(files.axis)
-    plan(axis, load_eds(axis.eds_path, axis.drive.node_id))
+    od = load_eds(axis.eds_path, axis.drive.node_id)
+    plan(axis, od)
     floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
     facts = {
         "axis": axis.name,
@@ -41,7 +43,15 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
         loaded.check_ratio(axis)
         compensation_for(axis, loaded)
         facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
-    write_json(json_file, {"schema": "hdbridge.check/1", **facts})
+    lacking = left_out(axis, od)
+    write_json(json_file, {"schema": "hdbridge.check/1", **facts, "left to the drive": [*map(str, lacking)]})
     for name, value in facts.items():
         console.print(f"{name:>20}  {value}")
+    for row in lacking:
+        source = f" ({axis.where(row.field)})" if row.field else ""
+        console.print(
+            f"{'left to the drive':>20}  {row.index:04X}h:{row.sub:02X}, which {axis.drive.eds} lacks: "
+            f"{row.why}{source}",
+            soft_wrap=True,
+        )
     console.print("all right")

@@ -79,7 +79,11 @@ class BootUp:
         self._others_heard = set(others_heard)
 
     def run(self, *, reset: bool) -> BootReport:
-        """All of it, in order. Raises `DriveError` (or a kind of it) at the first thing that is wrong."""
+        """All of it, in order. Raises `DriveError` (or a kind of it) at the first thing that is wrong.
+
+        `InputError` before anything is sent where the EDS lacks what there is no doing without.
+        """
+        written = tuple(plan(self._axis, self._sdo.od))
         for node_id in self._clients:
             self._reach(node_id, reset=reset)
         self._check_device_type()
@@ -87,7 +91,6 @@ class BootUp:
         modes = self._check_modes()
         self._power_off()
         notes = self._check_scaling()
-        written = tuple(plan(self._axis, self._sdo.od))
         for row in written:
             self._write(row)
         for node_id in self._clients:

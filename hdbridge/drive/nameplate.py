@@ -103,7 +103,7 @@ def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
     """Where the drive counts otherwise than the axis file says, by every object that says something."""
     try:
         increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
-        feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT)
+        feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT) if axis.drive.feed_scales else None
         gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
     except _NotARatioError as problem:
         return [Complaint(problem.key, str(problem))]
@@ -138,7 +138,7 @@ def _gear(axis: AxisConfig, gear: Fraction, feed: Fraction | None) -> list[Compl
                 f"{axis.where(key)} is {ratio:g}; correct the one that is wrong",
             )
         ]
-    if feed is None and gear != 1:
+    if feed is None and gear != 1 and axis.drive.feed_scales:
         return [
             Complaint(
                 key,
@@ -153,16 +153,20 @@ def _motor_counts(
     axis: AxisConfig, increments: Fraction | None, per_turn: Fraction | None
 ) -> list[Complaint]:
     key, counts = "motor_encoder.counts_per_turn", axis.motor_encoder.counts_per_turn
+    informative = (
+        f"; on a drive that counts encoder counts whatever 6092h says: 'feed_scales: false' under "
+        f"{axis.where('drive')}"
+    )
     return [
         Complaint(
             key,
             f"node {axis.drive.node_id}, {used}: the drive counts {float(value):g} per motor turn, but "
             f"{axis.where(key)} is {counts}; set the drive's scaling to plain encoder counts, or correct the "
-            "file",
+            f"file{hint}",
         )
-        for value, used in (
-            (increments, "608Fh:01 / 608Fh:02 (encoder resolution)"),
-            (per_turn, "6092h (feed) over 6091h (gear ratio)"),
+        for value, used, hint in (
+            (increments, "608Fh:01 / 608Fh:02 (encoder resolution)", ""),
+            (per_turn, "6092h (feed) over 6091h (gear ratio)", informative),
         )
         if value is not None and value != counts
     ]

@@ -200,6 +200,20 @@ def additional_resolution(sub: int) -> tuple[Address, Address]:
     )
 
 
+REQUIRED: Final = (
+    CONTROLWORD,
+    STATUSWORD,
+    MODE,
+    MODE_DISPLAY,
+    POSITION_ACTUAL,
+    TARGET_POSITION,
+    POSITION_DEMAND,
+    TORQUE_ACTUAL,
+    CYCLE_MANTISSA,
+    CYCLE_EXPONENT,
+    SUPPORTED_MODES,
+)
+"""What the control cycle cannot do without."""
 STANDARD: Final[dict[tuple[int, int], Address]] = {
     (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
 }

@@ -35,6 +35,9 @@ RPDO_TIMEOUT_CYCLES: Final = 4
 _PDOS_PER_KIND: Final = 512
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
 _EVERYTHING: Final = -1
+_REQUIRED: Final = frozenset((each.index, each.sub) for each in objects.REQUIRED)
+_NAMED: Final = 4
+"""Objects that are named of those that are lacking."""
 
 # Option codes that no field of the axis file chooses: braked rather than coasting wherever CiA 402 offers it.
 SHUTDOWN_DISABLES: Final = 0
@@ -72,18 +75,45 @@ def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWr
     """All writes of a boot-up in order, for the drive and a load encoder that is a node of its own.
 
     With the drive's object dictionary ``od``, objects that a drive need not have are left out where it has
-    none, and its other PDOs are disabled. Raises `InputError` where a value of the axis file cannot be
-    expressed in its object, or the dictionary has not what the axis file says.
+    none (`left_out`), and its other PDOs are disabled. Raises `InputError` where a value of the axis file
+    cannot be expressed in its object, or the dictionary lacks what the control cycle or the axis file needs.
     """
-    if od is not None and (complaints := channel_complaints(axis, od)):
-        raise InputError(complaints[0])
-    own = [*_heartbeats(axis), *_pdos(axis, od), *_cycle(axis), *_options(axis), *_limits(axis)]
-    drive_id = axis.drive.node_id
-    return [
-        row
-        for row, optional in own
-        if not (optional and od is not None and row.node_id == drive_id and not _has(od, row.index, row.sub))
+    rows = _rows(axis, od)
+    if od is not None:
+        _check_dictionary(axis, od, rows)
+    return [row for row, optional in rows if not (optional and _lacks(axis, od, row))]
+
+
+def left_out(axis: AxisConfig, od: ObjectDictionary) -> list[PlannedWrite]:
+    """The writes that `plan` leaves out because the dictionary lacks their objects."""
+    return [row for row, optional in _rows(axis, od) if optional and _lacks(axis, od, row)]
+
+
+def _rows(axis: AxisConfig, od: ObjectDictionary | None) -> list[_Row]:
+    return [*_heartbeats(axis), *_pdos(axis, od), *_cycle(axis), *_options(axis), *_limits(axis)]
+
+
+def _lacks(axis: AxisConfig, od: ObjectDictionary | None, row: PlannedWrite) -> bool:
+    return od is not None and row.node_id == axis.drive.node_id and not _has(od, row.index, row.sub)
+
+
+def _check_dictionary(axis: AxisConfig, od: ObjectDictionary, rows: list[_Row]) -> None:
+    """`InputError` where the dictionary lacks an object that there is no doing without."""
+    lacking = [str(each) for each in objects.REQUIRED if not _has(od, each.index, each.sub)]
+    lacking += [
+        f"{row.index:04X}h:{row.sub:02X}"
+        for row, optional in rows
+        if not optional and (row.index, row.sub) not in _REQUIRED and _lacks(axis, od, row)
     ]
+    if lacking:
+        lacking = list(dict.fromkeys(lacking))
+        more = f" and {len(lacking) - _NAMED} more" if len(lacking) > _NAMED else ""
+        raise InputError(
+            f"{axis.where('drive.eds')}: {axis.drive.eds} lacks {', '.join(lacking[:_NAMED])}{more}, which "
+            "hdbridge cannot do without; expected the EDS file of this drive, with all of its objects"
+        )
+    if complaints := channel_complaints(axis, od):
+        raise InputError(complaints[0])
 
 
 def _has(od: ObjectDictionary, index: int, sub: int) -> bool:
@@ -288,6 +318,7 @@ def _limits(axis: AxisConfig) -> Iterator[_Row]:
         round(limits.torque_percent * 10.0),
         "torque limit in per mille of the rated torque",
         "limits.torque_percent",
+        optional=True,
     )
     window = round(abs(axis.motor_encoder.counts(drive.following_error_deg)))
     if window == 0:

@@ -1,6 +1,10 @@
 """Bad input gives one clear line and a documented exit status, and nothing is written."""
 
+import re
+
 import pytest
+
+from hdbridge.files.bundled import bundled_folder
 
 
 def refused(done, status: int, *texts: str) -> None:
@@ -108,3 +112,31 @@ def test_the_virtual_bus_without_a_drive_is_refused_at_once(here, command):
     assert done.returncode == 2
     assert "bus.interface: found virtual, which reaches nothing outside this process" in done.stderr
     assert "--simulate" in done.stderr
+
+
+def lacking(profile, *indices):
+    """The article's profile with an EDS of its own that lacks these objects."""
+    eds = (bundled_folder("eds") / "hdbridge-402.eds").read_text()
+    for index in indices:
+        eds = re.sub(rf"^\[{index:04X}(sub\d+)?\]$", "[no object]", eds, flags=re.MULTILINE, count=1)
+    (profile.folder / "own.eds").write_text(eds)
+    return profile("eds: hdbridge-402.eds", "eds: own.eds")
+
+
+def test_check_says_beforehand_what_the_eds_lacks(here, profile):
+    done = here("check", lacking(profile, 0x6072))
+    assert done.returncode == 0, done.stderr
+    assert "left to the drive  6072h:00, which own.eds lacks: torque limit" in done.stdout
+    assert ": limits.torque_percent)" in done.stdout
+
+
+def test_an_eds_that_lacks_what_is_needed_is_not_all_right(here, profile):
+    refused(here("check", lacking(profile, 0x6064)), 2, "axis.yaml:13:3: drive.eds", "own.eds lacks 6064h:00")
+    (profile.folder / "own.eds").write_text("")
+    refused(here("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
+
+
+def test_doctor_does_without_a_torque_limit_in_the_drive(here, profile):
+    done = here("doctor", lacking(profile, 0x6072), "--simulate")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the EDS lacks, so what the drive has holds: 6072h:00 (torque limit" in done.stdout

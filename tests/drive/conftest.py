@@ -188,9 +188,9 @@ class TinyDrive:
                 continue
             data = bytes(message.data)
             if message.arbitration_id == 0 and data[1] == self.node_id:
-                self._nmt(data[0])
+                self.nmt(data[0])
             elif message.arbitration_id == 0x600 + self.node_id:
-                self._sdo(data)
+                self.sdo(data)
             elif message.arbitration_id == 0x77F:
                 self.heartbeats_heard += 1
         period_s = int(self.values[0x1017, 0]) / 1000
@@ -206,7 +206,7 @@ class TinyDrive:
         self.values[0x603F, 0] = code
         self.send(0x080, code.to_bytes(2, "little") + b"\x21\0\0\0\0\0")
 
-    def _nmt(self, command: int) -> None:
+    def nmt(self, command: int) -> None:
         if command == 0x82:
             self.send(0x700, b"\x00")
         self.nmt_state = {0x01: 5, 0x02: 4}.get(command, 127)
@@ -225,7 +225,7 @@ class TinyDrive:
         self.position, self.goal = self.goal, None
         self.bits |= 0x0400
 
-    def _control(self, word: int) -> None:
+    def control(self, word: int) -> None:
         self.controlwords.append(word)
         rising, self.controlword = word & ~self.controlword, word
         if self.state == 0x08:
@@ -259,7 +259,7 @@ class TinyDrive:
             self.position = float(int(self.values[0x607C, 0]))
             self.bits = 0x1400 if not self.blocked else 0x2000
 
-    def _value(self, key: tuple[int, int]) -> int | bytes:
+    def value(self, key: tuple[int, int]) -> int | bytes:
         if key == (0x6041, 0):
             return self.state | self.bits
         if key in ((0x6064, 0), (0x6062, 0)):
@@ -270,7 +270,7 @@ class TinyDrive:
             return self.values[0x6060, 0]
         return self.values[key]
 
-    def _sdo(self, request: bytes) -> None:
+    def sdo(self, request: bytes) -> None:
         index, sub = int.from_bytes(request[1:3], "little"), request[3]
         command = request[0] >> 5
         if (index, sub) in self.scripts and command in (1, 2):
@@ -281,7 +281,7 @@ class TinyDrive:
         elif command in (1, 2) and (index, sub) not in self.values:
             self.send(0x580, bytes((0x80, *request[1:4])) + (0x06020000).to_bytes(4, "little"))
         elif command == 2:
-            self._upload(request[1:4], self._value((index, sub)), (index, sub))
+            self._upload(request[1:4], self.value((index, sub)), (index, sub))
         elif command == 3:
             self._segment(request[0] & 0x10)
         else:
@@ -290,7 +290,7 @@ class TinyDrive:
             value = int.from_bytes(request[4 : 4 + size], "little", signed=signed)
             self.sdo_order.append((index, sub, value))
             if (index, sub) == (0x6040, 0):
-                self._control(value)
+                self.control(value)
             elif (index, sub) not in self.stuck:
                 self.values[index, sub] = value
             self.send(0x580, b"\x60" + request[1:4] + bytes(4))

@@ -7,10 +7,12 @@ from typing import Any
 
 import can
 import pytest
+from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State
-from hdbridge.errors import BusError, DriveError, IdentityError, SdoError
+from hdbridge.drive.writes import left_out
+from hdbridge.errors import BusError, DriveError, IdentityError, InputError, SdoError
 
 
 @pytest.fixture
@@ -100,6 +102,39 @@ def test_another_drive_or_another_scale_is_refused(
     assert tiny.sdo_order == []
 
 
+def test_a_feed_that_only_informs(bus: Any, tiny: Any, clock: Any, build_axis: Any) -> None:
+    """Where 6092h does not scale, the error names the line that says so, and with it the drive is taken."""
+    tiny.values[0x6092, 1] = 360_000
+    with pytest.raises(IdentityError, match=r"'feed_scales: false' under axis.yaml: drive"):
+        Drive(bus, build_axis(), clock, tiny.od).boot()
+    Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
+    tiny.values[0x6091, 1] = 50
+    Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
+    tiny.values[0x608F, 1] = 360_000
+    with pytest.raises(IdentityError, match="608Fh"):
+        Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
+
+
+def test_what_the_eds_lacks_is_left_out(drive: Drive, tiny: Any, bus: Any, axis: Any, clock: Any) -> None:
+    for index in (0x6072, 0x1029):
+        del tiny.od[index]
+        del tiny.values[index, 0 if index == 0x6072 else 1]
+    report = Drive(bus, axis, clock, tiny.od).boot()
+    assert not {0x6072, 0x1029} & {row.index for row in report.written}
+    assert [row.index for row in left_out(axis, tiny.od)] == [0x1029, 0x6072]
+
+
+def test_what_there_is_no_doing_without_is_refused_before_anything_is_sent(
+    tiny: Any, bus: Any, axis: Any, clock: Any
+) -> None:
+    with pytest.raises(InputError, match=r"drive\.eds: none\.eds lacks 6040h:00 controlword, .* more"):
+        Drive(bus, axis, clock, ObjectDictionary()).boot()
+    del tiny.od[0x6062]
+    with pytest.raises(InputError, match=r"lacks 6062h:00 position demand value, which"):
+        Drive(bus, axis, clock, tiny.od).boot()
+    assert bus.sent == []
+
+
 def test_a_different_rated_torque_is_only_noted(drive: Drive, tiny: Any) -> None:
     tiny.values[0x6076, 0] = 640
     (note,) = drive.boot().notes
@@ -157,8 +192,8 @@ def test_a_load_encoder_that_cannot_be_mapped(drive: Drive, tiny: Any) -> None:
 
 
 def test_a_node_that_does_not_start(drive: Drive, tiny: Any) -> None:
-    original = tiny._nmt
-    tiny._nmt = lambda command: None if command == 1 else original(command)
+    original = tiny.nmt
+    tiny.nmt = lambda command: None if command == 1 else original(command)
     with pytest.raises(DriveError, match=r"did not become OPERATIONAL \(it says 7Fh"):
         drive.boot()
 
@@ -171,7 +206,7 @@ def test_a_drive_left_under_power_is_switched_off_first(drive: Drive, tiny: Any)
 
 def test_a_drive_that_stays_under_power_is_refused(drive: Drive, tiny: Any) -> None:
     tiny.state = 0x27
-    tiny._control = lambda word: None
+    tiny.control = lambda word: None
     with pytest.raises(DriveError, match="stays in 'operation enabled'"):
         drive.boot()
 

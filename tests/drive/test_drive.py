@@ -80,8 +80,8 @@ def test_an_axis_outside_its_limits_is_not_enabled(drive: Drive, tiny: Any) -> N
 
 
 def test_a_drive_that_does_not_follow_a_transition(drive: Drive, tiny: Any) -> None:
-    original = tiny._control
-    tiny._control = lambda word: original(word) if word & 0x0F != 0x07 else None
+    original = tiny.control
+    tiny.control = lambda word: original(word) if word & 0x0F != 0x07 else None
     with pytest.raises(
         TransitionError, match=r"'switched on' did not come about within 1 s.*'ready to switch on'"
     ):
@@ -92,12 +92,12 @@ def test_a_drive_that_does_not_follow_a_transition(drive: Drive, tiny: Any) -> N
 def test_a_stale_or_senseless_statusword_is_never_taken_for_enabled(
     drive: Drive, tiny: Any, stale: int
 ) -> None:
-    state = tiny._value
-    tiny._value = lambda key: stale if key == (0x6041, 0) else state(key)
+    state = tiny.value
+    tiny.value = lambda key: stale if key == (0x6041, 0) else state(key)
     with pytest.raises(DriveError):
         drive.enable(Mode.PP)
     assert drive.image.power.state is not State.OPERATION_ENABLED
-    tiny._value = state
+    tiny.value = state
 
 
 def test_a_profile_move_arrives(drive: Drive, tiny: Any, clock: Any) -> None:

@@ -53,7 +53,7 @@ def test_a_long_value_is_written_in_segments(client: SdoClient, tiny: Any, bus: 
         else:
             original(request)
 
-    original, tiny._sdo = tiny._sdo, segment
+    original, tiny.sdo = tiny.sdo, segment
     tiny.scripts[0x1008, 0] = initiate
     client.write_bytes(0x1008, 0, b"twelve bytes")
     assert bytes(received) == b"twelve bytes"
@@ -142,7 +142,7 @@ def test_four_bytes_for_a_shorter_object(
 
 def endless(tiny: Any, chunk: bytes) -> None:
     """Answers every segment, and none is the last."""
-    original = tiny._sdo
+    original = tiny.sdo
 
     def serve(request: bytes) -> None:
         if request[0] >> 5 == 3:
@@ -150,7 +150,7 @@ def endless(tiny: Any, chunk: bytes) -> None:
         else:
             original(request)
 
-    tiny._sdo = serve
+    tiny.sdo = serve
     tiny.scripts[0x1008, 0] = lambda request: [b"\x40" + request[1:4] + bytes(4)]
 
 
@@ -166,13 +166,13 @@ def test_endless_segments_end(client: SdoClient, tiny: Any, chunk: bytes, text: 
 def test_a_slow_drip_of_segments_ends_too(bus: Any, clock: Any, tiny: Any) -> None:
     client = SdoClient(Link(bus, clock), NetworkMonitor(1), 1, tiny.od, timeout_s=0.1, attempts=1)
     endless(tiny, b"x")
-    answer = tiny._sdo
+    answer = tiny.sdo
 
     def slowly(request: bytes) -> None:
         clock.sleep_until(clock.now() + 0.09)
         answer(request)
 
-    tiny._sdo = slowly
+    tiny.sdo = slowly
     with pytest.raises(SdoError, match="no answer within"):
         client.read_text(0x1008)
     assert clock.now() < 2.5
