@@ -17,6 +17,7 @@ from hdbridge.bringup.judge import (
 from hdbridge.bringup.scale import Turned, judge_turn
 from hdbridge.bringup.slow import Silence, SlowAxis, TravelPlan, plan_travel
 from hdbridge.drive import objects
+from hdbridge.drive.emergencies import HEARTBEAT_LOST
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError
@@ -218,15 +219,50 @@ def _between(start: Turned, end: Turned) -> Turned:
     return Turned(end.motor_counts - start.motor_counts, end.load_counts - start.load_counts)
 
 
+def _noticed(context: BringUpContext) -> str:
+    """What to do about a drive that says that it lost its master, and goes on."""
+    axis = context.axis
+    option = axis.drive.quick_stop_option
+    again = (
+        f"; or it stopped, and went on by 'enable operation', which this check still sends (transition 16): "
+        f"{axis.where('drive.quick_stop_option')}: found {option}, with 1 to 4 it cannot"
+        if option >= 5
+        else ""
+    )
+    return (
+        "the drive noticed that its master is silent, and neither stops (6007h) nor leaves OPERATIONAL "
+        f"(1029h) for it: see its manual for both{again}; the check of the set-points says whether it stops "
+        "otherwise"
+    )
+
+
 def _judge_silence(
     context: BringUpContext, silence: Silence, speed: float, what: str, after_s: float, remedy: str
 ) -> Verdict:
     state = decode(silence.statusword)
     still_on = state is State.OPERATION_ENABLED
+    said = "".join(f"; it sent {each}" for each in silence.emergencies)
+    if silence.resumed:
+        what = (
+            f"no {what}: it stopped by itself, and the master's own 'enable operation', which a dead master "
+            f"does not send, took it out of that (transition 16){said}"
+        )
+        return judge_stop(
+            context.axis,
+            speed,
+            silence.distance_deg,
+            silence.noticed_after_s or 0.0,
+            what,
+            2.0 * after_s + 0.05,
+        )
     if silence.noticed_after_s is None or still_on or not silence.stands:
         return failed(
-            f"no {what} in motion at {speed:.3g} motor deg/s: the drive goes on, '{state.value}'",
-            remedy,
+            f"no {what} in motion at {speed:.3g} motor deg/s: the drive goes on{said}",
+            *(
+                [_noticed(context)]
+                if any(e.code == HEARTBEAT_LOST for e in silence.emergencies)
+                else [remedy]
+            ),
             reacted=False,
         )
     return judge_stop(

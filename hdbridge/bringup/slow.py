@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import fmean
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -19,6 +20,7 @@ from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
+from hdbridge.drive.monitor import Emergency
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event, Supervision
@@ -101,6 +103,10 @@ class Silence:
     stands: bool
     distance_deg: float
     """Motor travel from the last frame until it stood."""
+    emergencies: tuple[Emergency, ...] = ()
+    """What the drive said of it."""
+    resumed: bool = False
+    """It went into the quick stop, and back to 'operation enabled' by the master's own controlword."""
 
 
 class SlowAxis:
@@ -260,9 +266,16 @@ class SlowAxis:
         event = self.supervision.stop
         if event is not None:
             noticed_s = muted_s - last_s + (event.cycle - start.cycle) * self.cycle.period_s
-            return speed, self._after_silence(start.motor_counts, noticed_s, event, self._pause)
-        self.stop()
-        return speed, self._after_silence(start.motor_counts, None, None, self._pause)
+        states = [decode(each.statusword) for each in self.cycle.stopping] if event is not None else []
+        if event is None:
+            self.stop()
+        silence = self._after_silence(start.motor_counts, noticed_s, event, self._pause)
+        said = self._drive.monitor.nodes[self.axis.drive.node_id].emergencies
+        return speed, replace(
+            silence,
+            emergencies=tuple(each for each in said if each.time_s >= muted_s and each.code >> 8),
+            resumed=(State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED) in pairwise(states),
+        )
 
     def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
         """Move, and half-way send neither SYNC nor set-points any more; the heartbeat goes on."""

@@ -35,6 +35,7 @@ from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
+from hdbridge.drive.writes import drives_patience_s
 from hdbridge.errors import BusError, InputError, SafetyStop
 
 __all__ = ["Command", "Cycle", "Feedback", "Target"]
@@ -69,7 +70,7 @@ class Cycle:
     __slots__ = (
         "_all", "_bits", "_channel_ids", "_channels", "_commanded", "_count", "_deadline", "_discarded",
         "_faults", "_given_up", "_good_cycle", "_heartbeat_s", "_image", "_last", "_late_s",
-        "_link", "_plausibility", "_rested", "_stop_cycles", "_traffic", "_window_s", "clock",
+        "_link", "_patience_s", "_plausibility", "_rested", "_stop_cycles", "_traffic", "_window_s", "clock",
         "histogram", "monitor", "overruns", "period_s", "skipped", "stopping", "supervision",
     )  # fmt: skip
 
@@ -105,6 +106,7 @@ class Cycle:
         self._channel_ids = frozenset(layout.can_id for layout in image.channel_tpdos)
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
+        self._patience_s = drives_patience_s(image.axis)
         self._stop_cycles = max(int(stop_timeout_s / period_s), STILL_CYCLES + 1)
         self._faults: list[tuple[Fault, str]] = []
         self._count = -1
@@ -218,6 +220,9 @@ class Cycle:
         if late_s > self._late_s:
             missed = int(late_s / period_s) + 1
             self._faults.append((Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}"))
+            if late_s + period_s > self._patience_s:
+                patience = f"{1e3 * self._patience_s:.0f} ms"
+                self._faults.append((Fault.HANG, f"{1e3 * late_s:.0f} ms; the drive waits {patience}"))
             self.overruns += 1
             self.skipped += missed
             self._count += missed
@@ -258,6 +263,7 @@ class Cycle:
         recv, bits, everything, accept = self._link.recv, self._bits, self._all, self._image.accept
         faults = self._faults
         got = 0
+        spoilt: dict[int, int] | None = None
         while got != everything:
             frame = recv(window_end_s)
             if frame is None:
@@ -274,7 +280,8 @@ class Cycle:
             try:
                 accept(can_id, data)
             except PdoLengthError:
-                faults.append((Fault.DISCARDED_FRAME, f"{can_id:03X}h with {len(data)} bytes"))
+                spoilt = spoilt or {}
+                spoilt[can_id] = len(data)
                 continue
             got |= bit
         dropped = self._link.dropped
@@ -282,14 +289,25 @@ class Cycle:
         if discarded != self._discarded:
             self._discarded = discarded
             faults.append((Fault.DISCARDED_FRAME, "remote, extended, FD or error frame"))
+        if spoilt is not None:
+            self._note_lengths(spoilt, got)
         if got == everything:
             return True
         missing = [
             can_id for can_id, bit in bits.items() if not got & bit and can_id not in self._channel_ids
         ]
-        if missing:
-            faults.append((Fault.LOST_TPDO, ", ".join(f"{can_id:03X}h" for can_id in missing)))
+        lost = [can_id for can_id in missing if spoilt is None or can_id not in spoilt]
+        if lost:
+            faults.append((Fault.LOST_TPDO, ", ".join(f"{can_id:03X}h" for can_id in lost)))
         return not missing
+
+    def _note_lengths(self, spoilt: dict[int, int], got: int) -> None:
+        """Frames of the wrong length: a fault where no good one of that identifier came and it is needed."""
+        for can_id, length in spoilt.items():
+            needed = can_id not in self._channel_ids and not got & self._bits[can_id]
+            fault = Fault.WRONG_LENGTH if needed else Fault.DISCARDED_FRAME
+            expected = self._image.length_of(can_id)
+            self._faults.append((fault, f"{can_id:03X}h with {length} bytes, expected {expected}"))
 
     def _step_channels(self) -> None:
         """Hold what did not come, give up what stays away, and wait again for what is back."""

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Final
 
 from hdbridge.drive import objects
+from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
@@ -104,7 +105,10 @@ class Commander:
         """The error to raise for a drive that is in fault: its error code and last emergency."""
         code = self.sdo.fetch(objects.ERROR_CODE) if self.sdo.has(objects.ERROR_CODE.index) else None
         last = self.monitor.watch(self.sdo.node_id).last_error
-        details = [f"error code {code:04X}h" if code is not None else "", str(last) if last else ""]
+        details = [
+            f"error code {code:04X}h, {error_name(code)}" if code is not None else "",
+            str(last) if last else "",
+        ]
         told = ", ".join(filter(None, details)) or "no error code is known"
         return DriveError(
             f"{self.name}: fault {when} ({told}); remove the cause (the drive's manual explains the code), "

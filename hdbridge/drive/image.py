@@ -182,6 +182,11 @@ class ProcessImage:
         handler(data)
         return True
 
+    def length_of(self, can_id: int) -> int:
+        """Bytes that a TPDO of the image has to have."""
+        layouts = (*self.tpdos, *self.channel_tpdos)
+        return next(each.codec.length for each in layouts if each.can_id == can_id)
+
     def _accept_state(self, unpack: Callable[[bytes], tuple[int, ...]], data: bytes) -> None:
         self.statusword, motor, self.torque_permille = unpack(data)
         self.power.observe(self.statusword)

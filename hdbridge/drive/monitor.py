@@ -10,6 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.link import Frame
 from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, NmtState
 
@@ -25,8 +26,8 @@ class Emergency(NamedTuple):
     vendor: bytes
 
     def __str__(self) -> str:
-        """``EMCY 8611h, register 21h, 00 00 00 00 00``."""
-        return f"EMCY {self.code:04X}h, register {self.register:02X}h" + (
+        """``EMCY 8611h (following error), register 21h, 00 00 00 00 00``."""
+        return f"EMCY {self.code:04X}h ({error_name(self.code)}), register {self.register:02X}h" + (
             f", {self.vendor.hex(' ')}" if self.vendor else ""
         )
 

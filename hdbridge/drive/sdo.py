@@ -71,6 +71,8 @@ _ADVICE: Final = {
 def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
     """The object dictionary of an EDS file; `InputError` when it cannot be read."""
     try:
+        if b"[DeviceInfo]" not in Path(path).read_bytes():  # canopen takes an empty file for a dictionary
+            raise ValueError("it has no section [DeviceInfo]")
         return canopen.import_od(str(path), node_id)
     except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

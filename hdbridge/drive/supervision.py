@@ -34,8 +34,10 @@ class Fault(Enum):
 
     LOST_TPDO = "a TPDO is missing"
     OVERRUN = "the cycle started too late"
+    HANG = "this process stood still for longer than the drive waits for it"
     DUPLICATE_TPDO = "a TPDO came twice or out of its cycle"
-    DISCARDED_FRAME = "a frame had the wrong length or kind"
+    WRONG_LENGTH = "a TPDO has the wrong length"
+    DISCARDED_FRAME = "a frame of the wrong kind was thrown away"
     FLOOD = "more frames waited than one cycle reads"
     EMERGENCY = "the drive sent an emergency message"
     DRIVE_FAULT = "the drive reports a fault"
@@ -70,14 +72,18 @@ _GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP,
 TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.LOST_TPDO, _FREEZE, 2, _STOP, "check the cable, the bus load and the drive's PDOs"),
     Row(Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this machine carries"),
+    Row(
+        Fault.HANG, _GO, 1, _GO, "see 'hdbridge latency' for what this machine carries; keep it from sleeping"
+    ),
     Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
+    Row(Fault.WRONG_LENGTH, _FREEZE, 2, _STOP, "boot the drive again: its PDO mapping (1A00h) was changed"),
     Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),
     Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that babbles"),
     Row(Fault.EMERGENCY, _GO, 1, _GO, "look the code up in the drive's manual"),
     Row(Fault.DRIVE_FAULT, _STOP, 1, _STOP, "read its error code (603Fh), remove the cause, reset the fault"),
     Row(Fault.DROPPED_OUT, _STOP, 1, _STOP, "check the enable input, the supply and the limit switches"),
     Row(Fault.BOOT_UP, _LATCH, 1, _LATCH, "check its supply, then boot and verify the drive again"),
-    Row(Fault.NMT_CHANGE, _LATCH, 1, _LATCH, "look for another NMT master, then boot the drive again"),
+    Row(Fault.NMT_CHANGE, _LATCH, 1, _LATCH, "read the drive's error history (1003h), then boot it again"),
     Row(Fault.HEARTBEAT_LOST, _STOP, 1, _STOP, "check that the drive runs and that the cable is whole"),
     Row(Fault.OWN_ID_ELSEWHERE, _STOP, 1, _STOP, "stop the other master on this bus"),
     Row(Fault.FOREIGN_SYNC, _STOP, 1, _STOP, "switch the other SYNC producer off (object 1005h, bit 30)"),
@@ -92,6 +98,10 @@ TABLE: Final[tuple[Row, ...]] = (
 ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
 
 EVENTS_KEPT: Final = 1000
+EMERGENCIES_TOLD: Final = 3
+_BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
+"""What a drive does by itself, and for reasons that it knows best."""
+_AS_IT_SAYS: Final = "remove that cause, then reset the fault, or boot the drive again"
 
 
 class Event(NamedTuple):
@@ -116,11 +126,12 @@ class Supervision:
     Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
     """
 
-    __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "stop")
+    __slots__ = ("_frozen", "_hang", "_runs", "counts", "events", "gravest", "stop")
 
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}
         self._frozen = False
+        self._hang: Event | None = None
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         """Every fault seen, oldest first."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
@@ -149,6 +160,8 @@ class Supervision:
         previous, self._runs = self._runs, {}
         frozen, self._frozen = self._frozen, False
         worst = Reaction.GO
+        if not previous:
+            self._hang = None
         for fault, detail in faults:
             if fault not in self._runs:
                 worst = max(worst, self._note(cycle, fault, detail, previous.get(fault, 0) + 1, frozen))
@@ -170,8 +183,11 @@ class Supervision:
         event = Event(cycle, fault, reaction, detail)
         self.events.append(event)
         self.counts[fault] += 1
+        if fault is Fault.HANG:
+            self._hang = event
         if reaction >= Reaction.QUICK_STOP:
-            self.stop = self.stop or event
+            # What is wrong in the wake of a hang came of it: the drive has given this master up.
+            self.stop = self.stop or self._hang or event
             if reaction > self.reaction:
                 self.gravest = event
         return reaction
@@ -185,10 +201,22 @@ class Supervision:
         detail = f" ({stop.detail})" if stop.detail else ""
         again = ", the second cycle in a row" if row.first < row.then else ""
         done = "quick stop" if self.reaction is Reaction.QUICK_STOP else "set-points stopped"
-        then = "" if gravest is stop else f"; then {gravest.fault.value}"
+        then = "" if gravest.fault is stop.fault else f"; then {gravest.fault.value}"
+        said = self._emergencies(stop.cycle - 1)
+        told = f"; the drive sent {', '.join(said)}" if said else ""
+        hint = _AS_IT_SAYS if said and stop.fault in _BY_THE_DRIVE else row.hint
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}: {done}, latched; {row.hint}"
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched; {hint}"
         )
+
+    def _emergencies(self, since_cycle: int) -> list[str]:
+        """The first emergencies that came with the stop: the drive's own explanation of it."""
+        said = [
+            event.detail
+            for event in self.events
+            if event.fault is Fault.EMERGENCY and event.cycle >= since_cycle
+        ]
+        return list(dict.fromkeys(said))[:EMERGENCIES_TOLD]
 
     def reset(self, *, verified: bool = False) -> None:
         """Release the latch. After a LATCH, ``verified`` states that the drive was booted and verified again.
@@ -197,6 +225,6 @@ class Supervision:
         """
         if self.reaction is Reaction.LATCH and not verified:
             raise self.error()
-        self.stop = self.gravest = None
+        self.stop = self.gravest = self._hang = None
         self._runs = {}
         self._frozen = False

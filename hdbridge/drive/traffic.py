@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from hdbridge.drive.monitor import NetworkMonitor
 
 _NODE_MASK: Final = 0x7F
+_STATES: Final[dict[int, str]] = {
+    NmtState.STOPPED: " (stopped)",
+    NmtState.PRE_OPERATIONAL: " (pre-operational)",
+}
 
 
 class Traffic:
@@ -54,7 +58,7 @@ class Traffic:
             if state == NmtState.BOOT_UP:
                 yield Fault.BOOT_UP, f"node {node_id}"
             elif state != NmtState.OPERATIONAL:
-                yield Fault.NMT_CHANGE, f"node {node_id}, NMT state {state:02X}h"
+                yield Fault.NMT_CHANGE, f"node {node_id}, NMT state {state:02X}h{_STATES.get(state, '')}"
         elif can_id == self._sync_id:
             yield Fault.FOREIGN_SYNC, ""
         elif can_id in self._own:

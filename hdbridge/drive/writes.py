@@ -144,6 +144,16 @@ def master_heartbeat(axis: AxisConfig) -> int:
     return axis.drive.master_node_id << 16 | axis.drive.heartbeat_ms
 
 
+def set_point_timeout_ms(axis: AxisConfig) -> int:
+    """Value of 1400h:05: for how long set-points may stay away."""
+    return max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
+
+
+def drives_patience_s(axis: AxisConfig) -> float:
+    """For how long a drive with all its watchdogs waits for a silent master before it stops by itself."""
+    return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
+
+
 def _heartbeats(axis: AxisConfig) -> Iterator[_Row]:
     ms = axis.drive.heartbeat_ms
     field = "drive.heartbeat_ms"
@@ -177,7 +187,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[_Row]:
         yield from _pdo(layout, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING, _carried(axis, layout))
     layout = rpdo_layout(axis)
     used.add((layout.node_id, objects.RPDO_COMMUNICATION))
-    timeout_ms = max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
+    timeout_ms = set_point_timeout_ms(axis)
     timer = PlannedWrite(
         layout.node_id,
         objects.RPDO_COMMUNICATION,

@@ -211,6 +211,11 @@ class Dictionary:
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
 
+    def remove(self, index: int, sub: int) -> None:
+        """Be a drive that does not have this object."""
+        del self._entries[index, sub]
+        self._indices = {index for index, _ in self._entries}
+
     def value(self, index: int, sub: int = 0) -> int:
         """The present number behind an integer entry."""
         return self[index, sub].number()

@@ -63,7 +63,7 @@ class Exercise:
 
     def hold(self, duration_s: float) -> None:
         """Stand."""
-        self._lead(lambda seconds: 0.0 * seconds, duration_s)
+        self.lead(lambda seconds: 0.0 * seconds, duration_s)
 
     def move(self, distance_deg: float, speed_deg_s: float, acceleration_deg_s2: float) -> None:
         """Move by a distance; the speed rises and falls as half a cosine with that highest acceleration."""
@@ -86,19 +86,19 @@ class Exercise:
             return math.copysign(1.0, distance_deg) * (up + even + down)
 
         if distance:
-            self._lead(way, 2.0 * ramp_s + even_s, distance_deg)
+            self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
         """Swing to the far side and back, twice the amplitude away, as 1 - cos."""
         turn = math.tau * frequency_hz
-        self._lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
+        self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 
     def readings(self) -> Readings:
         """All that was kept so far."""
         columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(Readings._fields)).T
         return Readings(*columns)
 
-    def _lead(
+    def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
     ) -> None:
         """Follow a way from here for a duration; where a distance is given, end exactly there."""

@@ -14,30 +14,46 @@ Outgoing = tuple[int, bytes]
 
 @dataclass
 class Faults:
-    """Wishes, all off at first.
-
-    ``drop_tpdos`` the next n TPDOs are lost. ``shorten_tpdos`` the next n come without their last byte.
-    ``duplicate_tpdos`` the next n come twice. ``hold_tpdos`` the next n come one SYNC late, after the fresh
-    ones.
-    ``mute_heartbeat`` the heartbeat stops, the rest goes on. ``silent`` the node is as good as unplugged: it
-    hears nothing and says nothing; its own watchdogs stop the axis. ``load_jump_counts`` is added to the load
-    encoder from the next sample on.
-    """
+    """Wishes, all off at first."""
 
     drop_tpdos: int = 0
+    """The next n TPDOs are lost."""
     shorten_tpdos: int = 0
+    """The next n come without their last byte."""
     duplicate_tpdos: int = 0
+    """The next n come twice."""
     hold_tpdos: int = 0
+    """The next n come one SYNC late, after the fresh ones."""
     mute_heartbeat: bool = False
+    """The heartbeat stops, the rest goes on."""
     silent: bool = False
+    """As good as unplugged: it hears nothing and says nothing; its own watchdogs stop the axis."""
     load_jump_counts: int = 0
+    """Added to the load encoder from the next sample on."""
+    ignore_lost_heartbeat: bool = False
+    """It does not notice that the master's heartbeat stays away."""
+    only_report_lost_heartbeat: bool = False
+    """It sends its EMCY for that and goes on."""
+    stay_operational: bool = False
+    """A lost heartbeat does not take it out of OPERATIONAL, whatever 1029h says."""
+    ignore_missing_set_points: bool = False
+    """It does not notice that RPDOs stay away."""
+    resume_from_quick_stop: bool = False
+    """Transition 16 at once, by a controlword that only repeats 'enable operation'."""
+    deceleration_counts_s2: float | None = None
+    """How it brakes, whatever its objects say."""
     _held: list[Outgoing] = field(default_factory=list)
     _errors: list[tuple[int, bytes]] = field(default_factory=list)
+    _lost_masters: list[int] = field(default_factory=list)
     _boot_ups: int = 0
 
     def raise_error(self, code: int, additional: bytes = b"") -> None:
         """At the next poll: malfunction ``code`` (EMCY, fault reaction), with up to five bytes of detail."""
         self._errors.append((code, additional))
+
+    def lose_master(self, code: int) -> None:
+        """At the next poll: react as 6007h says to the loss of the master, without a word of it."""
+        self._lost_masters.append(code)
 
     def boot_up(self) -> None:
         """At the next poll: reset as after a brown-out, with a boot-up message, whatever the axis does."""
@@ -48,6 +64,11 @@ class Faults:
         errors, self._errors = self._errors, []
         return errors
 
+    def take_lost_masters(self) -> list[int]:
+        """For the node: with which codes to lose its master now."""
+        codes, self._lost_masters = self._lost_masters, []
+        return codes
+
     def take_boot_up(self) -> bool:
         """For the node: whether to reset now."""
         wanted, self._boot_ups = self._boot_ups > 0, 0
@@ -56,7 +77,7 @@ class Faults:
     @property
     def concerns_poll(self) -> bool:
         """For the node: whether something is to be done at this poll."""
-        return bool(self._errors) or self._boot_ups > 0
+        return bool(self._errors or self._lost_masters) or self._boot_ups > 0
 
     @property
     def concerns_tpdos(self) -> bool:

@@ -10,6 +10,7 @@ from typing import Final
 
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
+from hdbridge.sim.faults import Faults
 from hdbridge.sim.modes import CyclicSynchronousPosition, Homing, Mode, ProfilePosition
 from hdbridge.sim.motion import Machine, Motion, wrap_int32
 from hdbridge.sim.powerstate import POWERED, Control, State, Status, next_state
@@ -47,7 +48,10 @@ class _Braking:
 class Firmware:
     """One drive. ``state`` is its power state, ``motion`` where its axis is."""
 
-    def __init__(self, dictionary: Dictionary, machine: Machine, emergency: Emergency) -> None:
+    def __init__(
+        self, dictionary: Dictionary, machine: Machine, emergency: Emergency, faults: Faults | None = None
+    ) -> None:
+        self._faults = faults or Faults()
         self._dictionary = dictionary
         self._emergency = emergency
         self.motion = Motion(dictionary, machine)
@@ -168,7 +172,8 @@ class Firmware:
 
     def control(self, word: int) -> None:
         """Take a controlword. A word that only repeats the last one asks for nothing new."""
-        if word == self._word and not self._waits_for_rest:
+        resumes = self._faults.resume_from_quick_stop and self.state is State.QUICK_STOP_ACTIVE
+        if word == self._word and not self._waits_for_rest and not resumes:
             return
         rising = word & ~self._word
         self._word = word
@@ -223,9 +228,10 @@ class Firmware:
     def _leave_quick_stop(self) -> None:
         if self._dictionary.value(0x605A) < STAY_STOPPED:
             return
-        if self._braking is not None:
+        if self._braking is not None and not self._faults.resume_from_quick_stop:
             self._waits_for_rest = True  # the same word counts once more when the axis stands
             return
+        self._braking = None
         self._operate()
 
     def _quick_stop(self) -> None:
@@ -254,11 +260,13 @@ class Firmware:
     def _brake(self, option: int, then: State | None) -> None:
         """Stop on the ramp that an option code of 605Ah to 605Eh names, then go to ``then``."""
         value = self._dictionary.value
-        deceleration = value(0x60C6)  # 'current limit' and 'voltage limit': as hard as it goes
+        deceleration: float = value(0x60C6)  # 'current limit' and 'voltage limit': as hard as it goes
         if option in SLOW_DOWN_RAMP:
             deceleration = min(value(0x6084), deceleration)
         elif option in QUICK_STOP_RAMP:
             deceleration = min(value(0x6085), deceleration)
+        if self._faults.deceleration_counts_s2 is not None:
+            deceleration = self._faults.deceleration_counts_s2
         motion = self.motion
         self._braking = _Braking(stop(motion.demand_counts, motion.velocity_counts_s, deceleration), then)
         self._finish_braking()

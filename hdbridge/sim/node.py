@@ -95,7 +95,7 @@ class SimulatedDrive:
         nameplate.engrave(self.dictionary)
         self.dictionary.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
-        self.firmware = Firmware(self.dictionary, machine, self.emergency)
+        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults)
         self._sdo = SdoServer(self.dictionary)
         numbers = range(1, PDO_COUNT + 1)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
@@ -304,6 +304,8 @@ class SimulatedDrive:
     def _make_faults(self) -> None:
         for code, additional in self.faults.take_errors():
             self.firmware.fault(code, additional)
+        for code in self.faults.take_lost_masters():
+            self.firmware.connection_lost(code)
         if self.faults.take_boot_up():
             self._reset_node()
 
@@ -345,10 +347,14 @@ class SimulatedDrive:
 
     def _lose_heartbeat(self) -> None:
         self._watch_due_s = _NEVER
+        if self.faults.ignore_lost_heartbeat:
+            return
         self.emergency.occur(ErrorCode.HEARTBEAT)
+        if self.faults.only_report_lost_heartbeat:
+            return
         self.firmware.connection_lost(ErrorCode.HEARTBEAT)
         state = _AFTER_ERROR.get(self.dictionary.value(0x1029, 1))
-        if state is not None and self.nmt is Nmt.OPERATIONAL:
+        if state is not None and self.nmt is Nmt.OPERATIONAL and not self.faults.stay_operational:
             self._enter(state)
 
     def _miss_rpdo(self, now_s: float) -> None:
@@ -357,7 +363,7 @@ class SimulatedDrive:
             if pdo.deadline_s <= now_s:
                 pdo.deadline_s = _NEVER
         self._rpdo_due_s = min((pdo.deadline_s for pdo in self._rpdo_by_id.values()), default=_NEVER)
-        if self.firmware.follows_the_bus:
+        if self.firmware.follows_the_bus and not self.faults.ignore_missing_set_points:
             self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
             self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
 

@@ -137,7 +137,7 @@ WRONG: list[tuple[str, dict[str, Any], str, str]] = [
 def _without(*keys: tuple[int, int]) -> Callable[[SimulatedDrive], None]:
     def spoil(node: SimulatedDrive) -> None:
         for key in keys:
-            del node.dictionary._entries[key]
+            node.dictionary.remove(*key)
 
     return spoil
 
@@ -229,7 +229,7 @@ def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
 
 def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None:
     def deaf(node: SimulatedDrive) -> None:
-        node._lose_heartbeat = lambda: setattr(node, "_watch_due_s", float("inf"))  # type: ignore[method-assign]
+        node.faults.ignore_lost_heartbeat = True
 
     examined = case(spoil=deaf)
     verdicts = examined.run()
@@ -240,12 +240,38 @@ def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None
     assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
 
 
+def test_a_drive_without_a_torque_limit(case: Callable[..., Any]) -> None:
+    verdicts = case(eds={"[6072]": "[no object]"}).run(until="nudge")
+    assert failures(verdicts) == []
+    assert "the EDS lacks, so what the drive has holds: 6072h:00 (torque limit" in verdicts["files"].measured
+
+
+def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) -> None:
+    def spoil(node: SimulatedDrive) -> None:
+        node.faults.only_report_lost_heartbeat = True
+
+    verdict = case(spoil=spoil).run(until="heartbeat")["heartbeat"]
+    assert verdict.outcome is FAIL
+    assert "it sent EMCY 8130h (a heartbeat that the drive watches stayed away)" in verdict.measured
+    assert "1016h" not in verdict.remedies[0]
+    assert "neither stops (6007h) nor leaves OPERATIONAL (1029h)" in verdict.remedies[0]
+    assert "transition 16" in verdict.remedies[0]
+    assert ": drive.quick_stop_option: found 6, with 1 to 4 it cannot" in verdict.remedies[0]
+
+
+def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[..., Any]) -> None:
+    def spoil(node: SimulatedDrive) -> None:
+        node.faults.resume_from_quick_stop = True
+        node.faults.stay_operational = True
+
+    verdict = case(spoil=spoil).run(until="heartbeat")["heartbeat"]
+    assert verdict.outcome is PASS, verdict
+    assert "(transition 16); it sent EMCY 8130h" in verdict.measured
+
+
 def test_a_drive_that_ignores_missing_set_points(case: Callable[..., Any]) -> None:
     def deaf(node: SimulatedDrive) -> None:
-        def ignore(now_s: float) -> None:
-            node._rpdo_due_s = float("inf")
-
-        node._miss_rpdo = ignore  # type: ignore[method-assign]
+        node.faults.ignore_missing_set_points = True
 
     verdicts = case(spoil=deaf).run()
     assert failures(verdicts) == ["set_points"]
@@ -255,18 +281,7 @@ def test_a_drive_that_ignores_missing_set_points(case: Callable[..., Any]) -> No
 
 def test_a_drive_that_hardly_brakes(case: Callable[..., Any]) -> None:
     def coast(node: SimulatedDrive) -> None:
-        node.dictionary[0x6085, 0].guard = lambda value: None
-        brake = node.firmware._brake
-
-        def weakly(option: int, then: Any) -> None:
-            entry = node.dictionary[0x6085, 0]
-            kept, entry.value = entry.value, 2_000
-            try:
-                brake(option, then)
-            finally:
-                entry.value = kept
-
-        node.firmware._brake = weakly  # type: ignore[method-assign]
+        node.faults.deceleration_counts_s2 = 2_000.0
 
     verdicts = case(spoil=coast).run(until="quick_stop")
     assert "quick_stop" in failures(verdicts)

@@ -132,11 +132,7 @@ def test_check_says_beforehand_what_the_eds_lacks(here, profile):
 
 def test_an_eds_that_lacks_what_is_needed_is_not_all_right(here, profile):
     refused(here("check", lacking(profile, 0x6064)), 2, "axis.yaml:13:3: drive.eds", "own.eds lacks 6064h:00")
-    (profile.folder / "own.eds").write_text("")
+    (profile.folder / "own.eds").write_text("[DeviceInfo]\n")
     refused(here("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
-
-
-def test_doctor_does_without_a_torque_limit_in_the_drive(here, profile):
-    done = here("doctor", lacking(profile, 0x6072), "--simulate")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "the EDS lacks, so what the drive has holds: 6072h:00 (torque limit" in done.stdout
+    (profile.folder / "own.eds").write_text("")
+    refused(here("check", profile.folder), 2, "own.eds: cannot be read as an EDS")

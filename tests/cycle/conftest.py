@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ STEP_COUNTS = 40
 class SpoiltBus(LockstepBus):
     """The master's end of the channel, with an interface that can fail."""
 
+    no_room_for: int | None = None
+    """Identifier of a frame for which the transmit queue is full, once."""
     send_error: Exception | None = None
     recv_error: Exception | None = None
     sent: list[tuple[float, int, bytes]]
@@ -42,6 +45,9 @@ class SpoiltBus(LockstepBus):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if self.send_error is not None:
             raise self.send_error
+        if msg.arbitration_id == self.no_room_for:
+            self.no_room_for = None
+            raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
         self.sent.append((self.clock.now(), msg.arbitration_id, bytes(msg.data)))
         super().send(msg, timeout)
 
@@ -49,6 +55,22 @@ class SpoiltBus(LockstepBus):
         if self.recv_error is not None:
             raise self.recv_error
         return super().recv(timeout)
+
+
+class SyncAnswer:
+    """A node that answers each SYNC with the same frames."""
+
+    def __init__(self, bus: can.BusABC, frames: tuple[tuple[int, bytes], ...]) -> None:
+        self.bus, self.frames = bus, frames
+
+    def next_event_s(self) -> float:
+        return float("inf")
+
+    def poll(self, now_s: float) -> None:
+        while (message := self.bus.recv(0)) is not None:
+            if message.arbitration_id == 0x080:
+                for can_id, data in self.frames:
+                    self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
 
 @dataclass
@@ -85,6 +107,10 @@ class Rig:
         """A frame from another node, on the bus before the next cycle."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
+
+    def answers_sync(self, *frames: tuple[int, bytes]) -> None:
+        """Another node that sends these frames after every SYNC, before the drive does."""
+        self.clock.nodes.insert(0, SyncAnswer(self.intruder, frames))
 
     def events(self, fault: Fault) -> list[Reaction]:
         return [event.reaction for event in self.supervision.events if event.fault is fault]

@@ -71,11 +71,9 @@ def test_a_duplicated_tpdo_is_counted_and_the_newest_wins(moving) -> None:
 def test_the_newest_of_one_identifier_wins(moving) -> None:
     place = moving.move().motor_counts
     moving.node.faults.silent = True
-    moving.cycle._wait()
-    for counts in (place + 10, place + 20):
-        moving.interfere(0x181, struct.pack("<Hih", 0x1237, counts, 0))
-    moving.interfere(0x281, struct.pack("<ii", 0, place))
-    assert moving.cycle._receive(moving.clock.now() + 0.001)
+    first, second = (struct.pack("<Hih", 0x1237, place + counts, 0) for counts in (10, 20))
+    moving.answers_sync((0x181, first), (0x181, second), (0x281, struct.pack("<ii", 0, place)))
+    moving.cycle.tick(moving.target)
     assert moving.drive.image.motor_counts == place + 20
 
 
@@ -100,14 +98,21 @@ def test_a_stale_tpdo_before_sync_is_discarded(moving) -> None:
 def test_a_tpdo_of_the_wrong_length_is_treated_as_lost(moving) -> None:
     moving.node.faults.shorten_tpdos = 1
     assert not moving.move().fresh
-    assert moving.events(Fault.DISCARDED_FRAME) == [Reaction.GO]
-    assert moving.events(Fault.LOST_TPDO) == [FREEZE]
+    assert moving.events(Fault.WRONG_LENGTH) == [FREEZE]
     moving.move(5)
     moving.node.faults.shorten_tpdos = 2
     moving.move()
     moving.node.faults.shorten_tpdos = 2
-    moving.stopped_within(1, Fault.LOST_TPDO)
+    text = moving.stopped_within(1, Fault.WRONG_LENGTH)
+    assert "wrong length, the second cycle in a row (181h with 7 bytes, expected 8)" in text
+    assert moving.supervision.counts[Fault.LOST_TPDO] == 0
     moving.stands_still()
+
+
+def test_a_tpdo_of_the_wrong_length_beside_a_good_one_is_only_counted(moving) -> None:
+    moving.answers_sync((0x181, b"short"))
+    assert moving.move().fresh
+    assert moving.events(Fault.DISCARDED_FRAME) == [Reaction.GO]
 
 
 @pytest.mark.parametrize("kind", ["is_remote_frame", "is_extended_id", "is_error_frame"])
@@ -189,13 +194,14 @@ def test_the_end_of_an_emergency_and_a_short_one_harm_nothing(moving) -> None:
 def test_a_fault_of_the_drive_stops_and_is_named(moving) -> None:
     moving.node.faults.raise_error(0x3210)
     text = moving.stopped_within(2, Fault.DRIVE_FAULT)
-    assert "fault" in text
+    assert "the drive sent EMCY 3210h (DC link over-voltage)" in text
+    assert "remove that cause" in text
     assert moving.supervision.counts[Fault.EMERGENCY] >= 1
     moving.stands_still()
 
 
 def test_a_drive_that_drops_out_by_itself_is_not_enabled_again(moving) -> None:
-    moving.node.firmware.connection_lost(0x8130)
+    moving.node.faults.lose_master(0x8130)
     with suppress(SafetyStop):
         moving.move(3)
     assert moving.supervision.stop is not None
@@ -211,6 +217,42 @@ def test_a_lost_heartbeat_stops_within_a_tenth_of_a_second(moving) -> None:
     moving.stopped_within(round(0.1 / 0.004) + 1, Fault.HEARTBEAT_LOST)
     assert quick_stop_was_sent(moving)
     moving.stands_still()
+
+
+@pytest.mark.parametrize("stays", [False, True], ids=["leaves operational", "stays operational"])
+def test_a_hang_of_this_process_is_told_as_that(moving, stays: bool) -> None:
+    """The drive gave its master up meanwhile: neither an NMT master nor an enable input has to do with it."""
+    moving.node.faults.stay_operational = stays
+    moving.move()
+    moving.clock.sleep_until(moving.clock.now() + 0.4)
+    text = moving.stopped_within(1, Fault.HANG)
+    assert (
+        "this process stood still for longer than the drive waits for it (396 ms; the drive waits 16 ms)"
+        in text
+    )
+    assert "EMCY 8250h (set-points (RPDOs) stayed away)" in text
+    assert "NMT master" not in text
+    assert "enable input" not in text
+    moving.stands_still()
+
+
+def test_a_hang_that_the_drive_tolerates_is_only_counted(moving) -> None:
+    moving.node.faults.ignore_missing_set_points = True
+    moving.move()
+    moving.clock.sleep_until(moving.clock.now() + 0.03)
+    assert moving.move(5).fresh
+    assert moving.events(Fault.HANG) == [Reaction.GO]
+    moving.interfere(0x701, b"\x7f")
+    moving.stopped_within(1, Fault.NMT_CHANGE)
+
+
+def test_a_drive_that_leaves_operational_says_why(moving) -> None:
+    moving.interfere(0x081, struct.pack("<HB5x", 0x8130, 0x11))
+    moving.interfere(0x701, b"\x7f")
+    text = moving.stopped_within(1, Fault.NMT_CHANGE)
+    assert "NMT state 7Fh (pre-operational)" in text
+    assert "the drive sent EMCY 8130h (a heartbeat that the drive watches stayed away)" in text
+    assert "NMT master" not in text
 
 
 # ------------------------------------------------------------------ others on the bus
@@ -333,15 +375,7 @@ def test_a_full_transmit_queue_stops_without_a_retry(moving) -> None:
 
 
 def test_a_queue_that_is_full_for_one_frame_ends_in_a_confirmed_stop(moving) -> None:
-    inner = moving.bus.send
-
-    def once(msg: can.Message, timeout: float | None = None) -> None:
-        if msg.arbitration_id == 0x201:
-            moving.cycle._link._send = inner
-            raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
-        inner(msg, timeout)
-
-    moving.cycle._link._send = once
+    moving.bus.no_room_for = 0x201
     text = moving.stopped_within(1, Fault.TRANSMIT_FULL)
     assert "did not confirm" not in text
     assert moving.drive.image.power.state is State.QUICK_STOP_ACTIVE

@@ -16,6 +16,8 @@ EXPECTED = {
     Fault.OVERRUN: (GO, STOP, STOP),
     Fault.DUPLICATE_TPDO: (GO, GO, GO),
     Fault.DISCARDED_FRAME: (GO, GO, GO),
+    Fault.WRONG_LENGTH: (FREEZE, STOP, STOP),
+    Fault.HANG: (GO, GO, GO),
     Fault.FLOOD: (FREEZE, STOP, STOP),
     Fault.EMERGENCY: (GO, GO, GO),
     Fault.DRIVE_FAULT: (STOP, STOP, STOP),

@@ -171,7 +171,7 @@ def test_viscous_drag_winds_up_by_its_thinned_torque(speed_deg_s: float) -> None
     exercise = Exercise(machine)
     exercise.move(speed_deg_s, speed_deg_s, 3000.0)
     exercise.hold(0.3)
-    exercise._lead(lambda seconds: speed_deg_s * seconds, 1.0)
+    exercise.lead(lambda seconds: speed_deg_s * seconds, 1.0)
     speed = math.radians(speed_deg_s / 50.0)
     torque = 8.0 * speed / math.sqrt(1.0 + speed / 0.05)
     assert error_arcsec(machine) == pytest.approx(-torque / 16_000 * ARCSEC_PER_RAD, rel=0.02)
@@ -271,7 +271,7 @@ def test_a_late_sample_is_the_angle_of_that_time(late_s: float) -> None:
 def test_a_late_motor_sample_is_late_on_the_bus_and_not_in_the_loops() -> None:
     machines = [Machine(axis(motor__encoder__late_ms=late_ms), 1) for late_ms in (0.0, 3.0)]
     for machine in machines:
-        Exercise(machine)._lead(lambda seconds: 400.0 * seconds, 0.5)
+        Exercise(machine).lead(lambda seconds: 400.0 * seconds, 0.5)
     assert machines[0].true_motor_deg == machines[1].true_motor_deg
     behind = (machines[0].motor_counts - machines[1].motor_counts) / 512_000 * 360.0
     assert behind == pytest.approx(400.0 * 0.003, rel=0.02)
@@ -358,7 +358,7 @@ def test_warmth_changes_tooth_error_friction_and_the_zero() -> None:
         }
         machine, exercise = moved(axis(gear__motor_orders=order, temperature=heat), 180.0)
         errors.append(error_arcsec(machine))
-        exercise._lead(lambda seconds: 300.0 * seconds, 0.8)
+        exercise.lead(lambda seconds: 300.0 * seconds, 0.8)
         torques.append(float(np.mean(exercise.readings().motor_torque_nm[-100:])))
     assert errors[0] == pytest.approx(10.0, abs=0.1)
     assert errors[1] == pytest.approx(12.0, abs=0.1)
@@ -388,7 +388,7 @@ def test_the_loop_grows_with_speed_and_settles_back_at_rest() -> None:
     exercise.move(90.0, 300.0, 3000.0)
     exercise.hold(1.0)
     assert error_arcsec(machine) == pytest.approx(20.0, abs=0.1)
-    exercise._lead(lambda seconds: 99.0 * seconds, 2.0)
+    exercise.lead(lambda seconds: 99.0 * seconds, 2.0)
     assert error_arcsec(machine) == pytest.approx(20.0 * 1.2, abs=0.2)
 
 
