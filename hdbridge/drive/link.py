@@ -14,6 +14,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, Final, NamedTuple, Protocol
 
 import can
@@ -29,6 +30,11 @@ _GONE: Final = frozenset(
 _DRAIN_AT_MOST: Final = 4096
 _ECHOING: Final = frozenset({"UdpMulticastBus"})
 """Back ends of python-can that give a bus its own frames back and cannot be told not to."""
+_PACKAGES: Final = {
+    "udp_multicast": ("msgpack", "msgpack"),
+    **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "pyserial")),
+}
+"""What python-can does not install by itself: module and package."""
 _PROCESS: Final = uuid.uuid4().hex[:12]
 _ERROR_FRAME_BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""
@@ -222,6 +228,12 @@ def _errno(error: BaseException | None) -> int | None:
     return None
 
 
+def _lacking(interface: str) -> str | None:
+    """The package to install for an interface of python-can; None where it is there, or none is known of."""
+    module, package = _PACKAGES.get(interface, ("", ""))
+    return package if module and find_spec(module) is None else None
+
+
 @contextmanager
 def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.BusABC]:
     """Open the bus of an axis file; `BusError` in one line when that is not possible.
@@ -250,6 +262,8 @@ def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
         if settings.interface not in can.VALID_INTERFACES:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             what = f"python-can has no interface {settings.interface!r}; bus.interface may be one of {known}"
+        elif (package := _lacking(settings.interface)) is not None:
+            what = f"python-can needs the package {package} for it: python -m pip install {package}"
         else:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             what = f"cannot open it: {reason}; check bus.channel and that the interface is up"

@@ -108,6 +108,19 @@ class Rig:
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
+    def hang(self, duration_s: float) -> None:
+        """The master does nothing for so long."""
+        self.clock.sleep_until(self.clock.now() + duration_s)
+
+    def interface_down(self) -> None:
+        self.bus.recv_error = can.CanOperationError("Network is down", errno.ENETDOWN)
+
+    def interface_deleted(self) -> None:
+        self.bus.send_error = can.CanOperationError("No such device", errno.ENODEV)
+
+    def transmit_queue_full(self) -> None:
+        self.bus.no_room_for = 0x201
+
     def answers_sync(self, *frames: tuple[int, bytes]) -> None:
         """Another node that sends these frames after every SYNC, before the drive does."""
         self.clock.nodes.insert(0, SyncAnswer(self.intruder, frames))

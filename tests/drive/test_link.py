@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import sys
 import time
 from collections import deque
 from copy import deepcopy
@@ -173,6 +174,25 @@ def test_opening_an_absent_channel() -> None:
     ):
         pass
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("interface", "module", "package"),
+    [("udp_multicast", "msgpack", "msgpack"), ("slcan", "serial", "pyserial")],
+)
+def test_a_missing_package_is_said_with_the_line_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch, interface: str, module: str, package: str
+) -> None:
+    def refuse(**options: object) -> None:
+        raise can.CanInterfaceNotImplementedError(f"{module} not installed")
+
+    monkeypatch.setattr("can.Bus", refuse)
+    monkeypatch.setitem(sys.modules, module, None)
+    with (
+        pytest.raises(BusError, match=f"needs the package {package} for it: python -m pip install {package}"),
+        open_bus(BusConfig(interface=interface, channel="x"), shared=True),
+    ):
+        pass
 
 
 def test_an_opened_bus_is_closed_again() -> None:

@@ -35,7 +35,7 @@ def test_a_burst_of_emergencies_is_counted_and_kept_bounded() -> None:
     status = monitor.nodes[1]
     assert status.emergency_count == 1000
     assert len(status.emergencies) == EMERGENCIES_KEPT
-    assert str(status.emergencies[-1]) == "EMCY 86E7h, register 21h, 01 02 03 04 05"
+    assert str(status.emergencies[-1]) == "EMCY 86E7h (positioning), register 21h, 01 02 03 04 05"
 
 
 def test_a_short_emergency_is_not_lost() -> None:
