@@ -256,6 +256,10 @@ class Drive:
         modes.run_homing(self._commander, homing)
         return self.read_positions()
 
+    def state(self) -> State:
+        """The power state, read by SDO."""
+        return self._commander.state()
+
     def read_positions(self) -> Positions:
         """Both encoders by SDO, as they read now."""
         source = self.axis.load_encoder.source
