@@ -100,15 +100,15 @@ def test_usage_errors_have_status_2(hdbridge):
 
 
 @pytest.mark.parametrize("command", ["step", "calibrate", "improve", "scan", "doctor"])
-def test_a_simulated_drive_has_no_bus_to_choose(here, command):
-    done = here(command, "article", "--simulate", "--interface", "socketcan")
+def test_a_simulated_drive_has_no_bus_to_choose(hdbridge, command):
+    done = hdbridge(command, "article", "--simulate", "--interface", "socketcan")
     assert done.returncode == 2
     assert "leave out --interface and --channel" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["step", "calibrate", "scan"])
-def test_the_virtual_bus_without_a_drive_is_refused_at_once(here, command):
-    done = here(command, "article")
+def test_the_virtual_bus_without_a_drive_is_refused_at_once(hdbridge, command):
+    done = hdbridge(command, "article")
     assert done.returncode == 2
     assert "bus.interface: found virtual, which reaches nothing outside this process" in done.stderr
     assert "--simulate" in done.stderr
@@ -123,16 +123,18 @@ def lacking(profile, *indices):
     return profile("eds: hdbridge-402.eds", "eds: own.eds")
 
 
-def test_check_says_beforehand_what_the_eds_lacks(here, profile):
-    done = here("check", lacking(profile, 0x6072))
+def test_check_says_beforehand_what_the_eds_lacks(hdbridge, profile):
+    done = hdbridge("check", lacking(profile, 0x6072))
     assert done.returncode == 0, done.stderr
     assert "left to the drive  6072h:00, which own.eds lacks: torque limit" in done.stdout
     assert ": limits.torque_percent)" in done.stdout
 
 
-def test_an_eds_that_lacks_what_is_needed_is_not_all_right(here, profile):
-    refused(here("check", lacking(profile, 0x6064)), 2, "axis.yaml:13:3: drive.eds", "own.eds lacks 6064h:00")
+def test_an_eds_that_lacks_what_is_needed_is_not_all_right(hdbridge, profile):
+    refused(
+        hdbridge("check", lacking(profile, 0x6064)), 2, "axis.yaml:13:3: drive.eds", "own.eds lacks 6064h:00"
+    )
     (profile.folder / "own.eds").write_text("[DeviceInfo]\n")
-    refused(here("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
+    refused(hdbridge("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
     (profile.folder / "own.eds").write_text("")
-    refused(here("check", profile.folder), 2, "own.eds: cannot be read as an EDS")
+    refused(hdbridge("check", profile.folder), 2, "own.eds: cannot be read as an EDS")
