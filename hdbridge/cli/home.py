@@ -8,6 +8,7 @@ import typer
 
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     InterfaceOption,
     JsonOption,
     Profile,
@@ -69,6 +70,7 @@ def home(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.
@@ -79,10 +81,10 @@ def home(
     from hdbridge.drive.drive import Drive
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     with (
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
+        connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
+        Drive(bus, axis, clock, force=force) as drive,
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")

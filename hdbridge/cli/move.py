@@ -11,6 +11,7 @@ from rich.table import Table
 
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     InterfaceOption,
     JsonOption,
     ModelOption,
@@ -71,6 +72,7 @@ def move(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
@@ -84,10 +86,10 @@ def move(
     from hdbridge.procedures.waypoints import Hold, WayPoints
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
     compensation = compensation_for(axis, chosen)  # refused before anything is connected
-    with booted(axis, files, simulate=simulate, truth=truth, seed=seed) as (drive, interrupted):
+    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         if simulate and hold_s is None:
             hold_s = 0.0  # nobody sees a simulated axis stand
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)

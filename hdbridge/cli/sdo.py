@@ -11,6 +11,7 @@ import typer
 
 from hdbridge.cli.options import (
     ChannelOption,
+    ForceOption,
     InterfaceOption,
     JsonOption,
     Profile,
@@ -57,13 +58,14 @@ def get(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Read an object of the drive. The drive is neither booted nor enabled."""
     from hdbridge.drive.values import find_object
 
     files = Profile.find(profile)
-    with _drive(files, simulate, truth, seed, interface, channel) as drive:
+    with _drive(files, simulate, truth, seed, interface, channel, force) as drive:
         wanted = find_object(object_, drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: can only be written, by the EDS")
@@ -83,6 +85,7 @@ def put(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Write an object of the drive, and read it back. The drive is neither booted nor enabled by this.
@@ -95,12 +98,12 @@ def put(
     from hdbridge.drive.values import find_object
 
     files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     wanted = find_object(object_, load_eds(axis.eds_path, axis.drive.node_id))
     if not wanted.writable:
         raise InputError(f"{wanted}: can only be read, by the EDS; nothing was written")
     data = wanted.encode(value)
-    with _drive(files, simulate, truth, seed, interface, channel) as drive:
+    with _drive(files, simulate, truth, seed, interface, channel, force) as drive:
         drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         now = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub) if wanted.readable else data)
     write_json(json_file, _document(wanted, now))
@@ -115,15 +118,17 @@ def _drive(
     seed: int,
     interface: str | None,
     channel: str | None,
+    force: bool,
 ) -> Iterator[Drive]:
     """The drive, not booted: its objects are read and written as they are."""
     from hdbridge.drive.drive import Drive
 
-    axis = load_axis(files, interface, channel)
+    axis = load_axis(files, interface, channel, simulate=simulate)
     with (
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed) as (bus, clock),
-        Drive(bus, axis, clock) as drive,
+        connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
+        Drive(bus, axis, clock, force=force) as drive,
     ):
+        drive.listen()
         yield drive
 
 
