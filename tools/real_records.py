@@ -1,14 +1,16 @@
 """The figures of docs/real-records.md, from the measured records (which are not part of the project).
 
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py      # 40 s of CPU
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py      # a minute of CPU
 
-The folder holds `cobot/jointJ-R.csv` and `damper/sine.csv`, `damper/earthquake.csv`.
+The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-command`, `damper/sine.csv` and
+`damper/earthquake.csv`.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ import numpy as np
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.model import TransmissionModel
+from hdbridge.observations.driving import driving_angle
 from hdbridge.records.record import Record, concatenate
 
 NOTHING = TransmissionModel(100.0, ())
@@ -28,9 +31,9 @@ def main() -> None:
     if named is None:
         sys.exit("HDBRIDGE_REAL_RECORDS is not set; expected the folder of the measured records")
     folder = Path(named)
-    for joint in (4, 5):
-        records = [Record.read_csv(each) for each in sorted(folder.glob(f"cobot/joint{joint}-*.csv"))]
-        print(f"joint {joint}, all recordings")
+    for name, joint in product(("cobot", "cobot-command"), (4, 5)):
+        records = [Record.read_csv(each) for each in sorted(folder.glob(f"{name}/joint{joint}-*.csv"))]
+        print(f"{name}, joint {joint}, all recordings")
         _print(diagnose(concatenate(records), NOTHING, independent_zeros=True))
         _leave_one_out(records)
     _laws(folder)
@@ -84,6 +87,7 @@ def _laws(folder: Path) -> None:
     """Both laws fitted to the sine, and what they say of the earthquake; widths in mm."""
     _, angle, force = _damper(folder, "sine")
     _, other, measured = _damper(folder, "earthquake")
+    angle, other = (driving_angle(each, None, commanded=False) for each in (angle, other))
     print(f"damper: {np.std(force):.0f} N rms in the sine, {np.std(measured):.0f} N in the earthquake")
     for law in (Hysteresis, HysteresisMemory):
         best = None

@@ -6,7 +6,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.pipeline import conclude
 from hdbridge.calibration.result import Calibration
 from hdbridge.model import TransmissionModel
-from hdbridge.records.foreign import check_records
+from hdbridge.observations.foreign import check_records
 from hdbridge.records.given import Given, agreed_ratio, by_name
 
 

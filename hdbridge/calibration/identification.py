@@ -13,6 +13,7 @@ from hdbridge.calibration.journal import tasks_of
 from hdbridge.effects import FloatArray, Start
 from hdbridge.identify import FitOptions, FitResult, Kind, Segment, fit
 from hdbridge.model import TransmissionModel
+from hdbridge.observations.cuts import observed
 from hdbridge.records.record import Record, time_shifts_s
 from hdbridge.records.recording import Recording, versions_here
 
@@ -27,7 +28,12 @@ def identify(
     independent_zeros: bool = False,
 ) -> FitResult:
     """Fit a model. InputError where the recordings cannot be used; what they cannot say: ``warnings``."""
-    return fit(segments_of(recordings, independent_zeros=independent_zeros), ratio, FitOptions(active=active))
+    prepared = [observed(each.record, ratio) for each in recordings]
+    whole = [replace(each, record=seen.record) for each, seen in zip(recordings, prepared, strict=True)]
+    segments = segments_of(whole, independent_zeros=independent_zeros)
+    found = fit(segments, ratio, FitOptions(active=active))
+    remarks = tuple(remark for seen in prepared for remark in seen.remarks)
+    return replace(found, warnings=(*remarks, *found.warnings))
 
 
 def segments_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> list[Segment]:
@@ -44,7 +50,7 @@ def segments_of(recordings: Sequence[Recording], *, independent_zeros: bool = Fa
             if independent_zeros or _sessions(recording)
             else 0
         )
-        segments += _of_one(recording, shift_s, zero)
+        segments += _of_one(recording, shift_s, zero, independent_zeros)
     return segments
 
 
@@ -105,11 +111,12 @@ def _sessions(recording: Recording) -> bool:
     return len({each.session for each in tasks_of(recording)}) > 1
 
 
-def _of_one(recording: Recording, shift_s: float, zero: int) -> Iterator[Segment]:
+def _of_one(recording: Recording, shift_s: float, zero: int, independent: bool) -> Iterator[Segment]:
     if not recording.segments:
         for number, part in enumerate(recording.record.parts()):
             name = part.source or f"part {number + 1}"
-            yield _segment(part, Kind.UNKNOWN, shift_s, zero, None, name)
+            segment = _segment(part, Kind.UNKNOWN, shift_s, zero + number * independent, None, name)
+            yield replace(segment, follows=number == 0)
         return
     tasks = list(tasks_of(recording))
     session, known = 1, not tasks

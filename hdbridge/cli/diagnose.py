@@ -63,6 +63,7 @@ def run(
     from hdbridge.diagnose import diagnose
     from hdbridge.diagnose.planned import plan_report
     from hdbridge.model import TransmissionModel
+    from hdbridge.observations.foreign import check_once
     from hdbridge.procedures.plan import Plan
     from hdbridge.records.recording import Recording
     from hdbridge.report.diagnosis import diagnosis_page
@@ -80,7 +81,9 @@ def run(
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
-    recordings = {each: Recording.load(each) for each in records}
+    loaded = [Recording.load(each) for each in records]
+    check_once(records, [each.record for each in loaded])
+    recordings = dict(zip(records, loaded, strict=True))
     result = diagnose(
         recordings,
         known,

@@ -58,12 +58,15 @@ def command(
     from hdbridge.calibration import fit
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
     from hdbridge.model import TransmissionModel
+    from hdbridge.observations.foreign import check_once
     from hdbridge.records.recording import Recording
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
+    loaded = [Recording.load(each) for each in records]
+    check_once(records, [each.record for each in loaded])
     compared = TransmissionModel.load(active) if active else None
     found = fit(
-        {each: Recording.load(each) for each in records},
+        dict(zip(records, loaded, strict=True)),
         ratio=ratio,
         axis=config,
         active=compared,

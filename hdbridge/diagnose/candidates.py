@@ -30,6 +30,7 @@ from hdbridge.effects import (
     RatioError,
     Relaxation,
     Synchronous,
+    TorqueGrowth,
     TorqueModulation,
     VelocityWindup,
     Wear,
@@ -131,6 +132,8 @@ def _with_torque(
     channels = [Channel.LOAD_TORQUE] if Channel.LOAD_TORQUE in motion_torques else list(motion_torques)
     for channel in channels:
         top = motion_torques[channel]
+        # Beyond its range an effect is held: the record's torques have to lie within.
+        within = {"limit_nm": max(TorqueGrowth.model_fields["limit_nm"].default, 2.0 * top)}
         if channel is Channel.LOAD_TORQUE:
             straight = {"torque1_nm": 1e4, "torque2_nm": 2e4}
             broken = {"torque1_nm": 0.4 * top, "torque2_nm": 0.8 * top}
@@ -142,8 +145,9 @@ def _with_torque(
             if has_orders:
                 for signed in (False, True):
                     yield TorqueModulation(
-                        orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed, torque=channel.value
-                    )
+                        orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed,
+                        torque=channel.value, **within,
+                    )  # fmt: skip
 
 
 def _warm(evidence: Evidence, base: Sequence[Effect], modulated: bool) -> Iterator[Effect]:

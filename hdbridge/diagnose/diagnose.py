@@ -35,14 +35,18 @@ from hdbridge.diagnose.unexplained import (
     rest,
     without_doubtful_loops,
 )
+from hdbridge.diagnose.unfitted import unfitted
 from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
+from hdbridge.effects.torque import beyond_limit
 from hdbridge.model import TransmissionModel
-from hdbridge.records.foreign import check_records, zeros_apart_arcsec
+from hdbridge.observations.cuts import observed
+from hdbridge.observations.foreign import check_records, zeros_apart_arcsec
 from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
+from hdbridge.units import DEG_PER_TURN
 
 LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 NAMED = 0.3
@@ -56,6 +60,10 @@ LINES = frozenset({"subdivisional_error", "vibration"})
 LOOP_EXPLAINS = 0.3
 """A loop of another shape accounts for what is left when the way since the reversal foretells this share
 of it."""
+FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
+PARTED = 0.2
+"""Share of a period by which two orders have to part to be told apart, whatever else is not quite right: some
+ten motor turns for order 2 at a ratio of 100."""
 LOW_SHARE = 0.8
 """Orders 1 and 2 that make up more than this share of the squares may be the motor encoder's own."""
 
@@ -79,7 +87,9 @@ def diagnose(
     check_records({name: each.record for name, each in recordings.items()}, model.ratio)
     whole = Recording.joined(list(recordings.values()))
     record, legs = whole.record, whole.segments
-    remarks = () if independent_zeros else _of_zeros(record.parts(), model.ratio)
+    remarks = (
+        () if independent_zeros else _of_zeros(observed(record, model.ratio).record.parts(), model.ratio)
+    )
     lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
     for name, channels in lacking.items():
         if channels:
@@ -90,10 +100,14 @@ def diagnose(
     )
     workshop = Workshop(evidence)
     search = Search(workshop, model.effects)
+    first = unfitted(workshop, model.effects)
+    held = beyond_limit(model.effects, evidence.full.motion)
+    evidence = replace(evidence, remarks=(*((first,) if first else ()), *held, *evidence.remarks))
+    workshop.evidence = evidence
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    found = _Judge(workshop, search, trail, model, record, named_from).diagnosis()
+    found = _Judge(workshop, search, trail, model, record, named_from, bool(first)).diagnosis()
     return replace(found, remarks=(*remarks, *found.remarks))
 
 
@@ -126,6 +140,8 @@ class _Judge:
     model: TransmissionModel
     record: Record
     named_from: float
+    unfitted: bool
+    """Whether the model lacks most of what the axis has."""
 
     def diagnosis(self) -> Diagnosis:
         workshop, trail, base = self.workshop, self.trail, self.trail.base
@@ -304,11 +320,26 @@ class _Judge:
                 margin = min(margin, worse)
         if effect.name == "motor_order" and _low(effect):
             aliases += [each for each in ALWAYS["motor_order"] if each not in aliases]
+        aliases += [each for each in self._out_of_step(effect) if each not in aliases]
         has_torque = Channel.LOAD_TORQUE in self.workshop.motion.available()
         orders = {each.order for each in getattr(effect, "orders", ())}
         if effect.name == "load_order" and 1 in orders and not has_torque and "compliance" not in aliases:
             aliases.append("compliance")
         return tuple(aliases), margin
+
+    def _out_of_step(self, effect: Effect) -> tuple[str, ...]:
+        """The other of the motor's and the flexspline's orders, where one has hardly parted from the other.
+
+        Over T motor turns orders k of the two part by k T / N of a period.
+        """
+        twin = {"motor_order": "flexspline_order", "flexspline_order": "motor_order"}.get(effect.name)
+        if twin is None:
+            return ()
+        orders = effect.orders  # type: ignore[attr-defined]
+        largest = max(orders, key=lambda each: each.amplitude_arcsec).order
+        evidence = self.workshop.evidence
+        parted = largest * evidence.travel_deg / DEG_PER_TURN / evidence.ratio
+        return (twin,) if parted < PARTED else ()
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings)
@@ -330,7 +361,7 @@ class _Judge:
             parameters={},
             gain=None,
             left_arcsec=left.arcsec,
-            experiment=for_unexplained(lives),
+            experiment=FIT_FIRST if self.unfitted else for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",

@@ -18,11 +18,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.driven import kinematics
-from hdbridge.diagnose.noise import noise_arcsec, third_deviation
+from hdbridge.diagnose.noise import noise_arcsec
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
-from hdbridge.identify.driving import quantum_deg, steadied
+from hdbridge.observations.cuts import observed
+from hdbridge.observations.driving import reversals
+from hdbridge.observations.kinematics import kinematics
+from hdbridge.observations.reading import Reading, quantum_deg, reading_of
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -35,8 +37,6 @@ AVERAGED_POINTS = 50_000
 """to at most about so many points: time and memory go with them, and what is slow needs no more."""
 SHORT = 0.77
 """Share of the mean length of a run that every other one has: the rest have 1.6 times as much."""
-CHATTER_SIGMAS = 8.0
-"""Turns smaller than so many standard deviations of the noise of the measured angle are no turns."""
 LEAST_SAMPLES = 60
 SPEED_WINDOW_S = 0.03
 SETTLE_S = 0.15
@@ -103,13 +103,15 @@ class Evidence:
     commanded: bool
     """Whether the record has the command."""
     motor_count_arcsec: float
-    """One count of the motor encoder at the load; 0 where none is seen."""
+    """One count of the motor encoder at the load; where none is seen, the one that would jitter as much."""
     load_count_arcsec: float
     period_s: float
     """Median time between samples."""
     standstill: bool
     reversals: int
-    """Turns of the driving angle."""
+    """Turns of the driving angle with travel on both sides, each within one record."""
+    travel_deg: float
+    """The largest span of the motor's angle over which a phase is carried: no further than to a cut."""
     remarks: tuple[str, ...]
     """What the record lacks, in words."""
 
@@ -134,12 +136,15 @@ def gather(
             f"{record.source or 'the record'}: {count} samples are too few for a diagnosis; expected at "
             f"least {LEAST_SAMPLES}: record more"
         )
-    for part in record.parts() if independent_zeros else (record,):
+    prepared = observed(record, ratio)
+    record = prepared.record
+    count = len(record)
+    for part in record.parts() if independent_zeros or prepared.cuts else (record,):
         part.check_ratio(ratio)
     full, kinds, facts = _series(record, ratio, legs, independent_zeros)
     motion = full.motion
     turns = facts.reversals
-    remarks = []
+    remarks = list(prepared.remarks)
     if not facts.commanded:
         remarks.append("no command (motor_target_deg): the encoder's own counts drive the hysteresis")
     still = motion.motor_speed_deg_s == 0.0 if motion.motor_speed_deg_s is not None else np.zeros(count, bool)
@@ -167,6 +172,7 @@ def gather(
         period_s=facts.period_s,
         standstill=standstill,
         reversals=turns,
+        travel_deg=prepared.travel_deg(independent_zeros),
         remarks=tuple(remarks),
     )
 
@@ -189,20 +195,22 @@ def _series(
     fresh = np.zeros(len(time), dtype=bool)
     fresh[list(record.starts)] = True
     window = max(1, round(SPEED_WINDOW_S / period)) | 1
-    count = quantum_deg(record.motor_position_deg)
+    edges = [*record.starts, len(time)]
+    rows_of = [slice(first, last) for first, last in pairwise(edges)]
+    reading = _reading(record.motor_position_deg, rows_of)
+    count = reading.count_deg
     target = record.motor_target_deg
     if target is not None and np.ptp(target) <= 0.0 and np.ptp(record.motor_position_deg) > 4.0 * count:
         target = None  # a command that never moves while the motor does is no command
-    edges = [*record.starts, len(time)]
     pieces = [
         kinematics(
             record.motor_position_deg[rows],
             None if target is None else target[rows],
             time[rows],
             window,
-            count,
+            reading,
         )
-        for rows in (slice(first, last) for first, last in pairwise(edges))
+        for rows in rows_of
     ]
     driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
     driving.setflags(write=False)  # so that where it turns round is worked out once
@@ -232,13 +240,10 @@ def _series(
     )
     facts = _Facts(
         target is not None,
-        count / ratio * ARCSEC_PER_DEG,
+        reading.resolution_deg / ratio * ARCSEC_PER_DEG,
         quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
         period,
-        sum(
-            _turns(piece[0], _chatter_deg(record.motor_position_deg[first:last]))
-            for piece, (first, last) in zip(pieces, pairwise(edges), strict=True)
-        ),
+        sum(reversals(piece[0], reading.jitter_deg) for piece in pieces),
     )
     return series, names, facts
 
@@ -264,16 +269,10 @@ def _kinds(
     return kind, leg, ("standing", "slow", "fast")
 
 
-def _chatter_deg(position_deg: FloatArray) -> float:
-    """What the noise of an interpolated encoder may go back without the axis having turned round."""
-    third = np.diff(position_deg, 3)
-    return CHATTER_SIGMAS * third_deviation(third) if len(third) else 0.0
-
-
-def _turns(motor_deg: FloatArray, chatter_deg: float) -> int:
-    steps = np.sign(np.diff(steadied(motor_deg, motor_deg, chatter_deg)))
-    held = steps[steps != 0.0]
-    return int(np.count_nonzero(np.diff(held)))
+def _reading(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
+    """How finely the motor's angle was read: one encoder for all parts, so the one that saw it best tells."""
+    largest = max(parts, key=lambda rows: rows.stop - rows.start)
+    return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
 
 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:

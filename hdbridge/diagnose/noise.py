@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.effects import FloatArray
-
-_THIRD = np.sqrt(20.0)
-_MAD = 1.4826
+from hdbridge.observations.reading import third_deviation
 
 
 def noise_arcsec(
@@ -37,8 +35,3 @@ def noise_arcsec(
     if np.any(still) and np.any(~still):  # in motion nothing is quieter than at rest
         result[~still] = max(float(result[~still][0]), 0.5 * float(result[still][0]))
     return result
-
-
-def third_deviation(third: FloatArray) -> float:
-    """Standard deviation of white noise from its third differences, by their median."""
-    return float(_MAD * np.median(np.abs(third)) / _THIRD)

@@ -258,8 +258,8 @@ class Search:
         return trial
 
     def _travel_turns(self) -> float:
-        """Turns of the load that the record covers."""
-        return float(np.ptp(self.workshop.motion.motor_deg)) / 360.0 / self.workshop.evidence.ratio
+        """Turns of the load that the record covers without a cut."""
+        return self.workshop.evidence.travel_deg / 360.0 / self.workshop.evidence.ratio
 
     def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
         """Whether what was added is large enough, physical, and really seen."""

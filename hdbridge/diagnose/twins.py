@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdbridge.diagnose.noise import third_deviation
 from hdbridge.diagnose.search import FLOOR_ARCSEC, Search
 from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
@@ -17,6 +16,7 @@ from hdbridge.effects import (
     LoadOrders,
     VelocityWindup,
 )
+from hdbridge.observations.reading import third_deviation
 
 INERTIA_SHARE = 0.15
 """A skew whose part in speed is less than this of its part in acceleration is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -21,6 +22,25 @@ TorqueLimit = Annotated[
         gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
     ),
 ]
+
+
+def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
+    """In words, the effects that are held because a record's torque goes beyond their range."""
+    lines = []
+    for each in effects:
+        name, limit_nm = getattr(each, "torque", None), getattr(each, "limit_nm", None)
+        torque = None if name is None else motion.measured.get(Channel(name))
+        if torque is None or limit_nm is None or not len(torque):
+            continue
+        largest = float(np.max(np.abs(torque)))
+        if largest > limit_nm:
+            share = 100.0 * float(np.mean(np.abs(torque) > limit_nm))
+            lines.append(
+                f"{name} reaches {largest:.4g} Nm, beyond the limit_nm of {limit_nm:g} of the model's "
+                f"{getattr(each, 'name', 'effect')}, which is held there ({share:.2g} % of the samples): "
+                "raise limit_nm if the torque is right"
+            )
+    return tuple(lines)
 
 
 class TorqueGrowth(BaseModel):

@@ -13,8 +13,10 @@ from hdbridge.effects import FloatArray, Motion, Start
 from hdbridge.effects.base import measured_by_all
 from hdbridge.effects.hysteresis import branches
 from hdbridge.errors import InputError
-from hdbridge.identify.driving import driving_angle, quantum_deg
 from hdbridge.identify.segment import MINIMUM_SAMPLES, Kind, Segment
+from hdbridge.observations.cuts import jumps
+from hdbridge.observations.driving import driving_angle
+from hdbridge.observations.reading import quantum_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
 IntArray = NDArray[np.intp]
@@ -70,6 +72,8 @@ class Samples:
     count_deg: float
     """Motor angle of one count of the encoder or the command, 0 where none is seen."""
     chains: tuple[Chain, ...]
+    travel_deg: float
+    """The largest span of the motor's angle over which a phase is carried."""
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -110,7 +114,10 @@ def gather(
     begins = [
         index
         for index, each in enumerate(segments)
-        if index == 0 or each.start is not None or numbers[index] != numbers[index - 1]
+        if index == 0
+        or each.start is not None
+        or numbers[index] != numbers[index - 1]
+        or not follows(segments[index - 1], each)
     ]
     sizes = np.cumsum([0, *(len(each) for each in segments)]).tolist()
     chains: list[Chain] = []
@@ -148,7 +155,32 @@ def gather(
             for each in segments
         ),
         chains=tuple(chains),
+        travel_deg=_travel_deg(segments, numbers),
     )
+
+
+def follows(before: Segment, segment: Segment) -> bool:
+    """Whether the axis can have moved straight from one segment to the next."""
+    time_s = np.concatenate([before.time_s[-2:], segment.time_s[:2]])
+    motor_deg = np.concatenate([_measured(before)[-2:], _measured(segment)[:2]])
+    return segment.follows and not len(jumps(motor_deg, time_s))
+
+
+def _measured(segment: Segment) -> FloatArray:
+    return segment.motor_deg if segment.position_deg is None else segment.position_deg
+
+
+def _travel_deg(segments: Sequence[Segment], zeros: Sequence[int]) -> float:
+    """The largest span without another zero or a cut."""
+    low = high = None
+    largest = 0.0
+    for index, each in enumerate(segments):
+        here = _measured(each)
+        cut = index and (zeros[index] != zeros[index - 1] or not follows(segments[index - 1], each))
+        low = float(np.min(here)) if cut or low is None else min(low, float(np.min(here)))
+        high = float(np.max(here)) if cut or high is None else max(high, float(np.max(here)))
+        largest = max(largest, high - low)
+    return largest
 
 
 def _motion(segments: Sequence[Segment]) -> Motion:

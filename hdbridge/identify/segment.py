@@ -40,7 +40,8 @@ class Segment:
 
     A segment follows the one before it: the axis moved straight from the last sample of that to the first of
     this, and the gear's elastic state came along. Where that is not so, say what the state was (``start``),
-    or give it another ``zero``, which says that the encoders' zeros may have been lost in between.
+    that it is not known (``follows``), or give it another ``zero``: the encoders' zeros may have been lost in
+    between.
     """
 
     time_s: FloatArray
@@ -57,6 +58,8 @@ class Segment:
     """The measured channels that it has."""
     start: Start | None = None
     """The elastic state at the first sample where it is known and does not follow from the segment before."""
+    follows: bool = True
+    """False where nothing is known of the axis between the segment before and this one."""
     zero: int = 0
     """Segments of one number share one absolute zero."""
     name: str = "segment"

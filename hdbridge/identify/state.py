@@ -131,7 +131,7 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
     ratio = design.samples.ratio
     if turns_covered(design) < WHOLE_TURN:
         return ()
-    turns = float(np.ptp(design.blocks.motor_deg)) / DEG_PER_TURN
+    turns = design.samples.travel_deg / DEG_PER_TURN
     motor = [Order.motor(number) for number in range(1, options.highest_order + 1)]
     if turns < WHOLE_TURN * ratio:
         return tuple(motor)

@@ -35,6 +35,11 @@ OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
 )
 MINIMUM_SAMPLES: Final = 2
 _DEG_PER_RAD: Final = float(np.degrees(1.0))
+_DEG_PER_TURN: Final = 360.0
+UNIT_SHARE: Final = 0.006
+"""How far a slope may be off that of a unit to look like it: a ratio that is next to the gear's is as far."""
+LEAST_COUNTS: Final = 1000.0
+"""An encoder has at least so many counts per turn."""
 
 WRONG_RATIO: Final = 0.003
 """A ratio this far off, relatively, is another gear's; the closest pair of common ones is 0.6 % apart."""
@@ -240,13 +245,29 @@ def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
 def _cure(times: float, ratio: float) -> str:
     """What may be wrong where the load goes so many times as far as the ratio says."""
     usual = {
-        1.0 / _DEG_PER_RAD: "the load's angle is in radians: convert it to degrees",
-        _DEG_PER_RAD: "the motor's angle is in radians: convert it to degrees",
+        1.0 / _DEG_PER_RAD: "the load's angle looks like radians: convert it to degrees",
+        _DEG_PER_RAD: "the motor's angle looks like radians: convert it to degrees",
+        1.0 / _DEG_PER_TURN: "the load's angle looks like turns: convert it to degrees",
+        _DEG_PER_TURN: "the motor's angle looks like turns: convert it to degrees",
+        3600.0: "the load's angle looks like arcseconds: convert it to degrees",
         ratio**2: "the columns of motor and load are exchanged",
         ratio: "the motor's angle is told at the gear's output: multiply it by the ratio",
     }
-    near = [cure for value, cure in usual.items() if abs(times / value - 1.0) < WRONG_RATIO]
-    return near[0] if near else "correct the ratio, or the counts per turn of an encoder"
+    value, cure = min(usual.items(), key=lambda each: abs(times / each[0] - 1.0))
+    if abs(times / value - 1.0) < UNIT_SHARE:
+        rest = abs(times / value - 1.0)
+        return (
+            cure
+            if rest < WRONG_RATIO
+            else f"{cure} (then it is {100.0 * rest:.2g} % off: see the ratio, too)"
+        )
+    for name, counts in (("load", _DEG_PER_TURN * times), ("motor", _DEG_PER_TURN / times)):
+        if counts > LEAST_COUNTS:
+            return (
+                f"the {name}'s angle looks like counts, some {counts:.4g} to a turn: convert it to degrees "
+                "(times 360, divided by the counts per turn)"
+            )
+    return "correct the ratio, or the counts per turn of an encoder"
 
 
 def _frozen(column: Any) -> Column:

@@ -151,3 +151,18 @@ def test_a_bare_short_record_gives_no_confident_wrong_name(model: TransmissionMo
     result = diagnose(bare, TransmissionModel(50.0, ()))
     assert not [each for each in result.findings if each.probability > 0.5]
     assert any("reversal" in each for each in result.remarks)
+
+
+@pytest.mark.parametrize(("counts", "digits"), [(2**14, 9), (8000, 7)])
+def test_the_digits_of_a_file_name_nothing(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
+) -> None:
+    """Without a command the reading drives the loop, and its count is hidden by the digits that were kept."""
+    told = columns()
+    lag_s = 2e-4  # of the plant's motor behind its command
+    motor = told["motor_target_deg"]
+    motor = motor - lag_s * np.gradient(motor, told["time_s"])
+    read = np.round(motor * counts / 360.0) * 360.0 / counts + 36_000.0
+    record = {"time_s": told["time_s"], "load_position_deg": told["load_position_deg"]}
+    record["motor_position_deg"] = np.array([float(f"{each:.{digits}g}") for each in read.tolist()])
+    assert diagnose(Record(record), model).findings == ()

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.identify.driving import driving_angle, quantum_deg
+from hdbridge.observations.driving import driving_angle
+from hdbridge.observations.reading import quantum_deg
 
 
 def turns(path):

@@ -51,8 +51,21 @@ WRONG = {
     "load wrapped": (text(load=(LOAD + 350.0) % 360.0), ":72: load_position_deg: 0.129375 after 359.985"),
     "motor wrapped": (text(motor=MOTOR % 360.0), ":52: motor_position_deg: 1.80905 after 354.573"),
     "motor jumps": (text(motor=JUMPED), ":103: motor_position_deg: 1450.85 after 723.618"),
-    "load in radians": (text(load=np.radians(LOAD)), "the load's angle is in radians"),
-    "motor in radians": (text(motor=np.radians(MOTOR)), "the motor's angle is in radians"),
+    "load in radians": (text(load=np.radians(LOAD)), "the load's angle looks like radians"),
+    "motor in radians": (text(motor=np.radians(MOTOR)), "the motor's angle looks like radians"),
+    "load in radians, ratio a little off": (
+        text(load=np.radians(1.004 * LOAD)),
+        "the load's angle looks like radians: convert it to degrees (then it is 0.4 % off",
+    ),
+    "motor in counts": (
+        text(motor=MOTOR * 8000.0 / 360.0),
+        "the motor's angle looks like counts, some 8000 to",
+    ),
+    "both in counts": (
+        text(motor=np.round(MOTOR * 8000.0 / 360.0), load=np.round(LOAD * 2.88e6 / 360.0)),
+        ": load_position_deg: whole numbers only (",
+    ),
+    "motor in turns": (text(motor=MOTOR / 360.0), "the motor's angle looks like turns"),
     "motor at the output": (text(motor=MOTOR / RATIO), "multiply it by the ratio"),
     "exchanged": (text(motor=LOAD, load=MOTOR), "the columns of motor and load are exchanged"),
     "against each other": (text(load=-LOAD), "turn the direction of one encoder round"),
@@ -142,3 +155,22 @@ def test_samples_taken_twice_change_nothing_that_is_said(folder: Path) -> None:
     result = CliRunner().invoke(app, commands(path)[0], catch_exceptions=False)
     assert result.exit_code == 0
     assert (folder / "out.json").is_file()
+
+
+def test_milliseconds_are_told_by_what_they_look_like(folder: Path) -> None:
+    path = folder / "bench.csv"
+    path.write_text(text(time=1000.0 * TIME))
+    result = CliRunner().invoke(app, commands(path)[0], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "if these are milliseconds, divide them by 1000" in " ".join(result.stderr.split())
+
+
+def test_a_measurement_that_is_named_twice_is_refused(folder: Path) -> None:
+    (folder / "bench.csv").write_text(text())
+    (folder / "copy.csv").write_text(text())
+    for other, said in (("copy.csv", "holds the same samples as"), ("bench.csv", "is named twice")):
+        for name, first, *options in commands(folder / "bench.csv"):
+            result = CliRunner().invoke(app, [name, first, str(folder / other), *options])
+            assert isinstance(result.exception, InputError), result.output
+            assert said in str(result.exception)
+            assert not (folder / "new.yaml").exists()

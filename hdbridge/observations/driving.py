@@ -13,15 +13,17 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from hdbridge.effects import FloatArray
+from hdbridge.observations.reading import reading_of
 
 LAG_SAMPLES = 5
 """Samples over which the lag of the motor behind its command is averaged."""
 CHATTER_COUNTS = 2.6
 """A measured angle counts as turned round when it has come back by more than this many counts."""
-
-SMALLEST_COUNT_DEG = 1e-5
-ROUNDED_DEG = 1e-6
-"""Changes are whole counts to within this: files round."""
+REVERSAL_DEG = 0.3
+"""Travel that a reversal has on either side of it, motor degrees: less than the narrowest loop that is looked
+for (0.5, `effects.elastic_loop`), and several times what a motor settles by (0.07 in measured records)."""
+JITTER_SIGMAS = 8.0
+"""... and at least so many standard deviations of the reading's own error."""
 
 
 def driving_angle(motor_deg: FloatArray, position_deg: FloatArray | None, commanded: bool) -> FloatArray:
@@ -33,13 +35,14 @@ def driving_angle(motor_deg: FloatArray, position_deg: FloatArray | None, comman
     if len(motor_deg) < 2 or (position_deg is None and commanded):
         return motor_deg
     if position_deg is None:
-        return steadied(motor_deg, motor_deg, CHATTER_COUNTS * quantum_deg(motor_deg))
-    cell = quantum_deg(position_deg)
+        return steadied(motor_deg, motor_deg, CHATTER_COUNTS * reading_of(motor_deg).unaided_deg)
+    reading = reading_of(position_deg)
+    cell = reading.count_deg
     path = position_deg
     if cell:
         lag = uniform_filter1d(position_deg - motor_deg, min(LAG_SAMPLES, len(motor_deg)), mode="nearest")
         path = np.clip(motor_deg + lag, position_deg - 0.5 * cell, position_deg + 0.5 * cell)
-    return steadied(path, position_deg, CHATTER_COUNTS * cell)
+    return steadied(path, position_deg, CHATTER_COUNTS * reading.resolution_deg)
 
 
 def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) -> FloatArray:
@@ -74,20 +77,10 @@ def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) ->
     return result
 
 
-def quantum_deg(angle_deg: FloatArray) -> float:
-    """The count in which an angle was read, degrees; 0 where it moves in no counts that can be seen.
-
-    Changes of a counted angle, and the differences between them, are whole multiples of the count; the
-    smallest of them is the count itself if nearly all changes are multiples of it.
-    """
-    steps = np.abs(np.diff(angle_deg))
-    values = np.unique(np.round(steps, 9))
-    gaps = np.diff(values)
-    gaps = gaps[gaps > SMALLEST_COUNT_DEG]
-    if len(gaps) < 1:
-        return 0.0
-    smallest = float(np.min(gaps))
-    whole = np.round(values / smallest)
-    sharp = float(np.median((values / np.maximum(whole, 1.0))[whole > 0])) if np.any(whole > 0) else smallest
-    off = np.abs(steps - np.round(steps / sharp) * sharp)
-    return sharp if np.mean(off < ROUNDED_DEG) > 0.99 else 0.0
+def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
+    """How often one record turns round with travel on both sides (`REVERSAL_DEG`)."""
+    if len(driving_deg) < 3:
+        return 0
+    band = max(REVERSAL_DEG, JITTER_SIGMAS * jitter_deg)
+    steps = np.sign(np.diff(steadied(driving_deg, driving_deg, band)))
+    return int(np.count_nonzero(np.diff(steps[steps != 0.0])))

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.noise import third_deviation
 from hdbridge.effects import FloatArray
-from hdbridge.identify.driving import steadied
+from hdbridge.observations.driving import steadied
+from hdbridge.observations.reading import Reading, third_deviation
 
 BoolArray = NDArray[np.bool_]
 
@@ -24,15 +24,15 @@ CHATTER_COUNTS = 1.6
 
 
 def kinematics(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
+    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Driving angle, speed and acceleration of one record."""
     if len(time) < 4 * window:
         window = 1
-    driving = _driving(position, target, time, window, count)
+    count = reading.resolution_deg if target is not None else reading.unaided_deg
+    driving = _driving(position, target, time, window, reading)
     smooth = _smooth(driving, window)
-    speed = _slope(smooth, time, window)
-    acceleration = _curvature(smooth, time, window)
+    speed, acceleration = _rates(smooth, smooth, time, window)
     resting = _resting(driving if target is None else target, window)
     if count and target is None:
         # Counts that come and go are no motion: less than half a count over eight windows is rest.
@@ -43,18 +43,18 @@ def kinematics(
 
 
 def _driving(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, count: float
+    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
 ) -> FloatArray:
     """The command and a smooth line for the lag behind it, within the cell that the encoder was read in;
     without a command the angle freed of chatter.
     """
     if target is None:
-        return steadied(position, position, 1.6 * count)
+        return steadied(position, position, CHATTER_COUNTS * reading.unaided_deg)
+    count = reading.count_deg
     lag = position - target
-    smooth = _smooth(target, window)
-    speed = _slope(target, time, window)
+    speed, acceleration = _rates(target, _smooth(target, window), time, window)
     speed[_resting(target, window)] = 0.0
-    columns = np.column_stack([np.ones(len(lag)), speed, _curvature(smooth, time, window)])
+    columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
     solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
     line = columns @ solution
@@ -62,11 +62,10 @@ def _driving(
     noise = _noise(lag, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    if count:
-        # A motor that sticks where it turns round, or overshoots where it stops, is where its encoder says.
-        cell = max(0.5 * count, 3.0 * noise)
-        line = np.clip(line, lag - cell, lag + cell)
-    return steadied(target + line, target + line, CHATTER_COUNTS * count)
+    # A motor that sticks where it turns round, or overshoots where it stops, is where its encoder says.
+    cell = max(0.5 * count, 3.0 * noise)
+    line = np.clip(line, lag - cell, lag + cell)
+    return steadied(target + line, target + line, CHATTER_COUNTS * reading.resolution_deg)
 
 
 def _noise(lag: FloatArray, count: float) -> float:
@@ -84,6 +83,23 @@ def _resting(angle: FloatArray, window: int) -> BoolArray:
     moved = np.abs(np.diff(angle, prepend=angle[:1])) > 1e-9
     near = np.convolve(moved.astype(np.float64), np.ones(2 * window + 1))
     return np.asarray(near[window : window + len(angle)] < 0.5)
+
+
+def _rates(
+    angle: FloatArray, smooth: FloatArray, time: FloatArray, window: int
+) -> tuple[FloatArray, FloatArray]:
+    """Speed of ``angle`` and acceleration of ``smooth``.
+
+    A record that begins or ends in motion has no window on its far side: there the acceleration goes on as it
+    was, and the speed with it.
+    """
+    speed, acceleration = _slope(angle, time, window), _curvature(smooth, time, window)
+    reach = 2 * max(1, window // 2)
+    if len(time) > 3 * reach:
+        for rows, inner in ((slice(0, reach), reach), (slice(-reach, None), -reach - 1)):
+            acceleration[rows] = acceleration[inner]
+            speed[rows] = speed[inner] + acceleration[inner] * (time[rows] - time[inner])
+    return speed, acceleration
 
 
 def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import line_of_row
-from hdbridge.records.record import Record
+from hdbridge.observations.cuts import observed
+from hdbridge.records.record import REQUIRED, Record
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WRAPPED_SHARE = 0.05
 """How near a whole number of turns a jump is when it is an angle that began anew."""
+LEAST_WHOLE = 10.0
+"""Travel beyond which whole numbers are no chance."""
 LEAST_JUMP_DEG = 900.0 / ARCSEC_PER_DEG
 """No gear's error jumps by as much."""
 
@@ -26,13 +29,16 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
     Time has to pass, angles have to be multi-turn, the ratio has to be the gear's, and in one of the records
     the motor has to move. Each record is named by its path.
     """
-    for path, record in records.items():
+    for path, given in records.items():
+        record = observed(given, ratio).record
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
             raise InputError(
                 f"{path}: time_s: {record.time_s[0]:g} in all {len(record)} rows; expected time that passes"
             )
-        _check_wrapped(path, record, ratio)
-        record.check_ratio(ratio)
+        _check_whole(path, record)
+        _check_wrapped(path, record, given, ratio)
+        for part in record.parts():
+            part.check_ratio(ratio)
     counts = sum(len(each) for each in records.values())
     if counts and not any(_moves(each) for each in records.values()):
         raise InputError(
@@ -67,7 +73,29 @@ def _moves(record: Record) -> bool:
     return len(record) > 1 and float(np.ptp(record.motor_position_deg)) > 0.0
 
 
-def _check_wrapped(path: Path, record: Record, ratio: float) -> None:
+def check_once(paths: Sequence[Path], records: Sequence[Record]) -> None:
+    """Refuse (InputError) a measurement that is named twice: what it says would count twice."""
+    for number, (path, record) in enumerate(zip(paths, records, strict=True)):
+        for other, before in zip(paths[:number], records[:number], strict=True):
+            if len(record) == len(before) and all(
+                np.array_equal(record.columns[name], before.columns[name]) for name in REQUIRED
+            ):
+                same = "is named twice" if path == other else f"holds the same samples as {other}"
+                raise InputError(f"{path}: {same}; expected each measurement once: leave one of them out")
+
+
+def _check_whole(path: Path, record: Record) -> None:
+    """Refuse a load angle in whole numbers: no encoder reads whole degrees."""
+    load = record.load_position_deg
+    if len(load) and float(np.ptp(load)) >= LEAST_WHOLE and np.all(load == np.round(load)):
+        raise InputError(
+            f"{path}: load_position_deg: whole numbers only ({load[0]:.10g} to {load[-1]:.10g}), which looks "
+            "like counts; expected degrees: multiply by 360, divided by the encoder's counts per turn (look "
+            "at motor_position_deg, too)"
+        )
+
+
+def _check_wrapped(path: Path, record: Record, given: Record, ratio: float) -> None:
     """Refuse an angle that jumps by a turn of its encoder from one sample to the next."""
     slip = np.diff(record.load_position_deg) - np.diff(record.motor_position_deg) / ratio
     for name, turn_deg in (("load_position_deg", DEG_PER_TURN), ("motor_position_deg", DEG_PER_TURN / ratio)):
@@ -76,7 +104,8 @@ def _check_wrapped(path: Path, record: Record, ratio: float) -> None:
         rows = rows[np.abs(np.diff(angle)[rows]) > 0.5 * DEG_PER_TURN]
         if len(rows):
             row = int(rows[0]) + 1
-            where = f"{path}:{line_of_row(path, row)}" if path.is_file() else f"{path}"
+            line = int(np.searchsorted(given.time_s, record.time_s[row]))
+            where = f"{path}:{line_of_row(path, line)}" if path.is_file() else f"{path}"
             raise InputError(
                 f"{where}: {name}: {angle[row]:g} after {angle[row - 1]:g}, a jump of a whole turn that the "
                 f"other angle does not make; expected multi-turn angles: unwrap the column "
