@@ -6,7 +6,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.pipeline import conclude
 from hdbridge.calibration.result import Calibration
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.foreign import check_records
+from hdbridge.observations.foreign import check_once, check_records
 from hdbridge.records.given import Given, agreed_ratio, by_name
 
 
@@ -30,6 +30,7 @@ def fit(
     recordings = by_name(recording)
     said = [("ratio", ratio), (str(axis.path), axis.gear.ratio) if axis else ("axis", None)]
     known = agreed_ratio(recordings, said)
+    check_once(list(recordings), [each.record for each in recordings.values()])
     check_records({name: each.record for name, each in recordings.items()}, known)
     if active and axis:
         active.check_ratio(axis)

@@ -42,7 +42,7 @@ from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
 from hdbridge.model import TransmissionModel
 from hdbridge.observations.cuts import observed
-from hdbridge.observations.foreign import check_records, zeros_apart_arcsec
+from hdbridge.observations.foreign import check_once, check_records, zeros_apart_arcsec
 from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
@@ -84,6 +84,7 @@ def diagnose(
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
+    check_once(list(recordings), [each.record for each in recordings.values()])
     check_records({name: each.record for name, each in recordings.items()}, model.ratio)
     whole = Recording.joined(list(recordings.values()))
     record, legs = whole.record, whole.segments

@@ -80,3 +80,10 @@ def test_a_simulated_axis_without_a_truth_is_refused(axis, tmp_path):
     (tmp_path / "axis.yaml").write_text(axis.path.read_text())
     with pytest.raises(InputError, match=r"truth\.yaml"), simulated(AxisConfig.load(tmp_path)):
         pass
+
+
+def test_a_recording_that_is_given_twice_is_refused(run, model):
+    with pytest.raises(InputError, match="holds the same samples as recording 1"):
+        diagnose([run, run], model)
+    with pytest.raises(InputError, match="holds the same samples as recording 1"):
+        fit([run, run.record], ratio=50)
