@@ -8,7 +8,8 @@
     │   ├── SdoError          an object could not be read or written
     │   ├── IdentityError     object 1018h, the ratio or the direction is not what the axis file says
     │   └── TransitionError   a CiA-402 transition that is not allowed, or did not come about in time
-    └── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
+    ├── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
+    └── OutputError       6   a result could not be written (a full disk); what was measured was printed
 
 A message says what is wrong, where (file:line:column, node and object), what was expected, and what to do.
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
@@ -61,3 +62,9 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
     """The supervision stopped the axis while it ran; the stop is latched until an explicit reset."""
 
     exit_status = 5
+
+
+class OutputError(HdbridgeError):
+    """A file could not be written after all, such as on a full disk; the old one stands."""
+
+    exit_status = 6

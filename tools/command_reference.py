@@ -42,7 +42,8 @@ and what is printed for a person then goes to the standard error.
 transfer), `--log FILE` (append all of it, a JSON object per line: `date`, `level`, `where`, `event` and its
 facts; nothing is written while the axis is in its control cycle), and `--install-completion` for your shell.
 
-**Ctrl-C** (and SIGTERM) lets the control cycle end its period and stops the axis; what was measured is kept.
+**Ctrl-C** (and SIGTERM, SIGQUIT, and SIGHUP of a terminal that is closed) lets the control cycle end its
+period and stops the axis; what was measured is kept.
 The third one ends the program at once.
 
 | exit status | |
@@ -53,6 +54,7 @@ The third one ends the program at once.
 | 3 | the bus: cannot be opened, or went away |
 | 4 | the drive: absent, refuses, not the one expected, reports a fault |
 | 5 | the supervision stopped the axis while it moved |
+| 6 | a result could not be written after all, on a full disk for example; what was measured is printed |
 | 130 | Ctrl-C: the axis was stopped, the record kept |
 """
 

@@ -7,7 +7,7 @@ task also what had been measured, where there was time to write it. `Journal.ope
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
@@ -15,6 +15,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.control.survived import Survived, lines
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
 from hdbridge.procedures.plan import Plan
@@ -46,6 +47,10 @@ class TaskEntry(BaseModel):
     end_s: float = Field(description="time of its last sample")
     lost: tuple[str, ...] = Field(
         (), description="channels of the axis file that were lost on the way: the samples do without them"
+    )
+    survived: tuple[Survived, ...] = Field(
+        (),
+        description="faults that it went on in spite of, and the one that ended it",
     )
 
 
@@ -157,6 +162,7 @@ class Journal:
         *,
         complete: bool,
         lost: tuple[str, ...] = (),
+        survived: tuple[Survived, ...] = (),
     ) -> None:
         """Keep what a task has measured; nothing where it has measured nothing."""
         if not len(record):
@@ -178,6 +184,7 @@ class Journal:
             start_s=float(record.time_s[0]),
             end_s=float(record.time_s[-1]),
             lost=lost,
+            survived=survived,
         )
         self._tasks.append(entry)
         segments = [
@@ -208,6 +215,17 @@ class Journal:
         }
         write_atomically(self.folder / ABOUT_NAME, HEADER + dump_yaml(data))
         self._about = RecordingFile.model_validate({**data, "drive": before.drive})
+
+
+def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
+    """A line for each file of these recordings that was measured in spite of something."""
+    found = []
+    for folder in folders:
+        if (folder / ABOUT_NAME).exists():
+            notes = read_yaml(folder / ABOUT_NAME).validate(RecordingFile).notes
+            tasks = _Notes.model_validate({"plan": {}, **notes}).tasks if "plan" in notes else ()
+            found += [(f"{folder.name}/{each.file}", each.survived) for each in tasks]
+    return tuple(lines(found))
 
 
 def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:

@@ -13,7 +13,7 @@ from hdbridge.axis import AxisConfig, Identity
 from hdbridge.calibration.journal import Journal
 from hdbridge.control.bench import Bench, axis_view, lost_channels
 from hdbridge.drive.drive import Drive
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
 from hdbridge.procedures.plan import Plan, Task
 from hdbridge.procedures.rehearsal import rehearse
@@ -123,16 +123,17 @@ def measure(
     for task in left.tasks:
         pace.begin(task.name)
         try:
-            run = bench.run(task.procedure)
+            bench.run(task.procedure)
         except InputError:
             raise  # refused before anything moved
         except (HdbridgeError, KeyboardInterrupt):
-            with suppress(OSError):
-                record = bench.record()
-                journal.add(
-                    task.name, record, bench.legs, complete=False, lost=lost_channels(drive.axis, record)
-                )
+            with suppress(OSError, OutputError):
+                _add(journal, task, bench, complete=False)
             raise
-        journal.add(
-            task.name, run.record, run.segments, complete=True, lost=lost_channels(drive.axis, run.record)
-        )
+        _add(journal, task, bench, complete=True)
+
+
+def _add(journal: Journal, task: Task, bench: Bench, *, complete: bool) -> None:
+    record = bench.record()
+    lost = lost_channels(bench.axis, record)
+    journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.survived)

@@ -10,13 +10,16 @@ from pathlib import Path
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
-from hdbridge.calibration.journal import Journal, tasks_of
+from hdbridge.calibration.journal import Journal, survived_in, tasks_of
 from hdbridge.calibration.measure import measure
 from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
+from hdbridge.control.caps import cap_remark
+from hdbridge.control.realtime import left_realtime
 from hdbridge.drive.drive import Drive
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import defer, writing
 from hdbridge.model import TransmissionModel
 from hdbridge.model.store import propose
 from hdbridge.records.recording import Recording
@@ -27,6 +30,7 @@ ACTIVE_NAME = "active.yaml"
 Progress = Callable[[str, float, float], None]
 
 
+@left_realtime()  # a fit takes its time; a bench goes back for each motion
 def calibrate(
     drive: Drive,
     journal: Journal,
@@ -52,6 +56,8 @@ def calibrate(
     if not result.fit.held_out.improves:
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
+    if remark := cap_remark(axis, result.model):
+        tell(remark)
     tell("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked = validate(
@@ -74,8 +80,16 @@ def calibrate(
         return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
     figures = (f"stepping 3 sigma {before:.2f} to {after:.2f} arcsec", *checked.worse)
     reason = f"calibration {journal.folder.name}: {', '.join(figures)}"
-    pending = propose(profile, result.model, reason, date, drive.identity)
-    return _kept(journal.folder, replace(result, offer=Offer(True, reason, pending)))
+    return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
+
+
+def proposed(profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive) -> Offer:
+    """The model as pending; where it cannot be written, the figures are told nonetheless."""
+    try:
+        return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
+    except OutputError as problem:
+        defer(problem)
+        return Offer(False, f"not offered for commit: {problem}; {reason}")
 
 
 def conclude(
@@ -92,7 +106,7 @@ def conclude(
     """
     measured = list(recordings.values())
     fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
-    fit = replace(fit, warnings=(*_lost(recordings), *fit.warnings))
+    fit = replace(fit, warnings=(*_lost(recordings), *survived_in(recordings), *fit.warnings))
     gain = fit.held_out.gain
     model = with_provenance(
         fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)
@@ -159,8 +173,10 @@ def active_model(
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
     """Result, model and what it was compared with, beside the recording that they come from."""
-    result.model.save(folder / MODEL_NAME)
-    if result.active:
-        result.active.save(folder / ACTIVE_NAME)
-    write_atomically(folder / RESULT_NAME, json.dumps(result.as_dict(), indent=1, allow_nan=False) + "\n")
+    with writing():
+        result.model.save(folder / MODEL_NAME)
+        if result.active:
+            result.active.save(folder / ACTIVE_NAME)
+        text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
+        write_atomically(folder / RESULT_NAME, text + "\n")
     return result

@@ -15,9 +15,11 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import resting
 from hdbridge.calibration.measure import Pace
 from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.evaluation.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
+from hdbridge.files.outputs import writing
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
@@ -120,6 +122,8 @@ class Validation:
     accuracy_before: AxisAccuracy | None = None
     accuracy_after: AxisAccuracy | None = None
     """By the positioning test, where the plan has one."""
+    survived: tuple[str, ...] = ()
+    """A line for each run that went on in spite of something."""
 
     @property
     def improves(self) -> bool:
@@ -141,6 +145,7 @@ class Validation:
             "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
             "noise_floor_arcsec": self.floor.noise_arcsec,
             "worse": list(self.worse),
+            "survived": list(self.survived),
             "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
             "accuracy": {
                 "before": self.accuracy_before.as_dict() if self.accuracy_before else None,
@@ -153,8 +158,15 @@ class Validation:
         """Read back; the first calibrations measured no accuracy."""
         floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
         measured = data.get("accuracy", {})
-        accuracy = [_accuracy(measured.get(name)) for name in ("before", "after")]
-        return cls(Stepped.from_dict(data["before"]), Stepped.from_dict(data["after"]), floor, *accuracy)
+        before, after = (_accuracy(measured.get(name)) for name in ("before", "after"))
+        return cls(
+            Stepped.from_dict(data["before"]),
+            Stepped.from_dict(data["after"]),
+            floor,
+            before,
+            after,
+            tuple(map(str, data.get("survived", ()))),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +224,7 @@ def validate(
     pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, progress, interrupted)
     results: list[Stepped] = []
     accuracies: list[AxisAccuracy] = []
+    survived: list[tuple[str, tuple[Survived, ...]]] = []
     for name, model, words in (
         ("before", before, "the active model" if before else "no compensation"),
         ("after", after, "the new model"),
@@ -220,11 +233,15 @@ def validate(
         compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
         bench = Bench(drive, compensation, interrupted=pace.interrupted)
         with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
-            results.append(Stepped.of(words, bench.run(stepping).outcome))
+            run = bench.run(stepping)
+            results.append(Stepped.of(words, run.outcome))
+            survived.append((f"stepping {name}", run.survived))
         if positioning:
             pace.begin(f"positioning {name}")
             with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
-                approaches = bench.run(positioning).outcome
+                measured = bench.run(positioning)
+            approaches = measured.outcome
+            survived.append((f"positioning {name}", measured.survived))
             accuracies.append(
                 axis_accuracy(
                     [each.target_deg for each in approaches],
@@ -232,7 +249,8 @@ def validate(
                     [each.forward for each in approaches],
                 )
             )
-    return Validation(results[0], results[1], floor, *accuracies)
+    accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
+    return Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(lines(survived)))
 
 
 @contextmanager
@@ -244,7 +262,8 @@ def record_kept(bench: Bench, path: Path) -> Iterator[None]:
         record = bench.record()
         if len(record):
             path.parent.mkdir(parents=True, exist_ok=True)
-            record.write_csv(path)
+            with writing():
+                record.write_csv(path)
 
 
 def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:

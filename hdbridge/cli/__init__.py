@@ -1,7 +1,8 @@
 """The command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
 
 Exit status: 0 done; 1 an error in hdbridge itself; 2 bad input (nothing was written, nothing moved); 3 the
-bus; 4 the drive; 5 the supervision stopped the axis; 130 Ctrl-C (the axis was stopped, the record kept).
+bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (what was measured is
+printed); 130 Ctrl-C (the axis was stopped, the record kept).
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
     epilog=(
         "Exit status: 0 done, 2 bad input (nothing moved, nothing written), 3 bus, 4 drive, "
-        "5 stopped by supervision, 130 Ctrl-C (axis stopped, record kept)."
+        "5 stopped by supervision, 6 a result could not be written (a full disk; the figures are printed), "
+        "130 Ctrl-C (axis stopped, record kept)."
     ),
 )
 

@@ -62,12 +62,14 @@ def command(
     from hdbridge.calibration.validation import validation_s
     from hdbridge.cli.booted import booted
     from hdbridge.cli.measuring import Measurement, kept_in, phases
+    from hdbridge.model.store import measuring
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
     work = Measurement.asked(axis, plan, out, resume)
     work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
     with (
+        measuring(files.axis),
         kept_in(work.folder),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):

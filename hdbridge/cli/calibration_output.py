@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import Profile, console, print_table
-from hdbridge.files.atomic import write_atomically
+from hdbridge.cli.options import Profile, console, print_table, write_result
 
 if TYPE_CHECKING:
     from hdbridge.calibration import Calibration, Stepped, Validation
@@ -81,7 +80,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
     from hdbridge.report.calibration import calibration_page
     from hdbridge.report.page import render
 
-    write_atomically(path, render(calibration_page(result)))
+    write_result(path, render(calibration_page(result)))
 
 
 def print_page(path: Path) -> None:
@@ -109,6 +108,8 @@ def print_stepping(checked: Validation) -> None:
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
+    for line in checked.survived:
+        console.print(f"note: {escape(line)}", soft_wrap=True)
     floor = checked.floor
     console.print(
         f"floor of this axis's counts and noise: {floor.three_sigma_arcsec:.2f} arcsec; the new model is at "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, write_json
+from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, notes, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -16,6 +16,7 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
     """Read an axis file, its EDS and its model; say what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
     from hdbridge.control.bench import compensation_for
+    from hdbridge.control.caps import cap_remark
     from hdbridge.drive import load_eds, plan
     from hdbridge.drive.writes import left_out
     from hdbridge.evaluation.stepping import quantisation_floor_arcsec
@@ -37,11 +38,12 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
     }
     if axis.channels:
         facts["beside encoders"] = ", ".join(axis.channels).replace("_", " ")
+    remark = None
     path = model or (files.model if files.model.exists() else None)
     if path is not None:
         loaded = TransmissionModel.load(path)
-        loaded.check_ratio(axis)
         compensation_for(axis, loaded)
+        remark = cap_remark(axis, loaded)
         facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
     lacking = left_out(axis, od)
     write_json(json_file, {"schema": "hdbridge.check/1", **facts, "left to the drive": [*map(str, lacking)]})
@@ -54,4 +56,6 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
             f"{row.why}{source}",
             soft_wrap=True,
         )
+    if remark:
+        notes.print(remark, markup=False, soft_wrap=True)
     console.print("all right")

@@ -11,9 +11,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, print_table, write_json
+from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, print_table, write_json, write_result
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
@@ -101,11 +100,9 @@ def run(
             provenance=_provenance(recording, records, model),
             command=shlex.join(["hdbridge", "diagnose", *map(str, records), "--model", str(model)]),
         )
-        write_atomically(html_file, render(page))
-        notes.print(f"wrote {html_file}", soft_wrap=True)
+        write_result(html_file, render(page))
     if extend is not None:
-        result.model.save(extend)
-        notes.print(f"wrote {extend}")
+        write_result(extend, result.model.dump())
     print_diagnosis(result)
     _print_figures(result)
     _print_shares(document["seen_over"])

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json
+from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 
@@ -65,6 +65,8 @@ def command(
     loaded = [Recording.load(each) for each in records]
     check_once(records, [each.record for each in loaded])
     compared = TransmissionModel.load(active) if active else None
+    if compared and config:
+        compared.check_bound_to(config)
     found = fit(
         dict(zip(records, loaded, strict=True)),
         ratio=ratio,
@@ -75,7 +77,7 @@ def command(
     held_out = found.fit.held_out
     refused = out is not None and held_out.worse and not force
     if out is not None and not refused:
-        found.model.save(out)
+        write_result(out, found.model.dump())
     write_json(json_file, found.as_dict())
     if html_file is not None:
         write_calibration_page(html_file, found)

@@ -24,9 +24,9 @@ from hdbridge.cli.options import (
     load_axis,
     notes,
     write_json,
+    write_result,
 )
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def command(
     from hdbridge.cli.measuring import Measurement, kept_in, phases
     from hdbridge.improvement import Source, improve
     from hdbridge.improvement.trial import trial_s
+    from hdbridge.model.store import measuring
     from hdbridge.records.recording import Recording
 
     files = Profile.find(profile)
@@ -104,6 +105,7 @@ def command(
     else:
         work.announce(trial)
     with (
+        measuring(files.axis),
         kept_in(work.folder),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):
@@ -144,6 +146,8 @@ def report(
     print_diagnosis(result.diagnosis)
     for line in result.extension.left:
         console.print(escape(line), soft_wrap=True)
+    for line in result.survived:
+        console.print(f"note: {escape(line)}", soft_wrap=True)
     if result.further is not None:
         further = result.further
         console.print(
@@ -179,6 +183,7 @@ def write_page(path: Path, result: Improvement) -> None:
         "recorded": result.date or "not known",
         "plan": result.plan,
         **{f"round {number}": each.about for number, each in enumerate(result.rounds, 1)},
+        **({"survived": "; ".join(result.survived)} if result.survived else {}),
     }
     page = diagnosis_page(
         result.diagnosis,
@@ -187,7 +192,7 @@ def write_page(path: Path, result: Improvement) -> None:
         stepping=result.trial.stepping if result.trial else None,
         offer=result.offer,
     )
-    write_atomically(path, render(page))
+    write_result(path, render(page))
 
 
 def _active(files: Profile) -> TransmissionModel:

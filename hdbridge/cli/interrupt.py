@@ -10,7 +10,11 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within the block SIGINT and SIGTERM only set a flag, which the yielded function tells."""
+    """Within the block a signal to end only sets a flag, which the yielded function tells.
+
+    So a terminal that is closed (SIGHUP) stops the axis in order, as does SIGQUIT. What is ignored from the
+    start (`nohup`) stays ignored.
+    """
     wishes = 0
 
     def note(_number: int, _frame: FrameType | None) -> None:
@@ -19,7 +23,11 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
         if wishes >= 3:  # somebody insists: whatever hangs shall end
             raise KeyboardInterrupt
 
-    before = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        each: signal.signal(each, note)
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+        if each is signal.SIGINT or signal.getsignal(each) is not signal.SIG_IGN
+    }
     try:
         yield lambda: wishes > 0
     finally:

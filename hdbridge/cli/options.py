@@ -20,7 +20,7 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import is_stream, write_atomically
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.files.outputs import Kind
+from hdbridge.files.outputs import Kind, writing
 
 if TYPE_CHECKING:
     import can
@@ -182,6 +182,12 @@ def print_table(table: Table) -> None:
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
     """The result for machines, where asked for."""
     if path is not None:
-        write_atomically(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+        write_result(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def write_result(path: Path, text: str) -> None:
+    """A result's file; where it cannot be written, that is said when everything is printed."""
+    with writing():
+        write_atomically(path, text)
         if not is_stream(path):
             notes.print(f"wrote {path}", soft_wrap=True)

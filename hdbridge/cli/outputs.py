@@ -15,8 +15,8 @@ from typing import Any
 
 from typer.models import OptionInfo
 
-from hdbridge.cli.options import console
-from hdbridge.files.outputs import Kind, Output, check_outputs
+from hdbridge.cli.options import console, notes
+from hdbridge.files.outputs import Kind, Output, check_outputs, failures_deferred
 
 STANDARD_OUTPUT = Path("/dev/stdout")
 
@@ -24,7 +24,8 @@ STANDARD_OUTPUT = Path("/dev/stdout")
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command, refused where an output would destroy something; ``-`` is the standard output.
 
-    Where a result goes to the standard output, what is printed for a person goes to the standard error.
+    Where a result goes to the standard output, what is printed for a person goes to the standard error. A
+    result that cannot be written after all (a full disk) ends the command when everything is printed.
     """
     declared = dict(_declared(command))
 
@@ -42,9 +43,20 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
         before = console.stderr
         console.stderr = before or any(each.path == STANDARD_OUTPUT for each in outputs)
         try:
-            return command(**values)
+            with failures_deferred() as failed:
+                try:
+                    done = command(**values)
+                except BaseException:
+                    for each in failed:
+                        notes.print(str(each), markup=False, soft_wrap=True)
+                    raise
         finally:
             console.stderr = before
+        for each in failed[1:]:
+            notes.print(str(each), markup=False, soft_wrap=True)
+        if failed:
+            raise failed[0]
+        return done
 
     return checked
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,11 +27,12 @@ from hdbridge.cli.options import (
     notes,
     progress_bar,
     write_json,
+    write_result,
 )
 from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
-from hdbridge.files.atomic import make_folder, write_atomically
-from hdbridge.files.outputs import Kind
+from hdbridge.files.atomic import make_folder
+from hdbridge.files.outputs import Kind, writing
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     from hdbridge.evaluation.comparison import Comparison
     from hdbridge.model import TransmissionModel
     from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+    from hdbridge.records.record import Record
 
 
 def register(app: typer.Typer) -> None:
@@ -119,6 +123,8 @@ def run_comparison(
 ) -> Comparison:
     """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there."""
     from hdbridge.cli.booted import booted
+    from hdbridge.control.bench import compensation_for
+    from hdbridge.control.caps import cap_remark
     from hdbridge.evaluation.comparison import compare_schemes
 
     offered = Scheme.offered_by(model)
@@ -128,11 +134,30 @@ def run_comparison(
     if record is not None:
         make_folder(record)  # before the axis moves, not after
 
+    for each in wanted:
+        compensation_for(axis, each.of(model))  # refused before anything is connected
+    if remark := cap_remark(axis, model):
+        notes.print(remark, markup=False, soft_wrap=True)
+
+    done: dict[Scheme, Run[SteppingOutcome]] = {}
+
     def keep(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
+        done[scheme] = run
         if record is not None:
-            run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+            with writing():
+                run.record.write_csv(record / f"stepping-{scheme.value}.csv.gz")
+
+    def stopped(scheme: Scheme, measured: Record) -> None:
+        path = None if record is None else record / f"stepping-{scheme.value}-stopped.csv.gz"
+        if path is not None:
+            with writing():
+                measured.write_csv(path)
+        kept = f"kept in {path}" if path else "not kept: it takes --record FOLDER"
+        seconds = float(measured.time_s[-1] - measured.time_s[0])
+        notes.print(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}", soft_wrap=True)
 
     with (
+        _told_when_stopped(axis, done),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
         progress_bar() as bar,
     ):
@@ -156,7 +181,21 @@ def run_comparison(
             progress=show,
             interrupted=interrupted,
             finished=keep,
+            stopped=stopped,
         )
+
+
+@contextmanager
+def _told_when_stopped(axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]]) -> Iterator[None]:
+    """Print what the schemes before have given when a test does not come to its end."""
+    from hdbridge.evaluation.comparison import Comparison
+
+    try:
+        yield
+    except BaseException:
+        if done:
+            print_result(axis, Comparison.of(axis, done))
+        raise
 
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
@@ -168,6 +207,8 @@ def print_result(axis: AxisConfig, comparison: Comparison) -> None:
         "compensation",
         ((scheme.value, (each.cw, each.ccw, each.pooled)) for scheme, each in comparison.results.items()),
     )
+    for line in comparison.survived:
+        console.print(f"note: {line}", markup=False, soft_wrap=True)
     best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
     floor = comparison.quantisation_floor_arcsec
     console.print(
@@ -206,6 +247,8 @@ def write_page(
         "motor encoder": f"{axis.motor_encoder.counts_per_turn:,} counts per turn",
         "load encoder": f"{axis.load_encoder.counts_per_turn:,} counts per turn",
     }
+    if comparison.survived:
+        facts["survived"] = "; ".join(comparison.survived)
     page = stepping_page(
         axis.name,
         comparison.results,
@@ -213,5 +256,4 @@ def write_page(
         facts,
         with_article=axis.name == "article",
     )
-    write_atomically(path, render(page))
-    notes.print(f"wrote {path}")
+    write_result(path, render(page))

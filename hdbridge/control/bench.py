@@ -19,7 +19,9 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.control.realtime import resumed_realtime
 from hdbridge.control.sensed import Sensed
+from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
@@ -52,6 +54,8 @@ class Run(Recording, Generic[Outcome]):
     """The recording of a procedure that has run, and what the procedure gave."""
 
     outcome: Outcome = field(kw_only=True)
+    survived: tuple[Survived, ...] = field(default=(), kw_only=True)
+    """Faults that the supervision let pass."""
 
 
 def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
@@ -82,8 +86,10 @@ def axis_view(axis: AxisConfig) -> AxisView:
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
     """The model's inverse with the caps of the axis file, at the axis's cycle.
 
-    InputError where an effect needs what the control loop does not know.
+    InputError for a model of another gear, axis or drive than the axis file's, and where an effect needs what
+    the control loop does not know.
     """
+    model.check_bound_to(axis)
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
         lacking = sorted(channels, key=lambda each: each.value)
         keys = " and ".join(f"'{each.axis_key}'" for each in lacking)
@@ -120,6 +126,7 @@ class Bench:
             compensation = TransmissionModel(axis.gear.ratio)
         if isinstance(compensation, TransmissionModel):
             compensation = compensation_for(axis, compensation)
+        self.axis = axis
         self.view = axis_view(axis)
         self.supervision = Supervision()
         self.cycle = Cycle(
@@ -141,6 +148,7 @@ class Bench:
         """Samples of a leg; where there are more, the first half goes."""
         self._measured: list[list[Sample]] = []
         self._legs: list[_Leg] = []
+        self._watch = Watch(self.supervision, 0)
 
     def run(
         self,
@@ -154,18 +162,23 @@ class Bench:
         Of a leg that lasts longer than ``keep_s`` at least the last so many seconds are kept, at most twice
         as many: for one that holds the axis for hours.
 
-        Refused with InputError, before anything moves, where the procedure would leave the axis's limits.
+        Refused with InputError, before anything moves, where the procedure would leave the axis's limits, and
+        where the compensation's model is of another gear, axis or drive.
         Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
         record up to then is `record`.
         """
+        # Every motion with a model begins here. What the drive answered counts, not only its axis file.
+        self._compensation.model.check_bound_to(self._drive.axis, self._drive.identity)
         standing_deg = self._drive.read_positions().motor_deg / self.view.ratio
         rehearsal = rehearse(procedure, self.view, standing_deg)
         self._measured.clear()
         self._legs.clear()
         self._most = math.inf if math.isinf(keep_s) else max(2 * math.ceil(keep_s / self.cycle.period_s), 2)
         _log.info("run begins", {"procedure": type(procedure).__name__, "ideally_s": rehearsal.duration_s})
+        self._watch = Watch(self.supervision, self.cycle.skipped)
         try:
-            outcome = self._powered(procedure, rehearsal, progress)
+            with resumed_realtime():
+                outcome = self._powered(procedure, rehearsal, progress)
         finally:
             self._tell_end()
         axis = self._drive.axis
@@ -178,6 +191,7 @@ class Bench:
             versions=versions_here(),
             notes={"procedure": type(procedure).__name__},
             outcome=outcome,
+            survived=self.survived,
         )
 
     def _powered(
@@ -230,6 +244,11 @@ class Bench:
     def legs(self) -> tuple[Segment, ...]:
         """The moves that the present procedure has run so far."""
         return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
+
+    @property
+    def survived(self) -> tuple[Survived, ...]:
+        """What the present procedure has gone on in spite of so far; the fault that stopped it included."""
+        return self._watch.survived(self.cycle.skipped)
 
     def _enable(self) -> None:
         """Enable the drive by PDO, standing still, and begin from where it stands."""

@@ -221,7 +221,7 @@ class Compensation:
 
     __slots__ = (
         "_correction", "_fading", "_inverse", "_known", "_maximum", "_ratio", "_slew_step", "_target",
-        "_weight", "_weight_step", "limited", "needs",
+        "_weight", "_weight_step", "limited", "model", "needs",
     )  # fmt: skip
 
     def __init__(
@@ -232,6 +232,8 @@ class Compensation:
         start: Start = Start.VIRGIN,
     ) -> None:
         """``period_s`` is the control cycle; ``start`` what is known of the gear's past."""
+        self.model = model
+        """Whose inverse it is; `Bench` runs none of another axis, gear or drive."""
         self._inverse = Inverse(model, start)
         self._ratio = model.ratio
         self._maximum = limits.maximum_arcsec

@@ -12,7 +12,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -76,6 +76,71 @@ def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> It
     Never around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it would
     take a whole processor from everything else.
     """
+    held = _Held(priority, cpus)
+    with held.stack:
+        realtime = held.enter()
+        _held.append(held)
+        try:
+            yield realtime
+        finally:
+            _held.remove(held)
+
+
+@contextmanager
+def left_realtime() -> Iterator[None]:
+    """Out of the block of `prepare_realtime` for as long as this one lasts: for a fit between two motions.
+
+    With SCHED_FIFO it would keep others from the processor for minutes, and without the collector, in locked
+    memory, take more of that than there is. `resumed_realtime` within goes back for a motion.
+    """
+    held = _held[-1] if _held else None
+    if held is None or held.left:
+        yield
+        return
+    held.leave()
+    try:
+        yield
+    finally:
+        held.enter()
+
+
+@contextmanager
+def resumed_realtime() -> Iterator[None]:
+    """Back in, where `left_realtime` has left; else nothing."""
+    held = _held[-1] if _held else None
+    if held is None or not held.left:
+        yield
+        return
+    held.enter()
+    try:
+        yield
+    finally:
+        held.leave()
+
+
+class _Held:
+    """The conditions of one block, entered or left for a while."""
+
+    def __init__(self, priority: int, cpus: Collection[int]) -> None:
+        self._priority, self._cpus = priority, cpus
+        self.stack = ExitStack()
+        self.left = True
+
+    def enter(self) -> Realtime:
+        self.left = False
+        return self.stack.enter_context(_conditions(self._priority, self._cpus))
+
+    def leave(self) -> None:
+        self.left = True
+        self.stack.close()
+
+
+_held: Final[list[_Held]] = []
+"""The blocks that this process is in; the conditions are the process's, so is this."""
+
+
+@contextmanager
+def _conditions(priority: int, cpus: Collection[int]) -> Iterator[Realtime]:
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     allowed = os.sched_getaffinity(0)
     collecting, switching_s = gc.isenabled(), sys.getswitchinterval()

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench, Run, compensation_for
+from hdbridge.control.survived import lines
 from hdbridge.drive.drive import Drive
 from hdbridge.evaluation.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.records.record import Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +25,23 @@ class Comparison:
     runs: dict[Scheme, Run[SteppingOutcome]]
     quantisation_floor_arcsec: float
 
+    @classmethod
+    def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Comparison:
+        """Of the runs that came to their end."""
+        floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+        return cls({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
+
+    @property
+    def survived(self) -> tuple[str, ...]:
+        """A line for each scheme whose test went on in spite of something."""
+        return tuple(lines((f"'{scheme.value}'", run.survived) for scheme, run in self.runs.items()))
+
     def as_dict(self) -> dict[str, Any]:
         """The contract of ``hdbridge step --json``."""
         return {
             "schema": "hdbridge.stepping/1",
             **{scheme.value: result.as_dict() for scheme, result in self.results.items()},
+            "survived": list(self.survived),
             "quantisation_floor_arcsec": self.quantisation_floor_arcsec,
         }
 
@@ -40,18 +55,23 @@ def compare_schemes(
     progress: Callable[[Scheme, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
     finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
+    stopped: Callable[[Scheme, Record], None] = lambda *_: None,
 ) -> Comparison:
     """Run the stepping test under each scheme on a booted drive; it is enabled for each and disabled after.
 
-    ``progress`` receives the share of the present scheme that is done; ``finished`` each run as it ends, so
-    that nothing measured is lost when a later one fails.
+    ``progress`` receives the share of the present scheme that is done; ``finished`` each run as it ends, and
+    ``stopped`` what one had measured that did not come to its end, so that nothing measured is lost.
     """
     # All of them first: what cannot be compensated is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme, compensation in compensations.items():
         bench = Bench(drive, compensation, interrupted=interrupted)
-        runs[scheme] = bench.run(stepping, partial(progress, scheme))
+        try:
+            runs[scheme] = bench.run(stepping, partial(progress, scheme))
+        except BaseException:
+            if len(record := bench.record()):
+                stopped(scheme, record)
+            raise
         finished(scheme, runs[scheme])
-    floor = quantisation_floor_arcsec(drive.axis.motor_encoder.counts_per_turn, drive.axis.gear.ratio)
-    return Comparison({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
+    return Comparison.of(drive.axis, runs)

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, OutputError
 
 _STANDARD = ("/dev/stdin", "/dev/stdout", "/dev/stderr")
 _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
@@ -26,7 +26,7 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
     """Replace the file's content, text as UTF-8: temporary file beside it, fsync, rename, fsync the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
-    straight through. InputError when the place cannot be written; the old file then stands.
+    straight through. OutputError when the place cannot be written; the old file then stands.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
@@ -51,7 +51,7 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
     except BrokenPipeError:  # who reads has had enough
         raise
     except OSError as problem:
-        raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
+        raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None
 
 
 def check_writable(path: Path | str) -> None:

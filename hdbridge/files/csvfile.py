@@ -15,7 +15,7 @@ import math
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ MAXIMUM_BYTES = 2 << 30
 _GZIP_MAGIC = b"\x1f\x8b"
 _GZIP_LEVEL = 4  # beyond it time grows several-fold and the size hardly falls
 _ROWS_AT_ONCE = 50_000
+_PIECE_BYTES = 1 << 20
 
 
 def read_columns(path: Path, required: Sequence[str], numeric: Collection[str]) -> dict[str, Column]:
@@ -98,7 +99,7 @@ def _content(path: Path) -> bytes:
     """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
     try:
         with path.open("rb") as plain:
-            content = plain.read(MAXIMUM_BYTES + 1)
+            content = _bounded(plain)
     except FileNotFoundError:
         raise _wrong(f"{path}: no such file") from None
     except OSError as problem:
@@ -106,7 +107,7 @@ def _content(path: Path) -> bytes:
     if content.startswith(_GZIP_MAGIC):
         try:
             with gzip.GzipFile(fileobj=io.BytesIO(content)) as file:
-                content = file.read(MAXIMUM_BYTES + 1)
+                content = _bounded(file)
         except (gzip.BadGzipFile, EOFError, zlib.error) as problem:
             raise _wrong(f"{path}: gzip data are damaged or cut off ({problem})") from None
     elif path.suffix == ".gz":
@@ -120,6 +121,14 @@ def _content(path: Path) -> bytes:
         line = content.count(b"\n", 0, problem.start) + 1
         raise _wrong(f"{path}:{line}: not UTF-8 text; expected CSV in UTF-8") from None
     return content
+
+
+def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
+    """All of it, or a piece more than is allowed; `read` in one go would take the memory that it may need."""
+    content = io.BytesIO()
+    while content.tell() <= MAXIMUM_BYTES and (piece := file.read(_PIECE_BYTES)):
+        content.write(piece)
+    return content.getvalue()
 
 
 def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:

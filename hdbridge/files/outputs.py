@@ -10,14 +10,15 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import check_writable, descriptor_of, is_stream
 
 _HEAD_BYTES: Final = 4096
@@ -213,3 +214,37 @@ def _head(path: Path) -> str:
             return file.read(_HEAD_BYTES).decode(errors="replace")
     except OSError as problem:
         raise InputError(f"{path}: cannot be read: {problem.strerror}") from None
+
+
+_failures: ContextVar[list[OutputError] | None] = ContextVar("failures", default=None)
+
+
+@contextmanager
+def failures_deferred() -> Iterator[list[OutputError]]:
+    """Within the block a result that cannot be written ends nothing: yields the list of what went wrong.
+
+    After a measurement the figures are printed first; a full disk shall not take them along.
+    """
+    failed: list[OutputError] = []
+    token = _failures.set(failed)
+    try:
+        yield failed
+    finally:
+        _failures.reset(token)
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """A result is written in the block: its OutputError waits, where somebody defers failures."""
+    try:
+        yield
+    except OutputError as error:
+        defer(error)
+
+
+def defer(error: OutputError) -> None:
+    """Keep the error for the end, where somebody defers failures, else raise it."""
+    failed = _failures.get()
+    if failed is None:
+        raise error
+    failed.append(error)

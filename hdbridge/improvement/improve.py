@@ -11,22 +11,24 @@ from typing import Any
 
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import provenance, with_provenance
-from hdbridge.calibration.journal import Journal, tasks_of
+from hdbridge.calibration.journal import Journal, survived_in, tasks_of
 from hdbridge.calibration.measure import measure, start_journal
-from hdbridge.calibration.pipeline import ACTIVE_NAME, MODEL_NAME
+from hdbridge.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, proposed
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import floor_of
 from hdbridge.control.bench import axis_view
+from hdbridge.control.caps import cap_remark
+from hdbridge.control.realtime import left_realtime
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import writing
 from hdbridge.improvement.extension import alternatives, extension_of, named
 from hdbridge.improvement.further import advice, choose, untold
 from hdbridge.improvement.result import Improvement, Round
 from hdbridge.improvement.trial import Trial, try_out
 from hdbridge.model import TransmissionModel
-from hdbridge.model.store import propose
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.recording import ABOUT_NAME, Recording
 
@@ -48,6 +50,7 @@ class Source:
     """The encoders' zeros were lost between the given recordings."""
 
 
+@left_realtime()  # a fit takes its time; a bench goes back for each motion
 def improve(
     drive: Drive,
     source: Source,
@@ -107,6 +110,7 @@ def improve(
         advice=advice(diagnosis),
         trial=None,
         offer=Offer(False, "nothing found: the active model stays"),
+        survived=survived_in(paths),
     )
     if diagnosis.findings:
         result = _concluded(result, bench, source, profile, recording, tell)
@@ -196,6 +200,8 @@ def _concluded(
     if not extension.improves:
         return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
     model = with_provenance(extension.model, _provenance(result, recording))
+    if remark := cap_remark(drive.axis, model):
+        tell(remark)
     tell("stepping with the active and with the extended model, in turns")
     floor = floor_of(drive.axis, recording)
     try:
@@ -216,8 +222,7 @@ def _concluded(
     if not trial.improves:
         return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
     reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
-    pending = propose(profile, model, reason, bench.date, drive.identity)
-    return replace(result, offer=Offer(True, reason, pending))
+    return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
 
 
 def _told(trial: Trial) -> str:
@@ -253,8 +258,10 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
 def _kept(folder: Path, result: Improvement) -> Improvement:
     """Result and models beside the recording; nothing where nothing new was measured."""
     if folder.is_dir() and any(folder.iterdir()):
-        if result.diagnosis.findings:
-            result.extension.model.save(folder / MODEL_NAME)
-        result.active.save(folder / ACTIVE_NAME)
-        write_atomically(folder / RESULT_NAME, json.dumps(result.as_dict(), indent=1, allow_nan=False) + "\n")
+        with writing():
+            if result.diagnosis.findings:
+                result.extension.model.save(folder / MODEL_NAME)
+            result.active.save(folder / ACTIVE_NAME)
+            text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
+            write_atomically(folder / RESULT_NAME, text + "\n")
     return result

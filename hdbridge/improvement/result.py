@@ -58,6 +58,8 @@ class Improvement:
     """What a person can do about what is still open."""
     trial: Trial | None
     offer: Offer
+    survived: tuple[str, ...] = ()
+    """A line for each file that was measured in spite of something."""
 
     def as_dict(self) -> dict[str, Any]:
         """The contract of ``--json``: schema ``hdbridge.improvement/1``."""
@@ -79,6 +81,7 @@ class Improvement:
             "rounds": [each.as_dict() for each in self.rounds],
             "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),
+            "survived": list(self.survived),
             **trial,
             "diagnosis": self.diagnosis.as_dict(),
         }

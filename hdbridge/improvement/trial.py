@@ -14,6 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
 from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept, worse_ways
 from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Hysteresis, HysteresisMemory
 from hdbridge.model import TransmissionModel
@@ -95,16 +96,20 @@ def try_out(
     procedures = _procedures(plan, axis_view(axis), active)
     pace = Pace(trial_s(plan, axis, active), axis.drive.cycle_s, progress, interrupted)
     outcomes: tuple[list[SteppingOutcome], list[SteppingOutcome]] = ([], [])
+    survived: list[tuple[str, tuple[Survived, ...]]] = []
     for number, (name, procedure) in enumerate(procedures):
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             title = f"{name}-{'before' if which == 0 else 'after'}"
             pace.begin(title.replace("-", " "))
             bench = Bench(drive, compensations[which], interrupted=pace.interrupted)
             with record_kept(bench, folder / f"{title}.csv.gz"):
-                outcomes[which].append(bench.run(procedure).outcome)
+                run = bench.run(procedure)
+                outcomes[which].append(run.outcome)
+                survived.append((title, run.survived))
     pieces = [Stepped.of(words, _together(each[:-1])) for words, each in zip(_WORDS, outcomes, strict=True)]
     small = [Stepped.of(words, each[-1]) for words, each in zip(_WORDS, outcomes, strict=True)]
-    return Trial(Validation(pieces[0], pieces[1], floor), (small[0], small[1]))
+    stepping = Validation(pieces[0], pieces[1], floor, survived=tuple(lines(survived)))
+    return Trial(stepping, (small[0], small[1]))
 
 
 def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:

@@ -145,10 +145,11 @@ def commit(profile: Path, date: datetime, identity: Identity | None = None) -> i
 
 def discard(profile: Path) -> None:
     """Throw the pending model away; InputError when there is none."""
-    try:
-        (profile / "pending.yaml").unlink()
-    except FileNotFoundError:
-        raise InputError(f"{profile}: there is no pending model") from None
+    with _locked(profile):
+        try:
+            (profile / "pending.yaml").unlink()
+        except FileNotFoundError:
+            raise InputError(f"{profile}: there is no pending model") from None
 
 
 def activate(
@@ -293,6 +294,29 @@ def _bytes(path: Path) -> bytes | None:
 
 def _iso(date: datetime) -> str:
     return date.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+@contextmanager
+def measuring(axis_file: Path) -> Iterator[None]:
+    """One measurement at a time for a profile, also between processes: of two proposals one would be lost.
+
+    InputError, at once, where another process has it. The lock goes with its process, whatever ends it.
+    """
+    try:
+        file = os.open(axis_file, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as problem:
+        raise InputError(f"{axis_file}: cannot be read: {problem.strerror}") from None
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{axis_file}: another hdbridge process is measuring this axis, to propose a model for it; "
+                "wait until it has ended, or stop it"
+            ) from None
+        yield
+    finally:
+        os.close(file)
 
 
 @contextmanager

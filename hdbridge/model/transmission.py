@@ -112,7 +112,8 @@ class TransmissionModel:
     def _of_another(self, what: str, theirs: str, ours: str, axis: AxisConfig) -> InputError:
         return InputError(
             f"{self._name()}: provenance.{what}: this model was made for {theirs}, but the {what} here is "
-            f"{ours} ({axis.path}); use the model of this {what}, or calibrate it"
+            f"{ours} ({axis.path}); use the model of this {what}, or calibrate it (if it is the same gear, "
+            f"correct provenance.{what} in the model's file)"
         )
 
     def _name(self) -> str:

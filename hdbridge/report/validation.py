@@ -34,8 +34,9 @@ def _stepping_text(checked: Validation) -> str:
     return (
         f"The axis stepped both ways, before and after. This axis's counts and noise allow {SIGMA} = "
         f"{checked.floor.three_sigma_arcsec:.2f} arcsec at best; with the new model it is {share:.2f} times "
-        "that."
-    ) + "".join(f" It got {each}." for each in checked.worse)
+        f"that.{''.join(f' It got {each}.' for each in checked.worse)}"
+        f"{''.join(f' Noted: {each}.' for each in checked.survived)}"
+    )
 
 
 def _stepping(checked: Validation) -> Iterator[Block]:

@@ -31,6 +31,8 @@ def measured(cell, silent_cycles):
         def each_cycle():
             nonlocal cycles
             cycles += 1
+            if cycles == 500:
+                node.faults.drop_tpdos = 1
             if cycles in silent_cycles:
                 stops(node)
             elif cycles - 1 in silent_cycles:
@@ -39,14 +41,30 @@ def measured(cell, silent_cycles):
 
         measure(drive, journal, interrupted=each_cycle)
     about = yaml.safe_load((cell.folder / "rec" / "recording.yaml").read_text())
-    return {each["file"]: each["lost"] for each in about["notes"]["tasks"] if "lost" in each}
+    survived = {each["file"]: each["survived"] for each in about["notes"]["tasks"] if "survived" in each}
+    return {each["file"]: each["lost"] for each in about["notes"]["tasks"] if "lost" in each}, survived
 
 
 def test_a_channel_lost_on_the_way_is_told_and_kept_in_mind(cell):
-    lost, channels = measured(cell, silent_cycles=range(1700, 1760)).popitem()
+    lost_in, survived_in = measured(cell, silent_cycles=range(1700, 1760))
+    lost, channels = lost_in.popitem()
     assert channels == ["load_torque"]
     done = cell.run("report", "rec", "--json", "result.json")
     line = f"the load torque was lost on the way (rec/{lost}); the fit does without it"
     assert f"note: {line}" in done.stdout.splitlines()
     assert line in cell.json("result.json")["warnings"]
     assert line in (cell.folder / "rec" / "report.html").read_text()
+    # What was survived beside it is in the recording, and told the same way.
+    missing = [
+        (name, row)
+        for name, rows in survived_in.items()
+        for row in rows
+        if row["what"] == "a TPDO is missing"
+    ]
+    ((name, row),) = missing
+    assert row["cycles"] == 1
+    said = f"rec/{name} went on in spite of: a TPDO is missing, in 1 cycle (first: {row['first']})"
+    assert any(each.startswith(f"note: {said}") for each in done.stdout.splitlines())
+    assert any(each.startswith(said) for each in cell.json("result.json")["warnings"])
+    assert said in (cell.folder / "rec" / "report.html").read_text()
+    assert any("channel" in row["what"] or "load torque" in row["what"] for row in survived_in[lost])

@@ -138,3 +138,19 @@ def test_an_eds_that_lacks_what_is_needed_is_not_all_right(hdbridge, profile):
     refused(hdbridge("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
     (profile.folder / "own.eds").write_text("")
     refused(hdbridge("check", profile.folder), 2, "own.eds: cannot be read as an EDS")
+
+
+def test_a_model_of_another_axis_is_refused_before_anything_is_connected(hdbridge, profile):
+    folder = profile("name: article", "name: elbow")
+    for command in (("check", folder), ("step", folder, "--simulate")):
+        done = hdbridge(*command)
+        refused(done, 2, "provenance.axis: this model was made for 'article', but the axis here is 'elbow'")
+        assert "booted" not in done.stderr
+
+
+def test_a_cap_that_cuts_the_model_is_said_by_check_and_before_steps(hdbridge, profile):
+    folder = profile("maximum_arcsec: ", "maximum_arcsec: 40 # not ")
+    for command in (("check", folder), ("step", folder, "--simulate", "--count", 2, "--scheme", "both")):
+        done = hdbridge(*command)
+        assert done.returncode == 0, done.stderr
+        assert "40 arcsec cut the correction of this model, which reaches" in done.stderr

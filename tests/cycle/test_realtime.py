@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from hdbridge.control.realtime import prepare_realtime
+from hdbridge.control.realtime import left_realtime, prepare_realtime, resumed_realtime
 
 
 def state() -> tuple[int, int, bool, int, set[int]]:
@@ -64,3 +64,22 @@ def test_a_processor_that_is_not_there_is_reported() -> None:
         assert "not on processor 0, 4095 (there is no processor 4095" in str(realtime)
         assert state()[-1] == before[-1]
     assert state() == before
+
+
+def test_a_fit_leaves_the_block_and_a_motion_within_it_goes_back():
+    with left_realtime(), resumed_realtime():
+        assert gc.isenabled()  # nothing was prepared, nothing to leave
+    with prepare_realtime(priority=0):
+        assert not gc.isenabled()
+        with left_realtime():
+            assert gc.isenabled()
+            with resumed_realtime():
+                assert not gc.isenabled()
+            with left_realtime():
+                assert gc.isenabled()
+            assert gc.isenabled()
+        assert not gc.isenabled()
+        with pytest.raises(RuntimeError), left_realtime():
+            raise RuntimeError
+        assert not gc.isenabled()
+    assert gc.isenabled()

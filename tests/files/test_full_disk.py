@@ -5,12 +5,12 @@ import sys
 
 SCRIPT = """
 import resource, sys
-from hdbridge.errors import InputError
+from hdbridge.errors import OutputError
 from hdbridge.files.atomic import write_atomically
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # as on a full disk
 try:
     write_atomically(sys.argv[1], "new" * 1000)
-except InputError as error:
+except OutputError as error:
     print(error)
 """
 

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, OutputError
 from hdbridge.files.yamlfile import (
     MAXIMUM_BYTES,
     FileError,
@@ -216,8 +216,8 @@ def test_writing_through_a_link_keeps_the_link(tmp_path):
     assert (tmp_path / "real" / "a.yaml").read_text() == "new"
 
 
-def test_writing_into_a_missing_folder_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match=r"absent/a\.yaml: cannot be written: No such file or directory$"):
+def test_writing_into_a_missing_folder_is_an_output_error(tmp_path):
+    with pytest.raises(OutputError, match=r"absent/a\.yaml: cannot be written: No such file or directory$"):
         write_atomically(tmp_path / "absent" / "a.yaml", "x")
 
 

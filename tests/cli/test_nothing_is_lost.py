@@ -1,0 +1,123 @@
+"""Interruptions and full disks: what was measured is kept, printed and told; one axis, one measurement."""
+
+import fcntl
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hdbridge.records.recording import Recording
+
+LONG = ("step", "article", "--simulate", "--count", 400, "--step-deg", 20)
+
+
+def started(folder, *arguments):
+    """A command whose drive is booted."""
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "hdbridge", *map(str, arguments)],
+        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    while "booted" not in (line := process.stderr.readline()):
+        assert line, "it ended early"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, number):
+    process = started(tmp_path, *LONG, "--record", "kept")
+    time.sleep(0.5)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    (kept,) = (tmp_path / "kept").glob("*-stopped.csv.gz")
+    scheme = kept.name.removeprefix("stepping-").removesuffix("-stopped.csv.gz")
+    assert f"stopped in '{scheme}' after" in errors
+    assert f"kept in kept/{kept.name}" in errors
+    assert len(Recording.load(kept).record)
+
+
+def test_without_a_folder_the_loss_is_said(tmp_path):
+    process = started(tmp_path, *LONG)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "not kept: it takes --record FOLDER" in errors
+
+
+def test_what_the_schemes_before_have_given_is_printed(tmp_path):
+    process = started(tmp_path, "step", "article", "--simulate", "--count", 40, "--record", "kept")
+    first = tmp_path / "kept" / "stepping-none.csv.gz"
+    while not first.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    printed, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "│ none" in printed
+    assert "│ both" not in printed
+
+
+def test_what_nohup_ignores_stays_ignored(tmp_path):
+    process = subprocess.Popen(
+        ["nohup", sys.executable, "-m", "hdbridge", "step", "article", "--simulate", "--count", "2"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while "booted" not in process.stderr.readline():
+        pass
+    process.send_signal(signal.SIGHUP)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+
+
+def test_a_disk_that_fills_while_the_axis_moves_takes_no_figures_along(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "hdbridge", "step", "article", "--simulate", "--count", "2",
+         "--scheme", "none", "--json", "out.json", "--html", "out.html", "--record", "kept"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
+    )  # fmt: skip
+    assert done.returncode == 6, done.stderr
+    assert "quantisation floor" in done.stdout
+    assert done.stderr.count("cannot be written: File too large") == 3
+    assert done.stderr.count("hdbridge: ") == 1
+    assert not [each for each in tmp_path.rglob("*") if each.is_file()]
+
+
+def test_one_measurement_of_an_axis_at_a_time(hdbridge, profile, tmp_path):
+    with (profile.folder / "axis.yaml").open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        done = hdbridge("calibrate", profile.folder, "--simulate", "--out", "rec")
+    assert done.returncode == 2
+    assert "another hdbridge process is measuring this axis" in done.stderr
+    assert "booted" not in done.stderr
+
+
+def test_two_calibrations_of_one_second_have_a_folder_each(monkeypatch, tmp_path):
+    from hdbridge.files.atomic import new_folder
+
+    monkeypatch.chdir(tmp_path)
+    made = [new_folder(tmp_path / "recordings" / "axis-20250101-000000").name for _ in range(3)]
+    assert made == [f"axis-20250101-000000{each}" for each in ("", "-2", "-3")]
+
+
+def test_a_small_file_is_read_in_little_memory(tmp_path):
+    (tmp_path / "one.csv").write_text(
+        "time_s,motor_position_deg,load_position_deg\n" + "".join(f"{n},{n},{n / 50}\n" for n in range(9))
+    )
+    script = (
+        "import resource, sys\n"
+        "from pathlib import Path\n"
+        "from hdbridge.records.record import Record\n"
+        "used = 4096 * int(Path('/proc/self/statm').read_text().split()[0])\n"
+        "resource.setrlimit(resource.RLIMIT_AS, 2 * (used + (256 << 20),))\n"
+        "print(len(Record.read_csv('one.csv')))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "9\n", done.stderr

@@ -1,0 +1,76 @@
+"""Nothing moves under a model of another gear, axis or drive; what cuts a model is said."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.control.bench import Bench, compensation_for
+from hdbridge.control.caps import cap_remark
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Synchronous
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
+AXIS = AxisConfig.load(PROFILE)
+MODEL = TransmissionModel.load(PROFILE / "model.yaml")
+BOUND = MODEL.bound_to(AXIS, Identity(vendor_id=0x4844, product_code=0x402, serial=7))
+FOREIGN = {
+    "ratio": (replace(MODEL, ratio=80.0), "ratio 80"),
+    "axis": (replace(MODEL, provenance={"axis": "elbow"}), "'elbow'"),
+    "vendor": (replace(MODEL, provenance={"drive": {"vendor_id": 0x99, "product_code": 0x402}}), "0x99"),
+    "teeth": (
+        replace(
+            MODEL,
+            provenance={
+                "gear": {
+                    "ratio": 50,
+                    "teeth": {"flexspline": 98, "circular_spline": 100, "output": "circular_spline"},
+                }
+            },
+        ),
+        "98/100",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_a_foreign_model_compensates_nothing(what):
+    model, words = FOREIGN[what]
+    with pytest.raises(InputError, match=words):
+        compensation_for(AXIS, model)
+
+
+def test_what_the_drive_answers_counts_and_a_compensation_of_ones_own_making_is_no_way_round():
+    truth = Truth.load(PROFILE / "truth.yaml")
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 0) as (bus, clock, _),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        assert drive.identity.serial not in {None, 7}
+        before = drive.read_positions().motor_counts
+        own = Compensation(FOREIGN["axis"][0], CompensationLimits(), AXIS.drive.cycle_s)
+        for compensation, words in ((compensation_for(AXIS, BOUND), "serial 0x7"), (own, "'elbow'")):
+            with pytest.raises(InputError, match=words):
+                Bench(drive, compensation).run(Stepping(count=2))
+        assert drive.read_positions().motor_counts == before
+        for model in (replace(MODEL, provenance={}), MODEL.bound_to(AXIS, drive.identity)):
+            assert Bench(drive, compensation_for(AXIS, model)).run(Stepping(count=2)).segments
+
+
+def test_a_cap_that_cuts_the_model_is_said():
+    assert cap_remark(AXIS, MODEL) is None
+    orders = {"orders": [{"order": 2, "amplitude_arcsec": 400, "phase_deg": 0}]}
+    large = replace(MODEL, effects=(Synchronous.model_validate(orders),))
+    said = cap_remark(AXIS, large)
+    assert said is not None
+    assert "axis.yaml:" in said
+    assert "maximum_arcsec: 300 arcsec cut" in said
+    assert "reaches 400 arcsec" in said
