@@ -1,4 +1,4 @@
-"""Writes the tables of docs/files.md from the models that read the files, so that the page cannot lag behind.
+"""Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   say whether they are up to date (exit status 1 if not)
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -21,11 +21,29 @@ from hdbridge.axis import AxisConfig
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.model.file import ModelFile
 from hdbridge.model.store import LogFile
+from hdbridge.procedures.plan import (
+    Plan,
+    ReversalsEntry,
+    SinesEntry,
+    StandstillEntry,
+    SteppingEntry,
+    SweepEntry,
+)
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "files.md"
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGES = (DOCS / "files.md", DOCS / "calibration.md")
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+ENTRIES: tuple[type[BaseModel], ...] = (
+    StandstillEntry,
+    SweepEntry,
+    SinesEntry,
+    ReversalsEntry,
+    SteppingEntry,
+)
 
 
 def key_table(model: type[BaseModel]) -> str:
@@ -43,12 +61,27 @@ def column_table() -> str:
     return "\n".join(lines) + "\n"
 
 
+def procedure_table() -> str:
+    """What a plan may ask for: the keys of each procedure."""
+    lines = ["| procedure | key | expected | default | meaning |", "|---|---|---|---|---|"]
+    for entry in ENTRIES:
+        _, *keys = _rows(entry)
+        procedure = entry.model_fields["procedure"].annotation
+        lines += (
+            f"| `{get_args(procedure)[0]}` | `{key}` | {what} | {default} | {about} |"
+            for key, what, default, about in keys
+        )
+    return "\n".join(lines) + "\n"
+
+
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
     "model": lambda: key_table(ModelFile),
     "columns": column_table,
     "recording": lambda: key_table(RecordingFile),
     "history": lambda: key_table(LogFile),
+    "plan": lambda: key_table(Plan),
+    "procedures": procedure_table,
 }
 
 
@@ -90,18 +123,28 @@ def _default(key: str, info: FieldInfo) -> str:
         value = value.value
     if key == "index":
         return f"`{value:#x}`"
+    if isinstance(value, bool):
+        return f"`{value}`".lower()
+    if isinstance(value, tuple):
+        return f"`{[*value]}`".replace(".0", "")
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
 def main(arguments: list[str]) -> int:
     """Rewrite, or check with ``--check``."""
-    page = PAGE.read_text(encoding="utf-8")
-    new = updated(page)
-    if "--check" in arguments:
-        print("up to date" if new == page else f"{PAGE} lags behind: run python tools/file_reference.py")
-        return int(new != page)
-    PAGE.write_text(new, encoding="utf-8")
-    return 0
+    behind = []
+    for path in PAGES:
+        page = path.read_text(encoding="utf-8")
+        new = updated(page)
+        if new != page:
+            behind.append(path.name)
+        if "--check" not in arguments:
+            path.write_text(new, encoding="utf-8")
+    if "--check" not in arguments:
+        return 0
+    words = f"{', '.join(behind)}: not up to date; run python tools/file_reference.py"
+    print(words if behind else "up to date")
+    return int(bool(behind))
 
 
 if __name__ == "__main__":
