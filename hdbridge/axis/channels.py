@@ -47,7 +47,7 @@ class LoadTorque(_Part):
         1, description="-1 where it counts down when the torque pushes the load forward"
     )
     maximum_nm: float = Field(
-        1000.0, gt=0, le=1e6, description="torque, either way, beyond which a reading is not believed"
+        1000.0, gt=0, le=1e6, description="torque in either direction beyond which a reading is not believed"
     )
     every_cycles: int = Field(1, ge=1, le=240, description="it comes with every n-th SYNC")
     hold_ms: float = Field(

@@ -68,7 +68,7 @@ def axis_lines(node: Node) -> list[str]:
     lines = [
         "drive:",
         f"  node_id: {node.node_id}",
-        "  eds: FILE.eds                 # the EDS file of this drive, beside the axis file",
+        "  eds: FILE.eds                 # the EDS file of this drive, next to the axis file",
         f"  identity: {{{identity}}}",
     ]
     torque = node.values.get(objects.RATED_TORQUE)

@@ -118,7 +118,7 @@ def judge_turn(
         remedies += [each.text(axis) for each in accuse(axis, abs(factor), tolerance, confirmed)]
     elif lost > 4.0 + 0.05 * abs(load) / 2.0:
         remedies.append(
-            f"{axis.where(SOURCE)}: the load encoder came back {lost:.0f} counts beside where it had been; "
+            f"{axis.where(SOURCE)}: the load encoder came back {lost:.0f} counts from where it had been; "
             "check it for lost counts and the coupling for slip"
         )
     ratio = f"ratio {axis.gear.ratio / abs(factor):.4g} against {axis.gear.ratio:g}"

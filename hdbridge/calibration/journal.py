@@ -46,7 +46,8 @@ class TaskEntry(BaseModel):
     start_s: float = Field(description="time of its first sample")
     end_s: float = Field(description="time of its last sample")
     lost: tuple[str, ...] = Field(
-        (), description="channels of the axis file that were lost on the way: the samples do without them"
+        (),
+        description="channels of the axis file that were lost during the test: the samples do without them",
     )
     survived: tuple[Survived, ...] = Field(
         (),

@@ -130,7 +130,7 @@ def _lost(recordings: Mapping[Path, Recording]) -> Iterator[str]:
     tasks = [(task, path) for path, each in recordings.items() for task in tasks_of(each)]
     for key in dict.fromkeys(key for task, _ in tasks for key in task.lost):
         places = ", ".join(f"{path.name}/{task.file}" for task, path in tasks if key in task.lost)
-        yield f"the {key.replace('_', ' ')} was lost on the way ({places}); the fit does without it"
+        yield f"the {key.replace('_', ' ')} was lost during the test ({places}); the fit does without it"
 
 
 def concluded(folder: Path) -> Calibration:

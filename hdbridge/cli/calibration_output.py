@@ -51,7 +51,7 @@ def print_calibration(result: Calibration) -> None:
     standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
     apart = ""
     if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
-        apart = f"; {noise.fitted_arcsec:.2f} with what was fitted beside the model taken off"
+        apart = f"; {noise.fitted_arcsec:.2f} with what was fitted in addition to the model taken off"
     console.print(
         f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}", soft_wrap=True
     )

@@ -37,7 +37,7 @@ def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOp
         "travel": f"{axis.limits.position_min_deg:g} to {axis.limits.position_max_deg:g} deg",
     }
     if axis.channels:
-        facts["beside encoders"] = ", ".join(axis.channels).replace("_", " ")
+        facts["other channels"] = ", ".join(axis.channels).replace("_", " ")
     remark = None
     path = model or (files.model if files.model.exists() else None)
     if path is not None:

@@ -1,4 +1,4 @@
-"""``hdbridge diagnose``: what the simulation gets wrong, and why."""
+"""``hdbridge diagnose``: what the model gets wrong, and why."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def run(
     plan: Annotated[
         str | None,
         typer.Option(
-            "--plan", metavar="PLAN.yaml", help="Without records: what this plan could detect and tell apart."
+            "--plan",
+            metavar="PLAN.yaml",
+            help="Without records: what this plan could detect and distinguish.",
         ),
     ] = None,
 ) -> None:
@@ -155,7 +157,7 @@ def _say(line: str) -> None:
 
 
 def _print_figures(result: Diagnosis) -> None:
-    table = Table(title="simulation against measurement, arcsec", title_justify="left")
+    table = Table(title="model and measurement, arcsec", title_justify="left")
     table.add_column("")
     for name in ("as given, rms", "3σ", "extended, rms", "3σ"):
         table.add_column(name, justify="right")
@@ -198,7 +200,7 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 
 def _print_plan(report: dict[str, Any]) -> None:
-    table = Table("cause", "detected from", "not told from")
+    table = Table("cause", "detected from", "not distinguished from")
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]
         words = (

@@ -59,7 +59,9 @@ def command(
     ] = False,
     auto: Annotated[
         bool,
-        typer.Option("--auto", help="Let the axis run further experiments where causes are not told apart."),
+        typer.Option(
+            "--auto", help="Let the axis run further experiments where causes are not distinguished."
+        ),
     ] = False,
     rounds: Annotated[
         int, typer.Option("--rounds", min=1, max=20, help="With --auto: so many experiments at most.")

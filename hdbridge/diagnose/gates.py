@@ -124,7 +124,7 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
         far = since_reversal(workshop.motion.motor_deg)[workshop.index] > TURN_DEG
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
         if robust < needed:
-            return Gate(robust, needed, passed=False, reason="seen only where the axis turns round")
+            return Gate(robust, needed, passed=False, reason="seen only where the axis reverses")
     if isinstance(effect, Creep):
         late = standing_s(workshop)[workshop.index] > SETTLED_S
         robust = min(robust, robust_chi_square(workshop, fitted, place, rows=late))
@@ -135,7 +135,7 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
     if isinstance(effect, Backlash) and workshop.evidence.reversals < 2:
         return Gate(robust, needed, passed=False, reason="no reversal in which play would show")
     if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
-        return Gate(robust, needed, passed=False, reason="too small to tell from the loop's shape")
+        return Gate(robust, needed, passed=False, reason="too small to distinguish from the loop's shape")
     return Gate(robust, needed, passed=True)
 
 

@@ -192,7 +192,7 @@ def _own_coordinate(effect: Effect | None, traces: Traces, ratio: float) -> Coor
         torque, name = motion.channel(channel, effect.name)[rows], channel.title
         values = torque if effect.signed else np.abs(torque)
         return Coordinate(
-            name if effect.signed else f"{name}, either way", "Nm", values, False, Spacing.FILLED
+            name if effect.signed else f"{name}, either direction", "Nm", values, False, Spacing.FILLED
         )
     if effect is not None and effect.name == "flexspline_order":
         angle = traces.motor_deg * (1.0 + 1.0 / ratio)

@@ -229,18 +229,17 @@ class Diagnosis:
         """One sentence."""
         if not self.findings:
             return (
-                "Nothing found: the simulation differs from the measurement by no more than noise and "
-                "calibration."
+                "Nothing found: the model differs from the measurement by no more than noise and calibration."
             )
         words = []
         for each in self.findings:
             if each.cause == "unexplained":
-                words.append(f"unexplained, lives in the {each.lives_in or 'time'}")
+                words.append(f"unexplained, depends on the {each.lives_in or 'time'}")
             else:
                 others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
                 words.append(f"{each.cause}{others}, {each.peak_arcsec:.2g} arcsec")
         return (
-            f"The simulation is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
+            f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."
         )
 

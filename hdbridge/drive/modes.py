@@ -159,12 +159,12 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
         )
         if _dropped_out(word):
             raise DriveError(
-                f"{commander.name}: left 'operation enabled' on the way to {move.load_deg:g} deg and is in "
+                f"{commander.name}: left 'operation enabled' moving to {move.load_deg:g} deg and is in "
                 f"'{decode(word).value}'; look at its error display"
             )
         if word & FAILED:
             raise DriveError(
-                f"{commander.name}: following error on the way to {move.load_deg:g} deg; check that the axis "
+                f"{commander.name}: following error moving to {move.load_deg:g} deg; check that the axis "
                 "moves freely, or lower the acceleration"
             )
 

@@ -43,7 +43,7 @@ class Compliance(Linear):
         equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
         "206265 arcsec / K",
         signature="the error follows the torque; with a mass off centre it looks like once per load turn",
-        consequence="the load sags under its weight and gives way to process forces",
+        consequence="the load sags under its weight and yields to process forces",
         remedy="compensate it where the torque is known; balance the load; a larger or stiffer gear",
         experiment="move or take off the mass: the wind-up goes with it, a load order stays",
         aliases=("load_order", "inertial_windup", "velocity_windup"),

@@ -29,7 +29,7 @@ class RatioError(Linear):
     about: ClassVar[Cause] = Cause(
         title="wrong gear ratio or encoder scale",
         equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
-        signature="a ramp over the motor angle, the same both ways, coming back on the way back",
+        signature="a ramp over the motor angle, the same in both directions, undone on the return",
         consequence="the load is off in proportion to its distance from zero",
         remedy="correct ratio, teeth or counts per turn in the axis file: a ratio is a fraction of tooth "
         "numbers, not a fit",

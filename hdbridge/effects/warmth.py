@@ -37,7 +37,7 @@ class Warmed(Effect):
         float, Field(gt=0, le=200, description="warmth in the end, where driven by time (assumed)")
     ] = 10.0
     limit_k: Annotated[
-        float, Field(gt=0, le=200, description="warmth, either way, beyond which the effect is held")
+        float, Field(gt=0, le=200, description="warmth in either direction beyond which the effect is held")
     ] = 60.0
 
     def needs(self) -> frozenset[Channel]:

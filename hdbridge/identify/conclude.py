@@ -223,9 +223,9 @@ def _describe_limits(
 ) -> None:
     """Warnings about what the record's angles cannot tell apart, and about samples left out."""
     for alike in _families(selection.twins):
-        warnings.append(f"{_named(alike)} cannot be told apart at the angles of this record")
+        warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
     if selection.unresolved:
-        warnings.append(f"{_named(selection.unresolved)} cannot be told from what else was fitted")
+        warnings.append(f"{_named(selection.unresolved)} cannot be distinguished from what else was fitted")
     if lines.resolution.load_turns < 0.95:
         warnings.append(
             f"the record spans {lines.resolution.load_turns:.2f} load turns: errors that repeat with the "

@@ -92,7 +92,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     if not candidates:
         warnings.append(
             f"orders are not fitted: only {turns_covered(design):.2f} turns of the motor are seen, on which "
-            "they cannot be told from anything else; sweep over a turn or more"
+            "they cannot be distinguished from anything else; sweep over a turn or more"
         )
     waves = harmonics(design, [each.per_motor_turn for each in candidates])
     always = np.concatenate([zeros(design), waves], axis=1)
@@ -106,7 +106,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         prototype = options.prototype(effect)
         if share_left(design.columns(prototype, exact=False), always, weight) < EFFECT_SHARE:
             warnings.append(
-                f"{effect.name}: left out, it cannot be told from the zero in this record (no reversal?); "
+                f"{effect.name}: left out: not distinguished from the zero in this record (no reversal?); "
                 "record both directions"
             )
             continue
@@ -119,7 +119,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
         nuisances.append(DELAY)
     elif effects and size > 0.05:
         warnings.append(
-            "a delay between the two encoders cannot be told from the hysteresis' offset at one speed: "
+            "a delay between the two encoders is not distinguished from the hysteresis' offset at one speed: "
             f"one millisecond would be {size:.2f} arcsec; record a second speed"
         )
     if samples.count_deg and effects:

@@ -100,7 +100,7 @@ def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
     """Why the compensation does not make up for a finding; empty where it does."""
     if finding.cause == "unexplained":
         return (
-            f"unexplained, lives in the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
+            f"unexplained, depends on the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
         )
     if refused := finding.refusal():
         return f"{finding.cause} is not offered: {refused}"
@@ -110,7 +110,7 @@ def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
     for rival in rivals:
         if not CATALOGUE[rival].compensable.possible:
             return (
-                f"{finding.cause} is not compensated: it has not been told from {rival}, which must not "
+                f"{finding.cause} is not compensated: not yet distinguished from {rival}, which must not "
                 f"be: {CATALOGUE[rival].compensable.why}"
             )
     return ""

@@ -90,7 +90,7 @@ def choose(
             name = machine_for_unexplained(finding.lives_in)
             for duration_s, plan in menu:
                 if plan.name == name:
-                    return Choice(plan, duration_s, (f"what lives in the {finding.lives_in or 'time'}",))
+                    return Choice(plan, duration_s, (f"what depends on the {finding.lives_in or 'time'}",))
     return None
 
 

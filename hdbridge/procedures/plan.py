@@ -109,7 +109,7 @@ class ReversalsEntry(_Part):
         (2.0, 4.0, 8.0, 12.0, 16.0, 24.0), min_length=1, max_length=100, description="depths at the motor"
     )
     reach_deg: float = Field(
-        60.0, gt=0, le=3600, description="way at the motor before each, more than the hysteresis is wide"
+        60.0, gt=0, le=3600, description="travel of the motor before each, more than the hysteresis is wide"
     )
     motor_deg_per_s: float = Field(10.0, gt=0, le=3600, description="speed of the motor")
     beyond: bool = Field(

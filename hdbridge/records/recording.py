@@ -23,7 +23,7 @@ from hdbridge.records.record import Record, concatenate, time_shifts_s
 
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
-HEADER = "# What was recorded beside this file, by hdbridge. docs/files.md describes its keys.\n"
+HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
 """How ``recording.yaml`` begins."""
 
 

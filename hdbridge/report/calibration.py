@@ -230,7 +230,7 @@ def _residual(result: Calibration) -> Iterator[Block]:
     yield Facts(
         [
             ("left by the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
-            ("... beside what was fitted with it", f"{noise.fitted_arcsec:.2f} arcsec"),
+            ("... with what was fitted in addition to it", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
                 f"{noise.standing.rms_arcsec:.2f} arcsec" if noise.standing else "not measured",

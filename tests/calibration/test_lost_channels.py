@@ -50,7 +50,7 @@ def test_a_channel_lost_on_the_way_is_told_and_kept_in_mind(cell):
     lost, channels = lost_in.popitem()
     assert channels == ["load_torque"]
     done = cell.run("report", "rec", "--json", "result.json")
-    line = f"the load torque was lost on the way (rec/{lost}); the fit does without it"
+    line = f"the load torque was lost during the test (rec/{lost}); the fit does without it"
     assert f"note: {line}" in done.stdout.splitlines()
     assert line in cell.json("result.json")["warnings"]
     assert line in (cell.folder / "rec" / "report.html").read_text()

@@ -100,7 +100,7 @@ class TrueCable(Part):
     taut_from_deg: float = Field(ge=-36_000, le=36_000, description="load angle from which it is taut")
     arcsec_per_deg: float = Field(ge=-3_600, le=3_600, description="turn of the body per degree beyond")
     drag: float = Field(
-        0.0, ge=0, le=1, description="part by which it pulls more on the way out and less on the way back"
+        0.0, ge=0, le=1, description="part by which it pulls more outwards and less on the return"
     )
 
 

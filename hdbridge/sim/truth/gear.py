@@ -35,7 +35,9 @@ class TrueFlank(Part):
     """Teeth touch with the other flank after a reversal, and there the tooth error is shifted."""
 
     shift_deg: float = Field(
-        ge=-90, le=90, description="shift of the tooth error by motor angle, either way from the mean"
+        ge=-90,
+        le=90,
+        description="shift of the tooth error by motor angle, in either direction from the mean",
     )
     travel_deg: float = Field(gt=0, le=360, description="motor travel from one flank to the other")
 
@@ -52,9 +54,9 @@ class TrueWear(Part):
     """Lost motion between the teeth, growing with the way that the motor has run."""
 
     arcsec_per_1000_turns: float = Field(
-        ge=0, le=36_000, description="lost motion, one way, after the first 1000 motor turns"
+        ge=0, le=36_000, description="lost motion in one direction after the first 1000 motor turns"
     )
-    exponent: float = Field(1.0, ge=0.1, le=3, description="growth with the way; below 1 it runs in")
+    exponent: float = Field(1.0, ge=0.1, le=3, description="growth with the travel; below 1 it runs in")
 
 
 class TrueCreep(Part):
@@ -129,7 +131,7 @@ class TrueGear(Part):
     )
     second_hysteresis: Hysteresis | None = Field(None, description="a second law, added to the first")
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
-    wear: TrueWear | None = Field(None, description="lost motion by the way run; without it: none")
+    wear: TrueWear | None = Field(None, description="lost motion by the travel; without it: none")
     creep: tuple[TrueCreep, ...] = Field((), max_length=16, description="elements that yield in time")
     teeth: int | None = Field(None, ge=3, le=100_000, description="teeth of the output; else twice the ratio")
     jumps: tuple[TrueJump, ...] = Field((), description="teeth jumped, each at its time")
@@ -153,7 +155,7 @@ class TrueGear(Part):
         per_nm = math.radians(tooth_arcsec / ARCSEC_PER_DEG) * abs(self.torque_growth_per_nm)
         if per_nm * self.stiffest_nm_per_rad >= 1.0:
             raise wrong(
-                f"{self.torque_growth_per_nm:g} makes the teeth give way more than the spring does; expected "
+                f"{self.torque_growth_per_nm:g} makes the teeth yield more than the spring does; expected "
                 f"less than {abs(self.torque_growth_per_nm) / per_nm / self.stiffest_nm_per_rad:.2g}",
                 "torque_growth_per_nm",
             )

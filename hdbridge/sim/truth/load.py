@@ -57,7 +57,7 @@ class TrueLoad(Part):
     )
     viscous_nm_s_per_rad: float = Field(0.0, ge=0, le=1e6, description="viscous friction at the load")
     presliding: tuple[TrueSlip, ...] = Field(
-        (), max_length=16, description="friction at the load that gives way before it slips; they add up"
+        (), max_length=16, description="friction at the load that yields before it slips; they add up"
     )
     stribeck: TrueStribeck | None = Field(None, description="friction near rest; without it: Coulomb only")
     thinning: TrueThinning | None = Field(None, description="shear thinning of the viscous friction")
