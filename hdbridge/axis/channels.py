@@ -1,4 +1,4 @@
-"""What a drive can tell the control loop beside its encoders: the axis file's optional channels.
+"""What a drive can tell the control loop in addition to its encoders: the axis file's optional channels.
 
 Each is an object of the drive that comes by PDO, with its unit, the range in which a reading is believed, and
 how long the last one is held. `hdbridge.drive.channels` follows them on line.

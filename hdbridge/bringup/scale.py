@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 TOOTH_SHARE: Final = 0.35
-"""A ratio is told from its neighbour (N and N + 1 differ by 1/N) when it errs by less than this share."""
+"""A ratio is distinguished from its neighbour (N and N + 1 differ by 1/N) if it errs by less than this."""
 CLOSE_SHARE: Final = 0.001
 """How true a turn of the motor shows the ratio where nothing is wrong with the gear: 26 arcsec at N = 50."""
 DEAD_SHARE: Final = 0.02

@@ -55,7 +55,7 @@ class TravelPlan(NamedTuple):
 def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
     """The travel from a motor angle, to the side with more room; None where there is too little.
 
-    One motor turn, and more where the ratio is so high that one could not tell it from its neighbour.
+    One motor turn, and more where the ratio is so high that it could not be distinguished from its neighbour.
     """
     limits, ratio = axis.limits, axis.gear.ratio
     ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG

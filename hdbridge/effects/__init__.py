@@ -80,7 +80,7 @@ CATALOGUE: dict[str, type[Effect]] = {
 """Every effect by its canonical name."""
 
 CAUSES: tuple[str, ...] = tuple(name for name in CATALOGUE if name not in {"synchronous", "hysteresis"})
-"""Names of the causes that a diagnosis can find beside the two basic parts of a model."""
+"""Names of the causes that a diagnosis can find in addition to the two basic parts of a model."""
 
 
 def aliases_of(name: str) -> tuple[str, ...]:

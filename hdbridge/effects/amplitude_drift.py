@@ -105,7 +105,8 @@ class AmplitudeDrift(Linear, Warmed):
     def slope_bound_arcsec_per_deg(self) -> float:
         """The ripple's steepest fall; no bound where the loop changes: it falls as steeply as the loop rises.
 
-        Beside the model's loop, of which it takes only a share, the sum does not fall: `combine.fall_bound`.
+        Added to the model's loop, of which it takes only a share, the sum does not fall:
+        `combine.fall_bound`.
         """
         return self.ripple_fall() if not self.friction_percent_per_k else math.inf
 

@@ -251,7 +251,7 @@ class Effect(BaseModel, ABC):
     """The canonical name: in model files, findings and tests."""
     about: ClassVar[Cause]
     channels: ClassVar[frozenset[Channel]] = frozenset()
-    """What it needs beside the motor angle as a rule; an instance's own needs: `needs`."""
+    """What it needs in addition to the motor angle as a rule; an instance's own needs: `needs`."""
     compensable: ClassVar[Compensable]
     """Whether the load really moves so, and can be told in advance; see `is_compensable`."""
     replaces: ClassVar[str] = ""

@@ -29,8 +29,8 @@ class ChannelSkew(Linear):
     """delay omega_L + second alpha_L / 2: the load encoder, read later than the motor's, is farther on.
 
     A pure delay has second = delay^2. It is a parameter of its own because the speed is a difference over a
-    sample, half a step late, and a delay is rarely a whole number of samples: without it the rest would be
-    taken for an inertial wind-up.
+    sample, delayed by half a step, and a delay is rarely a whole number of samples: without it the rest would
+    be taken for an inertial wind-up.
     """
 
     name: ClassVar[str] = "channel_skew"

@@ -81,7 +81,7 @@ def fall_bound(effects: Iterable[Effect]) -> float:
 
     The sum of the effects' own bounds, but for one case: what takes a share from the model's loop falls as
     steeply as the loop rises, and as long as no more than the whole loop is taken, the sum still rises. (That
-    of a loop in which the load lags may fall without bound either way.)
+    of a loop in which the load lags may fall without bound in either direction.)
     """
     given = tuple(effects)
     left = {

@@ -4,9 +4,9 @@ The error is the offset times a loop of unit height (`_unit`), which is what one
 
 The offset has a sign. Positive: the load is ahead in the direction of motion, and the error rises along
 the path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path.
-Then the load stands still until the gear has wound up the other way, so the fall is at most the gear's own
-slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the inverse takes
-it with a slope that it can invert (`gentle_tracker`).
+Then the load stands still until the gear has wound up in the other direction, so the fall is at most the
+gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the
+inverse takes it with a slope that it can invert (`gentle_tracker`).
 """
 
 from __future__ import annotations

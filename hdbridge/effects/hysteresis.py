@@ -81,7 +81,7 @@ class Hysteresis(ElasticLoop):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A motor angle taken apart where it turns round; see `branches`."""
+    """A motor angle cut at its reversals; see `branches`."""
 
     turning: tuple[int, ...]
     signs: tuple[int, ...]

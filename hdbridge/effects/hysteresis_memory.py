@@ -13,7 +13,7 @@ been. This law has the same branch, offset, width and exponent, with Masing's ru
 g is concave, so the same law is a Prandtl-Ishlinskii sum of stop operators with thresholds up to half the
 width.
 
-**In a model it stands in place of `hysteresis`** (`replaces`), not beside it: as a difference it would fall
+**In a model it stands in place of `hysteresis`** (`replaces`), not in addition: as a difference it would fall
 infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
 """
 

@@ -28,7 +28,7 @@ class HysteresisParameters(Effect):
     """The loop with new parameters less the loop with the model's (`base`).
 
     It names a change. When a model is extended by it, it does not become an entry of its own: the model's
-    loop takes over the new parameters (`combine.extended`). As an entry beside the model's loop it would
+    loop takes over the new parameters (`combine.extended`). As an entry of its own it would
     predict the same, but a difference of loops falls infinitely steeply where the old one rises, so that the
     compensation cannot invert it.
     """

@@ -1,4 +1,4 @@
-"""Further orders of the motor angle, beside those that the synchronous part of the model has."""
+"""Further orders of the motor angle, in addition to those that the synchronous part of the model has."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Wear(Linear):
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The crossing at full height (where it crosses downwards), and the growth along the way."""
+        """The crossing at full height (where it crosses downwards), and the growth with the travel."""
         crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
         return crossing + self._fastest_growth()
 

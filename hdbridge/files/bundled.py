@@ -1,7 +1,7 @@
 """Where the profiles and EDS files that come with hdbridge lie.
 
 In an installed wheel that is ``hdbridge/_bundled``; in a working copy they are the folders ``eds`` and
-``profiles`` beside the package.
+``profiles`` next to the package.
 """
 
 from __future__ import annotations

@@ -295,7 +295,7 @@ class Room:
         self.notes: list[str] = []
         self._axis = axis
         self._back_deg = precondition_deg / axis.ratio
-        # On either side: what a pre-conditioning move needs beyond the way itself.
+        # On either side: what a pre-conditioning move needs beyond the travel itself.
         self._half_deg = 0.5 * (limits.position_max_deg - limits.position_min_deg) - 1.01 * self._back_deg
         if self._half_deg * axis.ratio < SMALLEST_TRAVEL_DEG:
             least = 2.0 * (SMALLEST_TRAVEL_DEG / axis.ratio + 1.01 * self._back_deg)
@@ -305,7 +305,7 @@ class Room:
             )
 
     def half(self, name: str, what: str, wanted_deg: float) -> float:
-        """Half a way about the middle, load degrees."""
+        """Half the travel about the middle, load degrees."""
         if wanted_deg <= self._half_deg:
             return wanted_deg
         self.notes.append(

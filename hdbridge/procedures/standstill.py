@@ -39,7 +39,7 @@ class Standstill:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Stand at a pose that recurs, approached the same way each time: what changes there is drift."""
+    """Stand at a pose that recurs, approached from the same side each time: what changes there is drift."""
 
     load_deg: float = 0.0
     duration_s: float = 1.5

@@ -28,7 +28,7 @@ class SteppingOutcome:
     cw: tuple[Standing, ...]
     """The first pass, towards positive angles."""
     ccw: tuple[Standing, ...]
-    """The way back."""
+    """The steps back."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,7 +154,7 @@ class Late:
 
     @property
     def deg(self) -> float:
-        """The angle as late as it is."""
+        """The delayed angle."""
         return self._angles[1] + (self._angles[0] - self._angles[1]) * self._part
 
 
@@ -169,7 +169,7 @@ def fixed_errors(truth: TrueEncoder) -> tuple[ReadingError, ...]:
 
 
 class Body:
-    """What moves the load encoder's body against its shaft, by the way the shaft has come.
+    """What moves the load encoder's body against its shaft, by the travel of the shaft.
 
     It has a state, so it is led once per substep, and read as often as one likes.
     """

@@ -69,7 +69,7 @@ class Exercise:
         """Move by a distance; the speed rises and falls as half a cosine with that highest acceleration."""
         distance = abs(distance_deg)
         ramp_s = 0.5 * math.pi * speed_deg_s / acceleration_deg_s2
-        if speed_deg_s * ramp_s > distance:  # short: it turns round before it is up to speed
+        if speed_deg_s * ramp_s > distance:  # short: it brakes before it is up to speed
             ramp_s = math.sqrt(0.5 * math.pi * distance / acceleration_deg_s2)
         speed = min(speed_deg_s, distance / ramp_s if ramp_s else speed_deg_s)
         even_s = max(0.0, distance / speed - ramp_s) if speed else 0.0

@@ -23,7 +23,7 @@ class Faults:
     duplicate_tpdos: int = 0
     """The next n come twice."""
     hold_tpdos: int = 0
-    """The next n come one SYNC late, after the fresh ones."""
+    """The next n come delayed by one SYNC, after the fresh ones."""
     mute_heartbeat: bool = False
     """The heartbeat stops, the rest goes on."""
     silent: bool = False

@@ -97,7 +97,7 @@ class LoadOrders:
 
 
 class ElasticHysteresis:
-    """The elastic part, by the way the motor has come."""
+    """The elastic part, by the travel of the motor."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     __slots__ = ("_advance",)

@@ -1,4 +1,4 @@
-"""Causes of transmission error in the gear, beside its orders and its hysteresis; see `hdbridge.sim.gear`.
+"""Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
 Each piece is asked once per substep, in order of time, so those with a state advance by one substep.
 """
@@ -24,7 +24,7 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 
 class Flank:
-    """Which flank of the teeth carries: -1 to 1, by the way the motor has come."""
+    """Which flank of the teeth carries: -1 to 1, by the travel of the motor."""
 
     __slots__ = ("_last_deg", "_share", "_shift_deg", "_travel_deg")
 
@@ -96,7 +96,7 @@ class WarmthFactor:
 
 
 class Wear:
-    """Lost motion between the teeth: the output lags in either direction, by what the way run has worn."""
+    """Lost motion between the teeth: the output lags in either direction, by what its travel has worn."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     __slots__ = ("_exponent", "_follower_deg", "_last_deg", "_per_1000", "_ratio", "_turns")

@@ -1,4 +1,4 @@
-"""Elastic hysteresis of the gear: how far its output is ahead, by the way the motor has come.
+"""Elastic hysteresis of the gear: how far its output is ahead, by the travel of the motor.
 
 Each law is rate-independent and advances from one motor angle to the next. The output is ahead in the
 direction of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.

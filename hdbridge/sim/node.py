@@ -63,7 +63,7 @@ class SimulatedDrive:
     """A CiA-402 drive on ``bus``, moving ``machine``.
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
-    the time of start; ``nameplate`` tells one drive from the next.
+    the time of start; ``nameplate`` distinguishes drives.
     ``poll`` must be called when frames may have come and at ``next_event_s``.
     """
 

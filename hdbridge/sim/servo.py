@@ -49,7 +49,7 @@ class Servo:
         self._dead_band = (servo.integral_dead_band + 0.5) * self._step_deg
         self._hunting_band = (servo.hunting_band + 0.5) * self._step_deg
         self.limit_nm = truth.motor.rated_torque_nm * servo.torque_limit_percent / 100.0
-        """Highest torque, either way."""
+        """Highest torque in either direction."""
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:

@@ -1,4 +1,4 @@
-"""The truth file's encoders: geometry of the disc, signals, late samples, counts lost."""
+"""The truth file's encoders: geometry of the disc, signals, delayed samples, counts lost."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class TrueRate(Part):
 
 
 class TrueWear(Part):
-    """Lost motion between the teeth, growing with the way that the motor has run."""
+    """Lost motion between the teeth, growing with the travel of the motor."""
 
     arcsec_per_1000_turns: float = Field(
         ge=0, le=36_000, description="lost motion in one direction after the first 1000 motor turns"
@@ -60,7 +60,7 @@ class TrueWear(Part):
 
 
 class TrueCreep(Part):
-    """A spring with a dashpot beside it (Kelvin-Voigt), in series with the gear."""
+    """A spring with a dashpot in parallel (Kelvin-Voigt), in series with the gear."""
 
     time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the element")
     amplitude_arcsec: float = Field(
@@ -106,7 +106,7 @@ class TrueSeat(Part):
 
 
 class TrueGear(Part):
-    """The harmonic gear: what its output does beside turning by motor angle / ratio."""
+    """The harmonic gear: what its output does in addition to turning by motor angle / ratio."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
     stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")
