@@ -263,7 +263,7 @@ def test_backlash_is_drawn_over_the_way_since_the_reversal():
 
 def test_a_cause_that_scales_the_ripple_is_drawn_as_a_scale():
     found = finding("torque_modulation")
-    chart = charts(page(found))["Change of the ripple, over the load torque, either way"]
+    chart = charts(page(found))["Change of the ripple, over the load torque, either direction"]
     torque, percent = series(chart, "the finding")
     assert percent == pytest.approx(found.effect.growth_percent_per_nm * torque, abs=0.05)
     measured = series(chart, "measured")[1]
