@@ -29,7 +29,7 @@ def started(folder, *arguments):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, number):
     process = started(tmp_path, *LONG, "--record", "kept")
-    time.sleep(0.5)
+    time.sleep(1.0)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
@@ -42,7 +42,7 @@ def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, nu
 
 def test_without_a_folder_the_loss_is_said(tmp_path):
     process = started(tmp_path, *LONG)
-    time.sleep(0.5)
+    time.sleep(1.0)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
