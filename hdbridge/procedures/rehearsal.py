@@ -36,7 +36,7 @@ def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.
             for edge in (path.lowest_deg, path.highest_deg):
                 if not limits.position_min_deg <= edge <= limits.position_max_deg:
                     raise InputError(
-                        f"{type(procedure).__name__} would move the load to {edge:.6g} deg; the axis file "
+                        f"this would move the load to {edge:.6g} deg; the axis file "
                         f"allows {limits.position_min_deg:g} to {limits.position_max_deg:g} (limits): "
                         "nothing was moved; choose fewer or smaller steps, or another start"
                     )
