@@ -49,9 +49,14 @@ def copy_bundled(source: str, folder: Path) -> list[Path]:
         if (origin / each).is_file():
             shutil.copyfile(origin / each, folder / each)
             written.append(folder / each)
-    text = (folder / "axis.yaml").read_text(encoding="utf-8")
-    write_atomically(folder / "axis.yaml", re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1))
+    _rename(folder / "axis.yaml", r"(?m)^name: .*$", f"name: {name}")
+    if (folder / "model.yaml").is_file():  # bound to the axis by its name: the copy's model is the copy's
+        _rename(folder / "model.yaml", r"(?m)^  axis: .*$", f"  axis: {name}")
     return written
+
+
+def _rename(file: Path, line: str, written: str) -> None:
+    write_atomically(file, re.sub(line, written, file.read_text(encoding="utf-8"), count=1))
 
 
 def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) -> list[Path]:
