@@ -1,6 +1,7 @@
 """What all tests share: no test asserts wall-clock time, Hypothesis included."""
 
 import os
+import signal
 
 from hypothesis import HealthCheck, settings
 
@@ -11,3 +12,8 @@ slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_s
 settings.register_profile("same", slow_machines, derandomize=True)
 settings.register_profile("random", slow_machines)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+# A script without job control starts what it puts into the background deaf to Ctrl-C, children included.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
