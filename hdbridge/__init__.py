@@ -93,7 +93,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*(each for each in globals() if each.startswith("__")), *__all__})
 
 
 class _FrontDoor(ModuleType):

@@ -142,6 +142,9 @@ def _hdbridge(
 
 def main() -> None:
     """Run the command line; errors raised on purpose are one line and their exit status."""
+    for name in ("stdout", "stderr"):  # closed by who started it: printed to nobody
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=plain.HANDLER)
@@ -159,7 +162,7 @@ def main() -> None:
         status = InputError.exit_status
     except typer.Abort:
         status = 130
-    except BrokenPipeError:  # `hdbridge ... | head`: who reads has had enough
+    except (BrokenPipeError, SystemExit):  # `hdbridge ... | head`, which typer makes an exit of
         _close_output()
         status = 0
     except OSError as error:

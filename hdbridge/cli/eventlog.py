@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from hdbridge.errors import InputError
+from hdbridge.files.outputs import Kind, Output, check_outputs
 
 _ROOT = logging.getLogger("hdbridge")
 
@@ -46,6 +47,7 @@ def begin(verbose: int, path: Path | None) -> None:
         people.setLevel(logging.INFO if verbose == 1 else logging.DEBUG)
         _ROOT.addHandler(people)
     if path is not None:
+        check_outputs([Output("--log", path, Kind.LOG)])
         try:
             machines = logging.FileHandler(path, encoding="utf-8")
         except OSError as problem:

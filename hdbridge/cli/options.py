@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,9 +28,17 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig
 
-console = Console(highlight=False)
+
+class _Console(Console):
+    """One whose reader may go away (`| head`): the command goes on, and what it prints then is nobody's."""
+
+    def on_broken_pipe(self) -> None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+console = _Console(highlight=False)
 """Tables for people: standard output."""
-notes = Console(stderr=True, highlight=False)
+notes = _Console(stderr=True, highlight=False)
 """Progress and remarks: standard error, so that they do not get into a pipe."""
 
 

@@ -30,12 +30,18 @@ class Kind(Enum):
     JSON = r'\s*\{\s*"schema": "hdbridge\.'
     PAGE = r"(?s).*<!doctype html>"
     MODEL = r"(?sm).*^schema: hdbridge\.model/"
+    LOG = r'\{"date": "'
     FOLDER = "a folder"
 
     @property
     def words(self) -> str:
         """For complaints."""
-        return {Kind.JSON: "a result of hdbridge", Kind.PAGE: "a page", Kind.MODEL: "a model file"}[self]
+        return {
+            Kind.JSON: "a result of hdbridge",
+            Kind.PAGE: "a page",
+            Kind.MODEL: "a model file",
+            Kind.LOG: "a log of hdbridge",
+        }[self]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +109,7 @@ def _check_file(
     _check_belongs_to_no_folder(output)
     if found is not None and found.st_size and not re.match(output.kind.value, _head(path)):
         raise InputError(
-            f"{path}: {output.option} would overwrite this file, which is not {output.kind.words}; expected "
+            f"{path}: {output.option} would write into this file, which is not {output.kind.words}; expected "
             "a new file, or one that may be replaced: remove it first"
         )
 
@@ -146,10 +152,17 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
                     f"{folder}: {output.option} would write into a folder that is not empty (it has "
                     f"{first}); expected a new or an empty one{begun}"
                 )
+    place = _resolved(folder)
+    for each in (place, *place.parents):
+        if each.name.casefold() == "history" and (each.parent / "axis.yaml").exists():
+            raise InputError(
+                f"{folder}: {output.option} would write into the history of the profile {each.parent}; "
+                "expected another folder"
+            )
     for each in inputs:
         if _same(folder, each):
             raise InputError(f"{folder}: {output.option} is what this command reads; expected a new folder")
-    existing = _resolved(folder)
+    existing = place
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():

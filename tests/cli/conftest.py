@@ -44,7 +44,7 @@ def unread(tmp_path):
         reader, writer = os.pipe()
         os.close(reader)
         with os.fdopen(writer, "w") as broken:
-            return subprocess.run(
+            done = subprocess.run(
                 [sys.executable, "-m", "hdbridge", *map(str, arguments)],
                 cwd=tmp_path,
                 stdout=broken,
@@ -52,7 +52,9 @@ def unread(tmp_path):
                 text=True,
                 timeout=120,
                 check=False,
-            ).stderr
+            )
+        assert done.returncode == 0, done.stderr
+        return done.stderr
 
     return run
 

@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 ENTRY = "import sys; sys.argv[0] = 'hdbridge'; from hdbridge.cli import main; main()"
 
 
@@ -35,7 +37,18 @@ def test_a_log_is_continued(hdbridge, tmp_path):
 def test_a_log_that_cannot_be_written_is_refused(hdbridge):
     done = hdbridge("--log", "nowhere/bus.jsonl", "check", "article")
     assert done.returncode == 2
-    assert "nowhere/bus.jsonl: cannot be written: No such file or directory" in done.stderr
+    assert "nowhere/bus.jsonl: cannot be written: there is no folder" in done.stderr
+
+
+@pytest.mark.parametrize("file", ["axis.yaml", "model.yaml", "notes.txt"])
+def test_a_log_is_appended_to_no_other_file(hdbridge, profile, file):
+    place = profile.folder / file
+    if not place.exists():
+        place.write_text("mine\n")
+    before = place.read_text()
+    done = hdbridge("--log", place, "check", profile.folder)
+    assert done.returncode == 2
+    assert place.read_text() == before
 
 
 def test_v_tells_on_standard_error_and_vv_tells_every_transfer(hdbridge):

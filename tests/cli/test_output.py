@@ -93,6 +93,20 @@ def test_a_reader_that_goes_away_is_no_error_and_the_result_is_whole(unread, tmp
     assert json.loads((tmp_path / "out.json").read_text())["schema"].startswith("hdbridge.")
 
 
+@pytest.mark.parametrize("arguments", [("--help",), ("check", "--help"), ("check", "article", "--json", "-")])
+def test_a_reader_that_goes_away_from_help_and_json_is_no_error(unread, arguments):
+    assert unread(*arguments) == ""
+
+
+def test_a_closed_standard_output_is_no_error(tmp_path):
+    line = f'exec "{sys.executable}" -m hdbridge check article --json out.json >&-'
+    done = subprocess.run(
+        ["sh", "-c", line], stderr=subprocess.PIPE, text=True, timeout=120, check=False, cwd=tmp_path
+    )
+    assert (done.returncode, done.stderr) == (0, "wrote out.json\n")
+    assert json.loads((tmp_path / "out.json").read_text())["axis"] == "article"
+
+
 @pytest.mark.parametrize(("slow", "arguments"), [("typer", ("--help",)), ("numpy", ("step", "--help"))])
 def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path, slow, arguments):
     """An import that never ends stands for a slow one."""

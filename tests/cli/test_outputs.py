@@ -66,6 +66,7 @@ def bench(tmp_path, profile):
         ("model log p --json p/history/0001.yaml", "of the profile"),
         ("calibrate p --simulate --out p", "not empty"),
         ("calibrate p --simulate --out p/history", "not empty"),
+        ("calibrate p --simulate --out p/history/new", "the history of the profile"),
         ("calibrate p --simulate --out one.csv/x", "one.csv is not a folder"),
         ("step p --simulate --count 2 --record rec", "not empty"),
         ("demo --count 2 --out rec", "not empty"),

@@ -27,6 +27,12 @@ def test_every_name_is_there_and_says_what_it_is(name):
     assert name in dir(hdbridge)
 
 
+def test_nothing_else_is_shown():
+    """Whatever was loaded before: what completes `hdbridge.` is the front door."""
+    shown = python("import hdbridge.diagnose, hdbridge.axis, hdbridge; print(*dir(hdbridge))").split()
+    assert [each for each in shown if not each.startswith("__")] == sorted(hdbridge.__all__)
+
+
 def test_another_name_is_refused_as_python_does():
     with pytest.raises(AttributeError, match="no attribute 'Brench'"):
         hdbridge.Brench  # noqa: B018
