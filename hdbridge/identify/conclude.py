@@ -86,7 +86,15 @@ def conclude(
         residual_tests=residual_tests(
             solution.residual, blocks, precision, lines, {str(each) for each in selection.chosen}, figures
         ),
-        held_out=held_out(problem, solution, state.noise, active, measured, inside),
+        held_out=held_out(
+            problem,
+            solution,
+            state.noise,
+            active,
+            measured,
+            inside,
+            against="the active model" if options.active else "no model",
+        ),
         traces=_traces(design, solution, zeros, written),
         warnings=tuple(warnings),
     )

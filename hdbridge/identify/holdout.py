@@ -33,12 +33,13 @@ def held_out(
     active_arcsec: FloatArray,
     measured_arcsec: FloatArray,
     inside_variance: float,
+    against: str,
 ) -> HeldOut:
     """Leave out one fold at a time.
 
     ``active_arcsec`` (b,) is what the active model predicts; ``measured_arcsec`` (b,) what was measured,
     before any delay was put right; ``inside_variance`` is what samples vary inside their blocks, which no
-    model of this kind changes.
+    model of this kind changes. ``against`` names in words what the active model is.
     """
     blocks = problem.design.blocks
     fold, over = folds(problem)
@@ -82,7 +83,7 @@ def held_out(
     assert result.gain is not None
     words = "improves on" if result.improves else "does not improve on"
     figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"
-    return replace(result, text=f"{words} the active model: {figures} on {over} left out")
+    return replace(result, text=f"{words} {against}: {figures} on {over} left out")
 
 
 def _told(problem: Problem, fit: Solution) -> FloatArray:
