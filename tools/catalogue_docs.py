@@ -47,13 +47,13 @@ What a gear does wrong, cause by cause: how it shows in a record, what it does t
 about it. The names are those of findings and of the model file's `effects`. The error is how far the load is
 ahead of motor angle / N, in arcsec at the load.
 
-- **Separate it** is the measurement that tells it from its look-alikes (*taken for*).
+- **Separate it** is the measurement that distinguishes it from its look-alikes (*taken for*).
 - **Compensated** says whether the compensation should make up for it. Errors of the measurement should not
   be: that would move the load away from where it should be. What cannot be foreseen cannot be.
-- **Needs** are the record's columns beside `motor_position_deg`. Speed, acceleration and direction are
-  derived: backward differences of the commanded motor angle over the samples' own time steps, the direction
-  held at rest; in the control loop those of the command before compensation. `load_deg` is the predicted
-  load angle.
+- **Needs** are the record's columns in addition to `motor_position_deg`. Speed, acceleration and direction
+  are derived: backward differences of the commanded motor angle over the samples' own time steps, the
+  direction held at rest; in the control loop those of the command before compensation. `load_deg` is the
+  predicted load angle.
 - Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a
   list of `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the
   effect modulates: `{offset_arcsec, width_deg, exponent, memory}`.

@@ -167,7 +167,7 @@ def judge_settling(
 def judge_stop(
     axis: AxisConfig, speed_deg_s: float, distance_deg: float, time_s: float, what: str, reaction_s: float
 ) -> Verdict:
-    """Did the axis stop in the time and way that its ramp allows? ``reaction_s`` may pass before it brakes.
+    """Did the axis stop in the time and travel that its ramp allows? ``reaction_s`` may pass before braking.
 
     Speed and distance are the motor's.
     """

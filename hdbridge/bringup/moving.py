@@ -114,7 +114,7 @@ def settling(context: BringUpContext) -> Verdict:
 
 
 def quick_stop(context: BringUpContext) -> Verdict:
-    """A quick stop in slow motion: way, time, and the state after it."""
+    """A quick stop in slow motion: travel, time, and the state after it."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():

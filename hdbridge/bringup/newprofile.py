@@ -60,7 +60,7 @@ def _rename(file: Path, line: str, written: str) -> None:
 
 
 def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) -> list[Path]:
-    """An axis file of what a drive says of itself, and its EDS beside it; what was written."""
+    """An axis file of what a drive says of itself, and its EDS next to it; what was written."""
     text = axis_text(_axis_name(folder), bus, node, eds.name if eds else "FILE.eds")
     if eds is not None and not eds.is_file():
         raise InputError(f"{eds}: there is no such file; expected the EDS file of the drive")

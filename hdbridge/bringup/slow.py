@@ -235,7 +235,7 @@ class SlowAxis:
     # -- stops --------------------------------------------------------------------------------------------
 
     def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
-        """Move, and quick stop half-way: the speed then, the way and the time it took (motor degrees, s)."""
+        """Move, and quick stop half-way: the speed then, travel and time of the stop (motor degrees, s)."""
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed = self._measured_speed(moved)
         stopping = self.stop()
@@ -297,7 +297,7 @@ class SlowAxis:
         return speed, result
 
     def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
-        """Move as far as half of the way, at full speed then; ``moving`` has more to give."""
+        """Move as far as half of the travel, at full speed then; ``moving`` has more to give."""
         begin = self._place_deg
         seen: list[Feedback] = []
         for feedback in moving:

@@ -172,7 +172,7 @@ def active_model(
 
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
-    """Result, model and what it was compared with, beside the recording that they come from."""
+    """Result, model and what it was compared with, next to the recording that they come from."""
     with writing():
         result.model.save(folder / MODEL_NAME)
         if result.active:

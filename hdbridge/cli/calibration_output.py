@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hdbridge.calibration.result import Offer
 
 TAKEN_OFF = 0.95
-"""What was fitted beside a model (a delay, orders of the load) is told where this share is left, or less."""
+"""What was fitted in addition to a model (a delay, load orders) is told where this share is left, or less."""
 
 
 def print_calibration(result: Calibration) -> None:
@@ -104,7 +104,7 @@ def _title(result: Calibration) -> str:
 
 
 def print_stepping(checked: Validation) -> None:
-    """The stepping test with the model before and with the new one, beside the floor of the axis."""
+    """The stepping test with the model before and with the new one, next to the floor of the axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)

@@ -131,7 +131,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """What is known of a finding beside its line in the table; nothing for one that says nothing more."""
+    """What is known of a finding in addition to its line in the table; nothing where there is no more."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")

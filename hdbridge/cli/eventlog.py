@@ -1,7 +1,7 @@
 """What hdbridge does on the bus, for whoever has to find out why: on standard error, or as lines of JSON.
 
-The library tells events through `logging`: a name, and a dictionary of facts. None is told from within the
-control cycle; what happened there is told when the axis rests.
+The library tells events through `logging`: a name, and a dictionary of facts. None is logged within the
+control cycle; what happened there is logged when the axis rests.
 """
 
 from __future__ import annotations

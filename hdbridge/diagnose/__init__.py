@@ -1,4 +1,4 @@
-"""How a simulation differs from a measurement, the physical cause by its name, and what extending the
+"""How a model differs from a measurement, the physical cause by its name, and what extending the
 model gains.
 
 `diagnose` takes a record and a model and returns a `Diagnosis`: findings, what the data could and could

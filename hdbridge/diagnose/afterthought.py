@@ -2,7 +2,7 @@
 
 A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. A merge
 does so with two findings that are kin: one cause that explains what they do is more likely than both. Wear is
-fitted from several widths. Pruning takes out what no longer earns its keep beside the others.
+fitted from several widths. Pruning takes out what no longer earns its keep among the others.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
 
 
 def _pruned(search: Search, fitted: Fitted) -> Fitted:
-    """Without what no longer earns its keep beside the others."""
+    """Without what no longer earns its keep among the others."""
     while len(fitted.theory.effects) > search.base:
         gains = {}
         for place in range(search.base, len(fitted.theory.effects)):

@@ -2,7 +2,7 @@
 screened for.
 
 Four causes have too many shapes for a grid and are sought by `seek.py`: lost counts, vibration, interpolation
-errors, local defects. The elastic law is chosen beside all of them (`search.py`).
+errors, local defects. The elastic law is chosen together with all of them (`search.py`).
 """
 
 from __future__ import annotations

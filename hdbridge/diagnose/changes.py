@@ -53,7 +53,7 @@ def findings(
     for place, (given, now) in enumerate(zip(model.effects, precise.theory.effects, strict=False)):
         if isinstance(given, Hysteresis | HysteresisMemory):
             if workshop.evidence.reversals < 2:
-                continue  # a loop shows only where the axis turns round
+                continue  # a loop shows only where the axis reverses
             found = _law(workshop, trail, precise, place, given, now, spread)
         elif isinstance(given, Synchronous):
             found = _orders(workshop, precise, place, given, now, spread)
@@ -127,7 +127,7 @@ def _law(
 
 
 def _lawless_arcsec(workshop: Workshop, fitted: Fitted) -> float:
-    """What a loop of free form does beside the law, peak; 0 where the law does as well."""
+    """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
     searched = workshop.nuisance
     if not searched.shape[1]:
         return 0.0

@@ -58,12 +58,12 @@ LEADS = 3.5
 LINES = frozenset({"subdivisional_error", "vibration"})
 """Causes that are one sharp line of a spectrum."""
 LOOP_EXPLAINS = 0.3
-"""A loop of another shape accounts for what is left when the way since the reversal foretells this share
+"""A loop of another shape accounts for what is left when the travel since the reversal foretells this share
 of it."""
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 PARTED = 0.2
-"""Share of a period by which two orders have to part to be told apart, whatever else is not quite right: some
-ten motor turns for order 2 at a ratio of 100."""
+"""Share of a period by which two orders have to part to be distinguished, whatever else is not quite right:
+some ten motor turns for order 2 at a ratio of 100."""
 LOW_SHARE = 0.8
 """Orders 1 and 2 that make up more than this share of the squares may be the motor encoder's own."""
 
@@ -249,7 +249,7 @@ class _Judge:
         return fitted, considered
 
     def _without_doubtful(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
-        """Take out names that do less than what is left unexplained beside them: it may well be its
+        """Take out names that do less than what is left unexplained in addition: it may well be its
         shadow.
         """
         considered: list[str] = []

@@ -213,7 +213,7 @@ def _series(
         for rows in rows_of
     ]
     driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
-    driving.setflags(write=False)  # so that where it turns round is worked out once
+    driving.setflags(write=False)  # so that where it reverses is worked out once
     # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
     angle = driving if target is not None else record.motor_position_deg
     error = (record.load_position_deg - angle / ratio) * ARCSEC_PER_DEG

@@ -1,8 +1,8 @@
 """The next experiment: the shortest that separates what the data leave open.
 
-Two menus. `next_experiment` and `for_unexplained` say in words what would tell a cause from its look-alikes,
-also what only a person can do (move a mass, re-clock an encoder). `machine_plans` are the experiments that
-the axis can do by itself; which of them separates a pair is not written here but predicted
+Two menus. `next_experiment` and `for_unexplained` say in words what would distinguish a cause from its
+look-alikes, also what only a person can do (move a mass, re-clock an encoder). `machine_plans` are the
+experiments that the axis can do by itself; which of them separates a pair is not written here but predicted
 (`hdbridge.diagnose.planned`).
 """
 
@@ -129,7 +129,7 @@ def machine_plans() -> dict[str, Plan]:
 
 
 def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
-    """The shortest experiment that tells the cause from its aliases; without aliases, the one that
+    """The shortest experiment that distinguishes the cause from its aliases; without aliases, the one that
     confirms it.
     """
     known = [_PAIRS[frozenset({cause, each})] for each in aliases if frozenset({cause, each}) in _PAIRS]
@@ -170,7 +170,7 @@ _UNEXPLAINED: Final[dict[str, tuple[str, str]]] = {
         "reference-pose",
     ),
 }
-"""By the coordinate that it lives in: in words, and what the machine can do of it."""
+"""By the coordinate that it depends on: in words, and what the machine can do of it."""
 
 
 def _coordinate(lives_in: str) -> str:

@@ -58,7 +58,7 @@ def extended_model(
 ) -> TransmissionModel:
     """``model`` with the fitted baseline (`supported`) and the findings at ``places`` of the theory.
 
-    What else the theory holds was fitted beside them and is not written: it was not named.
+    What else the theory holds was fitted in addition to them and is not written: it was not named.
     """
     ratio = model.ratio
     effects: tuple[Effect, ...] = tuple(_tidy(each, ratio) for each in fitted.theory.effects[:base])

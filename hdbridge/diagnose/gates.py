@@ -43,7 +43,7 @@ LEAST_CREEP_ARCSEC = 0.25
 """A gear that creeps does so for seconds: what is over so soon after a stop, or is smaller then, is the
 settling of load and servo, or the end of a loop that depends on speed."""
 BEND = 0.6
-"""A ramp of which the slope in some third of the way differs by more than this share is none."""
+"""A ramp of which the slope in some third of the travel differs by more than this share is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,14 +140,14 @@ def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
 
 
 def all_steps_seen(workshop: Workshop, fitted: Fitted, place: int) -> bool:
-    """Whether each step of a `count_loss` is seen, and none is what another cause leaves beside it."""
+    """Whether each step of a `count_loss` is seen, and none is what another cause leaves in its place."""
     steps = range(len(fitted.theory.effects[place].coefficients()))
     robust = [robust_chi_square(workshop, fitted, place, only=each) for each in steps]
     return min(robust) > max(ROBUST, STEP_SHARE * max(robust))
 
 
 def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:
-    """Whether a ramp has another slope in some third of the way: a wrong ratio has the same everywhere."""
+    """Whether a ramp has another slope in some third of the travel: a wrong ratio has the same everywhere."""
     angle = workshop.motion.motor_deg[workshop.index]
     low, span = float(np.min(angle)), float(np.ptp(angle))
     hinges = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
@@ -194,7 +194,7 @@ def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:
 
 
 def since_reversal(motor_deg: FloatArray) -> FloatArray:
-    """Motor angle since the axis last turned round (or began), degrees, shape (n,)."""
+    """Motor angle since the axis last reversed (or began), degrees, shape (n,)."""
     turning, _ = branches(motor_deg)
     result = np.zeros(len(motor_deg))
     if len(turning) > 1:

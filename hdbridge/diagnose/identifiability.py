@@ -29,9 +29,9 @@ from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import orders_from
 
 ENOUGH = 8_000
-"""Points that are enough to tell shapes apart."""
+"""Points that are enough to distinguish shapes."""
 NOT_APART = 0.95
-"""Canonical correlation from which on two causes cannot be told apart."""
+"""Canonical correlation from which on two causes cannot be distinguished."""
 SHARE_LEFT = 1e-4
 WORST_ARCSEC = 30.0
 """A cause whose limit is higher than this counts as not detectable."""

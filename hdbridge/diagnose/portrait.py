@@ -1,6 +1,6 @@
-"""The portrait of a finding: the residual without it, over the coordinate in which its cause lives.
+"""The portrait of a finding: the residual without it, over the coordinate that its cause depends on.
 
-Everything else that was found stays in the simulation, so what is seen is this finding alone, with the noise.
+Everything else that was found stays in the model, so what is seen is this finding alone, with the noise.
 A cause that scales what the model has (ripple that grows with torque, a loop that grows with speed) is seen
 as a scale over that coordinate, by least squares in each bin.
 """
@@ -81,7 +81,7 @@ class Portrait:
 
     coordinate: Coordinate
     residual_arcsec: FloatArray
-    """Measurement less the simulation with everything but this finding."""
+    """Measurement less the model with everything but this finding."""
     own_arcsec: FloatArray | None
     """What the finding does; None where it has no law."""
     rows: BoolArray
@@ -164,7 +164,7 @@ def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
 
 
 def _own_coordinate(effect: Effect | None, traces: Traces, ratio: float) -> Coordinate | None:
-    """Of a cause that lives in none of the usual ones."""
+    """Of a cause that depends on none of the usual ones."""
     motion, rows = traces.motion, traces.rows
     if isinstance(effect, SubdivisionalError):
         division = DEG_PER_TURN / effect.lines_per_turn

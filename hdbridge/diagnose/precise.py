@@ -1,10 +1,10 @@
-"""The fit that parameters are taken from: what else moves the load beside the theory is allowed for.
+"""The fit that parameters are taken from: what else moves the load in addition to the theory is allowed for.
 
 A tooth error shakes the load on its spring and the motor in its servo, and both answer the more the faster:
-well below the resonances in phase by the square of the frequency, and late by its cube. A search does without
-this, for it names nothing; but it makes orders a per cent too large or too small at one turn a second, where
-their noise is a tenth of that. The free-form loop of a search is left out: it is no part of any model, and
-what it takes over would be missing in the loop's own parameters.
+well below the resonances in phase by the square of the frequency, and lagging by its cube. A search does
+without this, for it names nothing; but it makes orders a per cent too large or too small at one turn a
+second, where their noise is a tenth of that. The free-form loop of a search is left out: it is no part of any
+model, and what it takes over would be missing in the loop's own parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _RATE: Final = 30.0
 
 
 def precisely(workshop: Workshop, fitted: Fitted) -> Fitted:
-    """The same theory fitted beside what its waves shake, with the tangents of all shapes.
+    """The same theory fitted together with what its waves shake, with the tangents of all shapes.
 
     What its waves shake is left out where the record has one speed only: it is part of the orders there.
     """
@@ -60,7 +60,7 @@ def _with_found(workshop: Workshop, fitted: Fitted) -> Fitted:
 
 
 def _shaken(workshop: Workshop, fitted: Fitted) -> FloatArray:
-    """In phase by the square of the frequency, and late by its cube; shape (m, 2), or (m, 0) without orders.
+    """In phase by the square of frequency, lagging by its cube; shape (m, 2), or (m, 0) without orders.
 
     The second is odd in the direction, as a lag is.
     """

@@ -25,7 +25,7 @@ CAP = 0.6
 STRONG = 2.5
 """Evidence beyond twelve times the needed says that something is there, not what it is."""
 MOST_EXCESS = 1.5
-"""Beyond this, what counts is how much is left beside a finding and not how quiet the record is."""
+"""Beyond this, what counts is how much is left in addition to a finding and not how quiet the record is."""
 COEFFICIENTS: Final = {
     "constant": -2.80,
     "strength": 1.88,
@@ -66,7 +66,7 @@ class Beside:
     excess: float
     """Chi square per point of the whole fit."""
     free_loop: bool
-    """Whether a loop of free form had to stand beside the law."""
+    """Whether a loop of free form had to be added to the law."""
     unexplained: bool
 
 

@@ -2,7 +2,7 @@
 
 Ripple and loop that grow with warmth can be told at any temperature: amplitudes and growth at another one are
 others, and the sum is the same. It is told where the amplitudes are those of the model. At any other
-temperature the drift would look like a change of the model's own orders, or of its loop, beside it.
+temperature the drift would look like a change of the model's own orders, or of its loop, in addition to it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SAME = 10.0
 
 
 def as_calibrated(workshop: Workshop, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
-    """With the drift of amplitudes told from the temperature at which they are those of the ``given`` model.
+    """The drift of amplitudes, counted from the temperature at which they are the ``given`` model's.
 
     As it was, where there is no such temperature near those of the record.
     """

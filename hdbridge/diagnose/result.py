@@ -21,7 +21,7 @@ SCHEMA = "hdbridge.diagnosis/1"
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """How far measurement and simulation are apart."""
+    """How far measurement and model are apart."""
 
     rms_arcsec: float
     three_sigma_arcsec: float
@@ -49,14 +49,14 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One thing that the simulation gets wrong."""
+    """One thing that the model gets wrong."""
 
     cause: str
     """A name of the catalogue, or ``unexplained``."""
     probability: float
     """That this cause, or one of its aliases, is there."""
     aliases: tuple[str, ...]
-    """Other causes that these data cannot tell from it."""
+    """Other causes that these data cannot distinguish from it."""
     parameters: Mapping[str, Parameter]
     gain: Gain | None
     """On held-out data, everything else refitted; None where nothing was held out."""
@@ -136,7 +136,7 @@ class Identifiability:
     detection_limit_arcsec: float | None
     """Smallest peak that would be named; None where nothing of it can be seen."""
     aliases: tuple[str, ...]
-    """Causes that it could not be told from in this record."""
+    """Causes that it could not be distinguished from in this record."""
     share_left: float
     """Share of its square that the baseline does not take over."""
     reason: str = ""
@@ -155,7 +155,7 @@ class Identifiability:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Arrays for pictures, one length: simulation beside measurement on the same trajectory."""
+    """Arrays for pictures, one length: model next to measurement on the same trajectory."""
 
     time_s: FloatArray
     motor_deg: FloatArray
@@ -187,7 +187,7 @@ class Traces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """How a simulation differs from a measurement, and why."""
+    """How a model differs from a measurement, and why."""
 
     baseline: Figures
     """Of the model as it was given."""

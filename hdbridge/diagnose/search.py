@@ -47,7 +47,7 @@ PAIR_SHARE = 0.9
 """Two causes at once in place of one, or none, have to leave less than this share of what it leaves."""
 WITH_SPEED = frozenset({"velocity_windup", "channel_skew", "rate_dependence"})
 FREE_LOOP_ARCSEC = 0.2
-"""Root mean square that a free-form loop has to take away to stand beside the law."""
+"""Root mean square that a free-form loop has to take away to be added to the law."""
 SLOW = 0.8
 """A third pick that leaves more than this of a large rest is the last."""
 EXTRAPOLATED = 2.0
@@ -78,8 +78,8 @@ ORDINARY_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
 """Every axis winds up a little in its fastest moves, and no two encoders are read at the same instant: it is
 allowed for, and a finding when it is more than that."""
 LATE_MS2, LATE_SHARE = 30.0, 4.0
-"""A late sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz and
-more) it is at most so many ms^2 and so many times the delay squared."""
+"""A delayed sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz
+and more) it is at most so many ms^2 and so many times the delay squared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +110,7 @@ class Search:
 
     def _choose_sign(self) -> None:
         """Let the load lag where the model has it lead, or the other way round, where that explains more than
-        a loop of the model's sign with the best cause beside it (play lags, too).
+        a loop of the model's sign with the best cause added to it (play lags, too).
         """
         if self.workshop.evidence.reversals < 2:
             return
@@ -187,7 +187,7 @@ class Search:
         return fitted, 0.0
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
-        """With a hysteresis of any shape beside the law, where that does more than the best cause."""
+        """With a hysteresis of any shape added to the law, where that does more than the best cause."""
         self.workshop.nuisance = self.workshop.free_loop(fitted.theory.start)
         loose = self.workshop.fit(fitted.theory)
         added = loose.free() - fitted.free()
@@ -202,7 +202,7 @@ class Search:
     # --- one more cause
 
     def forget(self) -> None:
-        """Candidates that were refused beside other findings are looked at again."""
+        """Candidates that were refused with other findings in the fit are looked at again."""
         self._refused.clear()
 
     def best_addition(self, fitted: Fitted) -> Fitted | None:
@@ -215,7 +215,7 @@ class Search:
             added = trial.free() - fitted.free()
             net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
             if score.candidate.cause == "flexspline_order" and self._travel_turns() < 1.0:
-                net *= SHORT_TRAVEL  # not told from the motor's order there, which is the commoner
+                net *= SHORT_TRAVEL  # not distinguished from the commoner motor's order there
             key = _key(score.candidate.effect)
             if net <= 0.0 or not self._counts(trial, score.candidate):
                 self._refused.add(key)
@@ -280,8 +280,8 @@ class Search:
             return False
         if not isinstance(effect, Creep | CountLoss):
             return True
-        # What is over at once, or seen only where the axis turns round, is another cause's, which would not
-        # be found beside it.
+        # What is over at once, or seen only where the axis reverses, is another cause's, which would not
+        # be found with it in the fit.
         if not gate(self.workshop, trial, place).passed:
             return False
         return isinstance(effect, Creep) or all_steps_seen(self.workshop, trial, place)
@@ -402,12 +402,12 @@ def _stiffens(effect: Compliance) -> bool:
 
 
 def _late(effect: ChannelSkew) -> bool:
-    """Whether a part in speed and one in acceleration can be those of one late sample."""
+    """Whether a part in speed and one in acceleration can be those of one delayed sample."""
     return abs(effect.second_order_ms2) <= LATE_MS2 + LATE_SHARE * effect.delay_ms**2
 
 
 def _key(effect: Effect) -> object:
-    """What tells one candidate from another: its kind and, for orders, the orders."""
+    """What distinguishes one candidate from another: its kind and, for orders, the orders."""
     if isinstance(effect, OrderSeries):
         return (effect.name, tuple(each.order for each in effect.orders))
     if isinstance(effect, Compliance):

@@ -1,4 +1,4 @@
-"""Seeing: what a simulation gets wrong, over every coordinate in which a cause may live.
+"""Seeing: what a model gets wrong, over every coordinate that a cause may depend on.
 
 A residual is looked at over motor angle, load angle, direction, speed, acceleration, torque, temperature,
 time and what has passed since the last reversal: means over bins, and how much of the residual they foretell.
@@ -196,7 +196,7 @@ def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
 
 
 def since_reversal(motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Motor angle (degrees) and time (s) since the axis last turned round or the record began, shape (n,)."""
+    """Motor angle (degrees) and time (s) since the axis last reversed or the record began, shape (n,)."""
     angle = motion.motor_deg
     time = _time(motion)
     turning = np.asarray(branches(angle)[0][:-1] or [0], dtype=np.intp)
@@ -205,7 +205,7 @@ def since_reversal(motion: Motion) -> tuple[FloatArray, FloatArray]:
 
 
 def since_change_s(motion: Motion) -> FloatArray:
-    """Time since the axis last stopped, started or turned round, seconds, shape (n,)."""
+    """Time since the axis last stopped, started or reversed, seconds, shape (n,)."""
     speed, time = motion.motor_speed_deg_s, _time(motion)
     assert speed is not None, "a diagnosis gives its motion the speed"
     change = np.flatnonzero(np.diff(np.sign(speed), prepend=np.nan) != 0.0)

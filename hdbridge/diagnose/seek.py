@@ -25,7 +25,7 @@ LEAST_LINES = 256
 LOWEST_HZ = 0.3
 PEAKS = 3
 FOOT_LINES = 50.0
-"""Lines of the record's resolution beside a vibration that are taken for its feet."""
+"""Lines of the record's resolution next to a vibration that are taken for its feet."""
 LINE_OVER_MEAN = 12.0
 """A line is looked at when its power is so many times the mean: noise alone reaches 11 in 65,000 lines."""
 
@@ -53,7 +53,7 @@ def count_loss(workshop: Workshop, fitted: Fitted) -> Candidate | None:
 
 
 def local_defect(workshop: Workshop, fitted: Fitted) -> Candidate | None:
-    """The best bump; it must lie on several passes, and not cover most of the way."""
+    """The best bump; it must lie on several passes, and not cover most of the travel."""
     ratio = workshop.evidence.ratio
     load = workshop.motion.motor_deg[workshop.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
@@ -89,7 +89,7 @@ def local_defect(workshop: Workshop, fitted: Fitted) -> Candidate | None:
 def is_met(effect: LocalDefect, workshop: Workshop) -> bool:
     """Whether the axis went over the place several times, in both directions or at different speeds.
 
-    Passes that are all alike cannot tell a place from a moment of the move.
+    Passes that are all alike cannot distinguish a place from a moment of the move.
     """
     motion = workshop.motion
     if motion.motor_speed_deg_s is None or motion.time_s is None:
@@ -159,7 +159,7 @@ def vibrations(
 
 
 def _off_centre(height: FloatArray, at: int) -> float:
-    """Where the top of a peak lies beside its highest sample, in samples: that of the parabola through
+    """Where the top of a peak lies next to its highest sample, in samples: that of the parabola through
     three.
     """
     if not 0 < at < len(height) - 1:

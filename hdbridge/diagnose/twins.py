@@ -1,5 +1,5 @@
-"""Second looks at names whose twin is commoner: a late sample that is the load's own wind-up, a drag that
-is a late sample, a load order that is the wind-up under the load's torque.
+"""Second looks at names whose twin is commoner: a delayed sample that is the load's own wind-up, a drag that
+is a delayed sample, a load order that is the wind-up under the load's torque.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def inertial(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
 
 
 def late(workshop: Workshop, search: Search, fitted: Fitted) -> Fitted:
-    """A drag that does not bend is a late sample.
+    """A drag that does not bend is a delayed sample.
 
     The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed part of
     one, with the sign of the direction.
@@ -74,8 +74,8 @@ def wound_up(workshop: Workshop, fitted: Fitted, base: int) -> Fitted:
     """A first load order that follows the load's torque is the torque's wind-up.
 
     An order takes any phase, a spring only that of the torque: where it does as well but for what the noise
-    of the torque channel takes from it, the order would be a coincidence. Beside a spring it makes up for
-    that noise, and takes most of what is the spring's.
+    of the torque channel takes from it, the order would be a coincidence. Together with a spring it makes up
+    for that noise, and takes most of what is the spring's.
     """
     if Channel.LOAD_TORQUE not in workshop.motion.available():
         return fitted

@@ -1,4 +1,4 @@
-"""What is left when no cause fits: how much, and where it lives.
+"""What is left when no cause fits: how much, and what it depends on.
 
 Non-parametric rivals that know nothing of causes (bins over load angle and direction, motor angle and
 direction, time,
@@ -34,7 +34,7 @@ PLAIN_ARCSEC = 1.0
 particular."""
 BLOCK_S = 0.2
 SHADOW = 2.0
-"""A name stands beside something unexplained when it takes away so many times its variance."""
+"""A name is kept together with something unexplained when it takes away so many times its variance."""
 EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
 ACTS = 0.1
@@ -100,7 +100,7 @@ def is_unexplained(workshop: Workshop, left: Rest) -> bool:
     limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
     if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
         return True
-    # Where command and standstill tell noise and following error apart from the gear, fast things count.
+    # Where command and standstill distinguish noise and following error from the gear, fast things count.
     if evidence.commanded and evidence.standstill:
         floor = float(np.sqrt(np.mean(1.0 / workshop.weight**2)))
         if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:

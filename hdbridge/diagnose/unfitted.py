@@ -16,7 +16,7 @@ MOST = 0.5
 def unfitted(workshop: Workshop, effects: tuple[Effect, ...]) -> str:
     """In words, where the model lacks a loop and one makes up most of what it leaves; else empty.
 
-    What else is wrong shows only beside the loop, so nothing that is named without it means much.
+    What else is wrong shows only with the loop in the fit, so nothing that is named without it means much.
     """
     if workshop.evidence.reversals < 2 or any(isinstance(each, LOOPS) for each in effects):
         return ""

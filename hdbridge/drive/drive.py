@@ -223,7 +223,7 @@ class Drive:
 
         Speed and acceleration are at the load; the limits of the axis are their defaults. Raises `InputError`
         before anything is sent when a value is not finite or outside the limits, `DriveError` when the drive
-        fails on the way, `TransitionError` when it takes too long (computed from the way unless given).
+        fails on the way, `TransitionError` when it takes too long (computed from the travel unless given).
         """
         move = modes.ProfileMove.checked(self.image, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
         self._need(Mode.PP)

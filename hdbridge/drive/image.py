@@ -138,7 +138,7 @@ class ProcessImage:
         self.channels = tuple(
             ChannelFollower(key, channel, axis.drive.cycle_ms) for key, channel in axis.channels.items()
         )
-        """What the axis has beside its encoders; empty for most."""
+        """What the axis has in addition to its encoders; empty for most."""
         followers = {
             (channel.source.index, channel.source.subindex): follower
             for channel, follower in zip(axis.channels.values(), self.channels, strict=True)

@@ -41,7 +41,7 @@ _ERROR_FRAME_BUS_OFF: Final = 0x40
 
 
 class TransmitBufferFull(BusError):  # noqa: N818 - the name says what happened
-    """The kernel's transmit queue is full (ENOBUFS); the frame was dropped and must not be sent late."""
+    """The kernel's transmit queue is full (ENOBUFS); the frame was dropped and must not be sent later."""
 
 
 class Frame(NamedTuple):

@@ -67,7 +67,7 @@ class ProfileMove:
     ) -> ProfileMove:
         """`InputError` when a value is not finite or outside the axis's limits, which are the defaults too.
 
-        Angles, speeds and accelerations are at the load. Without a time-out it is computed from the way.
+        Angles, speeds and accelerations are at the load. Without a time-out it is computed from the travel.
         """
         axis = image.axis
         limits = axis.limits

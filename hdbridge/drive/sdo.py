@@ -138,7 +138,7 @@ class _Channel(CanopenSdoClient):
 
     def _set_aside(self, frame: Frame) -> None:
         if frame.can_id == self.tx_cobid:
-            # The late answer to an earlier request, or to somebody else's.
+            # The delayed answer to an earlier request, or to somebody else's.
             self.strays += 1
         else:
             self.monitor.dispatch(frame)
@@ -189,7 +189,7 @@ class SdoClient:
 
     @property
     def strays(self) -> int:
-        """SDO answers that nobody had asked for: late ones, or those to another client."""
+        """SDO answers that nobody had asked for: delayed ones, or those to another client."""
         return self._channel.strays
 
     def has(self, index: int, sub: int = 0) -> bool:

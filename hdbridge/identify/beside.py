@@ -1,4 +1,4 @@
-"""What is fitted beside the model so that it does not bend it: zeros, and faults of the measurement.
+"""What is fitted in addition to the model so that it does not bend it: zeros, and faults of the measurement.
 
 A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole
 counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a
@@ -6,7 +6,7 @@ count *in the direction of motion*: that looks like hysteresis too, and the frac
 Each turn is known to within a count only, and a hysteresis that is narrow or steep cannot be known better
 than its turns. Each has a column; a fraction of a count it cannot exceed. With fine encoders these columns
 vanish by themselves. The load on the gear's spring swings beyond the error that shakes it, the more the
-faster: two speeds tell that from the orders' amplitudes, at one they are known the less for it.
+faster. Two speeds distinguish that from the orders' amplitudes; at one speed they are less well known.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def zeros(design: Design) -> FloatArray:
 
 
 def delay_column(design: Design) -> FloatArray:
-    """What a load encoder read one millisecond late would show, shape (b, 1), arcsec."""
+    """What a load encoder read with a delay of one millisecond would show, shape (b, 1), arcsec."""
     blocks, samples = design.blocks, design.samples
     column = -blocks.speed_deg_s * blocks.moving / samples.ratio * ARCSEC_PER_DEG / 1000.0
     return np.asarray(column)[:, np.newaxis]
@@ -150,7 +150,7 @@ def swing_columns(design: Design, waves: Sequence[tuple[float, FloatArray, Float
 def speeds_differ(design: Design) -> float:
     """Share of the squared speed that its mean leaves: 0 where everything moves at one speed.
 
-    At one speed a swing of the load cannot be told from the orders that shake it.
+    At one speed a swing of the load cannot be distinguished from the orders that shake it.
     """
     squared = design.blocks.speed_deg_s[design.blocks.moving] ** 2
     count = design.blocks.count[design.blocks.moving]

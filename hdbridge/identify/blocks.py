@@ -28,7 +28,7 @@ AVERAGED_COUNTS_S = 200.0
 """Faster than this a servo passes several counts before it answers, and rounding averages out."""
 LOCKED_COUNTS = 0.15
 """Standard deviation of what rounding leaves over a leg: sampled in step with the counts that it passes, an
-encoder is read at the same few places within a count all the way to the next turn."""
+encoder is read at the same few places within a count over all the travel to the next turn."""
 LEAST_LOCKED_COUNTS = 0.03
 """At least so much there may be at any speed."""
 
@@ -49,9 +49,9 @@ class Blocks:
     duration_s: FloatArray
     motor_deg: FloatArray
     travel_deg: FloatArray
-    """Way of the motor since the first sample, both directions counted positive."""
+    """Travel of the motor since the first sample, both directions counted positive."""
     extent_deg: FloatArray
-    """Way inside the block."""
+    """Travel inside the block."""
     speed_deg_s: FloatArray
     moving: BoolArray
     heading: FloatArray
@@ -63,7 +63,7 @@ class Blocks:
     """The sample in the middle of each block."""
     error_arcsec: FloatArray
     leg: IntArray
-    """Number of the way from turn to turn that a block lies on."""
+    """Number of the travel from turn to turn that a block lies on."""
     locked_arcsec: FloatArray
     """Standard deviation of an error that is the same over a leg, from reading the motor in whole counts."""
     blur: FloatArray
@@ -196,7 +196,7 @@ def _heading(motor_deg: FloatArray) -> FloatArray:
 
 
 def _cells(motor_deg: FloatArray, coarsest_deg: float) -> IntArray:
-    """A number per sample that changes from cell to cell of the way since the last turn."""
+    """A number per sample that changes from cell to cell of the travel since the last turn."""
     turning, _ = branches(motor_deg)
     cells = np.zeros(len(motor_deg), dtype=np.int64)
     edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest

@@ -146,7 +146,7 @@ def _about_zeros(design: Design, left_arcsec: FloatArray) -> FloatArray:
 def _lines(
     state: State, selection: Selection, system: System, clean: FloatArray, options: FitOptions
 ) -> Spectrum:
-    """Each candidate's line beside everything that is in the fit: what it is, or what it would add."""
+    """Each candidate's line, everything that is in the fit allowed for: what it is, or would add."""
     information, right = system
     waves = 2 * len(state.candidates)
     inside = [

@@ -72,7 +72,7 @@ def laps_arcsec(samples: Samples) -> float | None:
             cells = np.floor(samples.motor_deg[rows] / LAP_BIN_DEG).astype(np.int64)
             names, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
             means = np.bincount(inverse, samples.error_arcsec[rows]) / counts
-            # The first cells of a pass are on the way across the hysteresis.
+            # The first cells of a pass are on the travel across the hysteresis.
             keep = slice(5, None) if sign > 0 else slice(None, -5)
             passes[sign].append(dict(zip(names[keep].tolist(), means[keep].tolist(), strict=True)))
     differences = [

@@ -116,7 +116,7 @@ def folds(problem: Problem) -> tuple[IntArray, str]:
 
     Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
     reversals) by stretches of time, so that no fold takes all there is to know about a reversal. Of several
-    short recordings that went the same way whole ones: what is left in one of them goes on from one
+    short recordings of the same travel whole ones: what is left in one of them goes on from one
     stretch to the next, and would be foretold by its neighbours.
     """
     blocks = problem.design.blocks

@@ -43,7 +43,7 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """What is to be fitted: observations, effects, and columns beside them (zeros, nuisances)."""
+    """What is to be fitted: observations, effects, and further columns (zeros, nuisances)."""
 
     design: Design
     effects: tuple[Effect, ...]

@@ -1,7 +1,7 @@
 """Noise that is not white, and least squares that know it.
 
 Four parts: white noise (its size may differ between standing and moving), a slow wander in time, a wander
-over the motor's *way*: an axis rests anywhere within a count of its encoder, the same way as long as it
+over the motor's *travel*: an axis rests anywhere within a count of its encoder, the same way as long as it
 stands and another way at the next stop; and what rounding to counts leaves over a whole leg, of a size that
 the count gives. The wanders are first-order Markov processes, so the inverse of their covariance is banded,
 and a fit costs no more than one with white noise (Rybicki and Press 1995).
@@ -40,7 +40,7 @@ class NoiseModel:
     """Wander in time: its size, and the time in which it forgets."""
     place_arcsec: float = 0.0
     place_deg: float = 0.1
-    """Wander over the motor's way: its size, and the way over which it forgets."""
+    """Wander over the motor's travel: its size, and the travel over which it forgets."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
         """Of each block's mean; infinite for blocks without samples."""

@@ -15,11 +15,11 @@ class FitOptions:
     """All have defaults that suit the bench's own recordings."""
 
     effects: tuple[Effect, ...] = TYPICAL
-    """Fitted beside the synchronous part. Where data cannot say, their shapes stay as they are given here."""
+    """Fitted in addition to the synchronous part. Where data cannot say, their shapes stay as given here."""
     highest_order: int = 24
     """Motor orders up to this are looked for."""
     load_orders: int = 4
-    """Orders of the load turn, and of the flexspline, that are fitted beside the model when they show."""
+    """Orders of the load turn and of the flexspline that are fitted in addition to the model if they show."""
     family_wise: float = 0.01
     """Chance that noise alone puts any order in."""
     smallest_arcsec: float = 0.1

@@ -14,7 +14,7 @@ from hdbridge.identify.linear import solve_symmetric
 from hdbridge.identify.samples import IntArray
 
 NOT_APART = 0.95
-"""Correlation above which two orders cannot be told apart by a record."""
+"""Correlation above which two orders cannot be distinguished in a record."""
 
 
 class Family(Enum):
@@ -62,9 +62,9 @@ class Selection:
 
     chosen: tuple[Order, ...]
     twins: tuple[tuple[Order, Order], ...]
-    """Candidates that this record cannot tell apart from each other."""
+    """Candidates that this record cannot distinguish from each other."""
     unresolved: tuple[Order, ...]
-    """Candidates that this record cannot tell apart from the zero, the hysteresis or an order already in."""
+    """Candidates that this record cannot distinguish from the zero, the hysteresis or an order already in."""
 
 
 def threshold(candidates: int, family_wise: float) -> float:

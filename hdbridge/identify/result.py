@@ -49,7 +49,7 @@ class NoiseFigures:
     residual_arcsec: float
     """Rms that the model, as it is written, leaves of a sample, about its zero."""
     fitted_arcsec: float
-    """The same beside all that was fitted with it and is not written: delay, rounding, other orders."""
+    """The same with all that was fitted in addition and is not written: delay, rounding, other orders."""
     samples: int
     """Used by the fit."""
     effective_samples: float
@@ -85,17 +85,17 @@ class HeldOut:
     out.
     """
     beside: Gain | None
-    """The same with all that is fitted beside the model (delay, orders of the load) taken off of both."""
+    """The same with all that is fitted in addition to the model (delay, load orders) taken off of both."""
     fitted_arcsec: float
-    """Rms that the fit leaves of the same data, with all that is fitted beside the model."""
+    """Rms that the fit leaves of the same data, with all that is fitted in addition to the model."""
     text: str
 
     @property
     def improves(self) -> bool:
         """Whether the model is worth having.
 
-        What it leaves beside the nuisances falls by more than chance, by at least `WORTH` of its rms, and
-        alone it is not worse.
+        With the nuisances taken off, what it leaves falls by more than chance and by at least `WORTH` of its
+        rms; alone it is not worse.
         """
         gain = self.beside
         return (
@@ -123,7 +123,7 @@ class ChosenOrder:
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Something that was fitted beside the model so that it does not bend it."""
+    """Something that was fitted in addition to the model so that it does not bend it."""
 
     name: str
     text: str

@@ -28,7 +28,7 @@ SETTLE_S = 0.1
 """After a fast move the load is left this much time to come to rest, and after a turn, where the hysteresis
 rises too steeply for a load on a spring to follow."""
 SETTLE_SHARE = 0.2
-"""But no more than this share of the way to the next turn."""
+"""But no more than this share of the travel to the next turn."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis stands."""
 GENTLE_DEG_S2 = 40.0
@@ -224,7 +224,7 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
     fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(_rate(time, load_speed)) > GENTLE_DEG_S2)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], under_way, [False]]).astype(np.int8)))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        # Motions that follow one another without a rest are told apart by their kind and direction.
+        # Motions that follow one another without a rest are distinguished by their kind and direction.
         other = (np.diff(kind[begin:end]) != 0) | (np.diff(np.sign(load_speed[begin:end])) != 0)
         for part in np.split(np.arange(begin, end), np.flatnonzero(other) + 1):
             fast[part] |= bool(np.max(moving[part]) > slow_deg_s)

@@ -51,7 +51,7 @@ class Segment:
     """Measured load angle, multi-turn degrees."""
     kind: Kind = Kind.UNKNOWN
     position_deg: FloatArray | None = None
-    """Measured motor angle beside the commanded one, multi-turn degrees."""
+    """Measured motor angle in addition to the commanded one, multi-turn degrees."""
     commanded: bool = True
     """False where ``motor_deg`` is measured: its chatter is then kept away from the hysteresis."""
     measured: Mapping[Channel, FloatArray] = field(default_factory=dict)

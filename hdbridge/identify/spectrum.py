@@ -68,7 +68,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Lines, what could be told apart, and a curve to plot."""
+    """Lines, what could be distinguished, and a curve to plot."""
 
     lines: tuple[Line, ...]
     resolution: Resolution

@@ -90,7 +90,7 @@ class State(NamedTuple):
         return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
 
     def problem(self, selection: Selection) -> Problem:
-        """Motor orders as the synchronous part, other effects; orders not the motor's beside them."""
+        """Motor orders as the synchronous part, other effects; orders not the motor's in addition."""
         motor = tuple(
             MotorOrder(order=each.number, amplitude_arcsec=0.0, phase_deg=0.0)
             for each in selection.chosen
@@ -124,9 +124,9 @@ class State(NamedTuple):
 def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
     """Orders to look for: what the travel resolves.
 
-    Neighbouring orders are apart from each other, and from all else that varies along the way, from a whole
-    turn on (Rayleigh): orders of the motor need a motor turn, those of load and flexspline enough of a load
-    turn.
+    Neighbouring orders are apart from each other, and from all else that varies along the travel, from a
+    whole turn on (Rayleigh): orders of the motor need a motor turn, those of load and flexspline enough of a
+    load turn.
     """
     ratio = design.samples.ratio
     if turns_covered(design) < WHOLE_TURN:

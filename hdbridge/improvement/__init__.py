@@ -1,7 +1,7 @@
 """Improvement: closing the loop on a drive.
 
     diagnose     a recording, measured by a plan or given, against the active model
-    further      what is left open: the shortest experiment of the machine that tells it apart
+    further      what is left open: the shortest experiment of the machine that distinguishes it
     extension    the extended model, without what cannot be told in advance
     trial        stepping with the active and with the extended model, in turns
     improve      all of it, to a pending model

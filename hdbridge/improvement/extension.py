@@ -1,4 +1,4 @@
-"""What of a diagnosis goes into the model that is proposed, and what it is told apart from."""
+"""What of a diagnosis goes into the model that is proposed, and what it is distinguished from."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def extension_of(
     (orders of the load of unknown origin) stays in the model, where a person can state its origin. Wear goes
     on from the turns that the motor has run by the end of the record.
     What does not gain on held-out data, or may be nothing (`Finding.refusal`), is left out.
-    ``rivals`` are the causes that each has not been told from (`further.untold`): where one of them must not
-    be compensated, what was found is left out too, for it may well be that one.
+    ``rivals`` are the causes that each has not been distinguished from (`further.untold`): where one of
+    them must not be compensated, what was found is left out too, for it may well be that one.
     """
     known = {each.name for each in active.effects}
     reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}

@@ -39,10 +39,11 @@ class Choice:
 def untold(
     diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
 ) -> dict[str, tuple[str, ...]]:
-    """Per cause that was found, the other causes that it has not been told from.
+    """Per cause that was found, the other causes that it has not been distinguished from.
 
-    Those are its aliases in the diagnosis, and what none of the ``plans`` by which was measured can tell from
-    it: on a short way a load order is a ramp, and one of the two always fits a little better.
+    Those are its aliases in the diagnosis, and what none of the ``plans`` by which was measured can
+    distinguish from it: on a short travel a load order is a ramp, and one of the two always fits a little
+    better.
     """
     reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
     rivals: dict[str, tuple[str, ...]] = {}
@@ -66,9 +67,9 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """The shortest experiment, not ``done`` yet, predicted to tell a cause from one of its ``rivals``.
+    """The shortest experiment, not ``done`` yet, predicted to distinguish a cause from one of its ``rivals``.
 
-    Where none does but something is unexplained: the experiment that looks closer at where it lives. None
+    Where none does but something is unexplained: the experiment that looks closer at what it depends on. None
     where the machine can learn no more by itself.
     """
     menu = sorted(

@@ -256,7 +256,7 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
 
 
 def _kept(folder: Path, result: Improvement) -> Improvement:
-    """Result and models beside the recording; nothing where nothing new was measured."""
+    """Result and models next to the recording; nothing where nothing new was measured."""
     if folder.is_dir() and any(folder.iterdir()):
         with writing():
             if result.diagnosis.findings:

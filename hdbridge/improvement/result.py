@@ -50,7 +50,7 @@ class Improvement:
     diagnosis: Diagnosis
     extension: Extension
     untold: Mapping[str, tuple[str, ...]]
-    """Per cause that was found, the other causes that it has not been told from."""
+    """Per cause that was found, the other causes that it has not been distinguished from."""
     rounds: tuple[Round, ...]
     further: Choice | None
     """What the axis could do by itself to learn more."""

@@ -1,4 +1,4 @@
-"""What one control cycle costs in CPU time, beside a bare exchange of the same frames and beside canopen.
+"""What one control cycle costs in CPU time, next to a bare exchange of the same frames and to canopen.
 
     python tools/bench/cycle.py [--interface virtual|loopback|socketcan]... [--channel vcan0] [--json FILE]
 
@@ -12,7 +12,7 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
 and prints medians over the blocks, and their ratios to the bare exchange.
 
-Nobody sleeps. On the virtual bus the answering node lives in the same thread; what it costs is measured in
+Nobody sleeps. On the virtual bus the answering node runs in the same thread; what it costs is measured in
 the same blocks and subtracted from each alike. On SocketCAN the kernel's own gateway (can-gw, set up with
 cangw, as root) turns each SYNC into the two TPDOs, which costs no process any time; there wall time is
 measured, because the CPU clock of user-mode-linux counts in steps of 4 ms. `loopback` tells what the

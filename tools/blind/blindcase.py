@@ -70,7 +70,7 @@ def cases(wanted: dict[str, int], seed: int) -> Iterator[Case]:
 
 
 def _together(rng: random.Random, number: int) -> tuple[str, ...]:
-    """Causes that can be told apart at all when they come together."""
+    """Causes that can be distinguished at all when they come together."""
     while True:
         causes = tuple(rng.sample(sorted(CAUSES), number))
         apart = all(not set(twins) <= set(causes) for twins in TWINS)

@@ -2,7 +2,7 @@
 
 hidden.yaml says what was hidden, truth.yaml what the plant is, model.yaml what the diagnosis compared it
 with. `true_parameters` converts: a name is missing where the two do not mean the same, for the reasons that
-stand beside each cause.
+stand next to each cause.
 """
 
 from __future__ import annotations
@@ -234,9 +234,9 @@ def _amplitude_drift(secret: Secret) -> Values:
 def _wear(secret: Secret) -> Values:
     """Growth of the lost motion from side to side, lagging: minus twice that of either way.
 
-    A finding that has no exponent grows in proportion to the way, the plant with a power p of it: compared is
-    the straight line nearest to r^p over a way r run evenly, whose slope is 6 p / ((p + 1) (p + 2)) of the
-    mean growth.
+    A finding that has no exponent grows in proportion to the travel, the plant with a power p of it: compared
+    is the straight line nearest to r^p over a travel r run evenly, whose slope is 6 p / ((p + 1) (p + 2)) of
+    the mean growth.
     """
     known = secret.parameters
     if "exponent" in secret.found:

@@ -2,7 +2,7 @@
 
 python tools/blind/score.py FOLDER [--jobs 2] [--reuse] [--timeout 600] [--json OUT] [--command COMMAND]
 
-Each case's answer is kept beside it as diagnosis.json and diagnosis.yaml (exit status, seconds); --reuse
+Each case's answer is kept next to it as diagnosis.json and diagnosis.yaml (exit status, seconds); --reuse
 judges what is there without running again. Exit status 1 where a command failed.
 """
 
