@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from hdbridge.drive import Drive, open_bus
     from hdbridge.errors import (
         BusError,
+        BusInUseError,
         DriveError,
         HdbridgeError,
         IdentityError,
         InputError,
+        OutputError,
         SafetyStop,
         SdoError,
         TransitionError,
@@ -42,6 +44,7 @@ __all__ = [
     "AxisConfig",
     "Bench",
     "BusError",
+    "BusInUseError",
     "Compensation",
     "Drive",
     "DriveError",
@@ -49,6 +52,7 @@ __all__ = [
     "IdentityError",
     "InputError",
     "Inverse",
+    "OutputError",
     "Record",
     "Recording",
     "SafetyStop",

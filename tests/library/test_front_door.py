@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import hdbridge
+from hdbridge import errors
 
 
 def python(program: str) -> str:
@@ -50,3 +51,9 @@ def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
 
 def test_the_folder_of_a_function_can_still_be_imported():
     assert python("from hdbridge.diagnose.result import Diagnosis; print(Diagnosis.__name__)") == "Diagnosis"
+
+
+def test_every_error_stands_at_the_front_door():
+    kinds = [each for each in vars(errors).values() if isinstance(each, type)]
+    raised = {each.__name__ for each in kinds if issubclass(each, errors.HdbridgeError)}
+    assert raised <= set(hdbridge.__all__)
