@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) -> Iterator[Drive]:
     """The drive of an axis, simulated in this process and faster than real time; not booted yet.
 
-    ``truth`` says what the axis is like (docs/truth-file.md): without it the ``truth.yaml`` that lies beside
+    ``truth`` says what the axis is like (docs/truth-file.md): without it the ``truth.yaml`` that lies next to
     the axis file. The same truth and seed give the same frames, bit for bit. InputError where there is no
     truth, or it is wrong.
     """

@@ -54,7 +54,7 @@ HOMES: Final[Mapping[str, str]] = {
     "zero_drift": "time",
     "count_loss": "time",
 }
-"""The coordinate in which a cause lives; those that are not here have one of their own."""
+"""The coordinate that a cause depends on; those that are not here have one of their own."""
 LEAST_RESTING: Final = 200
 """Points at rest that a relaxation is looked at on; with fewer, all points."""
 SEEN_BINS: Final = 20

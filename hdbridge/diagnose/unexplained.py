@@ -30,8 +30,8 @@ LEFT_ARCSEC = 0.5
 FAST_ARCSEC = 0.75
 """The same for what is faster, where it is also more than the noise."""
 PLAIN_ARCSEC = 1.0
-"""More than this left (and counts, and what is left at rest) is too much even where it lives nowhere in
-particular."""
+"""More than this left (and counts, and what is left at rest) is too much even where it depends on nothing
+in particular."""
 BLOCK_S = 0.2
 SHADOW = 2.0
 """A name is kept together with something unexplained when it takes away so many times its variance."""

@@ -23,7 +23,7 @@ _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
-    """Replace the file's content, text as UTF-8: temporary file beside it, fsync, rename, fsync the folder.
+    """Replace the file's content, text as UTF-8: temporary file next to it, fsync, rename, fsync the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
     straight through. OutputError when the place cannot be written; the old file then stands.

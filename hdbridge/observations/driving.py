@@ -18,7 +18,7 @@ from hdbridge.observations.reading import reading_of
 LAG_SAMPLES = 5
 """Samples over which the lag of the motor behind its command is averaged."""
 CHATTER_COUNTS = 2.6
-"""A measured angle counts as turned round when it has come back by more than this many counts."""
+"""A measured angle counts as reversed when it has come back by more than this many counts."""
 REVERSAL_DEG = 0.3
 """Travel that a reversal has on either side of it, motor degrees: less than the narrowest loop that is looked
 for (0.5, `effects.elastic_loop`), and several times what a motor settles by (0.07 in measured records)."""
@@ -29,8 +29,8 @@ JITTER_SIGMAS = 8.0
 def driving_angle(motor_deg: FloatArray, position_deg: FloatArray | None, commanded: bool) -> FloatArray:
     """Motor angle for the regressors, degrees, shape (n,).
 
-    Where the motor was measured beside its command: the command plus the averaged lag, but never outside the
-    cell that the encoder was read in, so that a fast move's lag does not smear over a turn.
+    Where the motor was measured in addition to its command: the command plus the averaged lag, but never outside
+    the cell that the encoder was read in, so that a fast move's lag does not smear over a turn.
     """
     if len(motor_deg) < 2 or (position_deg is None and commanded):
         return motor_deg
@@ -78,7 +78,7 @@ def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) ->
 
 
 def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
-    """How often one record turns round with travel on both sides (`REVERSAL_DEG`)."""
+    """How often one record reverses with travel on both sides (`REVERSAL_DEG`)."""
     if len(driving_deg) < 3:
         return 0
     band = max(REVERSAL_DEG, JITTER_SIGMAS * jitter_deg)

@@ -62,14 +62,14 @@ def _driving(
     noise = _noise(lag, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    # A motor that sticks where it turns round, or overshoots where it stops, is where its encoder says.
+    # A motor that sticks where it reverses, or overshoots where it stops, is where its encoder says.
     cell = max(0.5 * count, 3.0 * noise)
     line = np.clip(line, lag - cell, lag + cell)
     return steadied(target + line, target + line, CHATTER_COUNTS * reading.resolution_deg)
 
 
 def _noise(lag: FloatArray, count: float) -> float:
-    """Noise of the motor's reading beside that of its counts, degrees."""
+    """Noise of the motor's reading in addition to that of its counts, degrees."""
     if len(lag) < 4:
         return 0.0
     return math.sqrt(max(third_deviation(np.diff(lag, 3)) ** 2 - count**2 / 12.0, 0.0))

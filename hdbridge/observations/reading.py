@@ -47,8 +47,8 @@ class Reading:
 
     @property
     def unaided_deg(self) -> float:
-        """The same where no command tells a motor that is shaken from a reading that is noisy: noise that is
-        larger than the counts bounds it, too.
+        """The same where no command distinguishes a motor that is shaken from a reading that is noisy: noise
+        that is larger than the counts bounds it, too.
         """
         return self._alike_deg if self._alike_deg > 2.0 * self.count_deg else self.resolution_deg
 

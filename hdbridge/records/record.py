@@ -163,7 +163,7 @@ class Record:
         """Refuse (InputError) a ratio that the record's own angles contradict.
 
         A small deviation is not refused but left to diagnosis, and so is any when the axis moved too little
-        to tell it from the gear's own error.
+        to distinguish it from the gear's own error.
         """
         slope = self.load_turns_per_motor_turn() if len(self) else None
         if slope is None:
