@@ -29,8 +29,8 @@ JITTER_SIGMAS = 8.0
 def driving_angle(motor_deg: FloatArray, position_deg: FloatArray | None, commanded: bool) -> FloatArray:
     """Motor angle for the regressors, degrees, shape (n,).
 
-    Where the motor was measured in addition to its command: the command plus the averaged lag, but never outside
-    the cell that the encoder was read in, so that a fast move's lag does not smear over a turn.
+    Where the motor was measured in addition to its command: the command plus the averaged lag, but never
+    outside the cell that the encoder was read in, so that a fast move's lag does not smear over a turn.
     """
     if len(motor_deg) < 2 or (position_deg is None and commanded):
         return motor_deg
