@@ -1,10 +1,9 @@
 """What is left when no cause fits: how much, and what it depends on.
 
 Non-parametric rivals that know nothing of causes (bins over load angle and direction, motor angle and
-direction, time,
-way since the last reversal, speed, torque, temperature) are fitted on every other stretch of time and
-judged on the
-rest. Where the best of them takes a good deal away, there something is that the catalogue does not have.
+direction, time, travel since the last reversal, speed, torque, temperature) are fitted on every other stretch
+of time and judged on the rest. Where the best of them takes a good deal away, there something is that the
+catalogue does not have.
 """
 
 from __future__ import annotations
