@@ -21,7 +21,7 @@ from typer.main import get_group
 
 from hdbridge import __version__
 from hdbridge.cli import eventlog, plain, usage
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import HdbridgeError, InputError, OutputError
 
 PANELS: Final = {
     "Without hardware": {
@@ -170,10 +170,9 @@ def main() -> None:
             raise
         _close_output()
         print(f"hdbridge: the standard output cannot be written: {error.strerror}", file=sys.stderr)
-        status = InputError.exit_status
+        status = OutputError.exit_status
     status = status if isinstance(status, int) else 0
-    eventlog.end(status)
-    sys.exit(status)
+    sys.exit(eventlog.end(status))
 
 
 def _close_output() -> None:

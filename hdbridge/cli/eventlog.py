@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 from datetime import datetime
 from pathlib import Path
 
-from hdbridge.errors import InputError
+from hdbridge.errors import InputError, OutputError
 from hdbridge.files.outputs import Kind, Output, check_outputs
 
 _ROOT = logging.getLogger("hdbridge")
@@ -38,6 +39,31 @@ class _ForMachines(logging.Formatter):
         return json.dumps({**about, **_facts(record)}, default=str)
 
 
+class _LogFile(logging.FileHandler):
+    """Ends, with one line, where its disk is full: the axis is worth more than its log."""
+
+    failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802 - logging's own
+        self._fail(sys.exc_info()[1])
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self.failed:
+            super().emit(record)
+
+    def close(self) -> None:
+        try:
+            super().close()
+        except OSError as problem:
+            self._fail(problem)
+
+    def _fail(self, problem: BaseException | None) -> None:
+        if not self.failed:
+            self.failed = True
+            why = problem.strerror if isinstance(problem, OSError) else problem
+            print(f"hdbridge: {self.baseFilename}: cannot be written: {why}", file=sys.stderr)
+
+
 def begin(verbose: int, path: Path | None) -> None:
     """Tell events from now on; InputError where the file cannot be written."""
     _ROOT.propagate = False
@@ -49,7 +75,7 @@ def begin(verbose: int, path: Path | None) -> None:
     if path is not None:
         check_outputs([Output("--log", path, Kind.LOG)])
         try:
-            machines = logging.FileHandler(path, encoding="utf-8")
+            machines = _LogFile(path, encoding="utf-8")
         except OSError as problem:
             raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
         machines.setFormatter(_ForMachines())
@@ -62,14 +88,17 @@ def tell(event: str, **facts: object) -> None:
     logging.getLogger(__name__).debug(event, facts)
 
 
-def end(exit_status: int) -> None:
-    """The last event; nothing is told after it."""
+def end(exit_status: int) -> int:
+    """The last event; nothing is told after it. The exit status: another, where only the log failed."""
     tell("end", exit_status=exit_status)
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()
+        if isinstance(each, _LogFile) and each.failed:
+            exit_status = exit_status or OutputError.exit_status
     _ROOT.setLevel(logging.NOTSET)
     _ROOT.propagate = True
+    return exit_status
 
 
 def _facts(record: logging.LogRecord) -> dict[str, object]:

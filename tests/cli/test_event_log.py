@@ -51,6 +51,13 @@ def test_a_log_is_appended_to_no_other_file(hdbridge, profile, file):
     assert place.read_text() == before
 
 
+def test_a_log_whose_disk_is_full_ends_in_one_line_and_the_command_goes_on(hdbridge):
+    done = hdbridge("--log", "/dev/full", "check", "article")
+    assert done.returncode == 6
+    assert done.stderr == "hdbridge: /dev/full: cannot be written: No space left on device\n"
+    assert "all right" in done.stdout
+
+
 def test_v_tells_on_standard_error_and_vv_tells_every_transfer(hdbridge):
     quiet, more, most = (
         hdbridge(*v, "sdo", "get", "article", "6064h", "--simulate") for v in ((), ("-v",), ("-vv",))

@@ -147,7 +147,7 @@ def test_a_full_standard_output_ends_in_one_line(tmp_path):
             check=False,
             cwd=tmp_path,
         )
-    assert done.returncode == 2
+    assert done.returncode == 6
     assert done.stderr.splitlines() == [
         "hdbridge: the standard output cannot be written: No space left on device"
     ]
