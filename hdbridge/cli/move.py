@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,9 +28,10 @@ from hdbridge.cli.options import (
     progress_bar,
     write_json,
 )
-from hdbridge.errors import InputError
+from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
+    from hdbridge.drive.drive import Drive
     from hdbridge.model import TransmissionModel
     from hdbridge.procedures.stepping import Standing
 
@@ -109,13 +111,25 @@ def move(
                 )
                 bar.update(task, completed=share, description=words)
 
-            run = bench.run(way, show, keep_s=KEPT_S)
+            try:
+                run = bench.run(way, show, keep_s=KEPT_S)
+            except KeyboardInterrupt:
+                _tell_where_it_stands(drive)
+                raise
     write_json(json_file, _document(axis.name, chosen, run.outcome))
     _print(axis.name, chosen, run.outcome)
 
 
+def _tell_where_it_stands(drive: Drive) -> None:
+    """After it was stopped on the way. What is told of a drive that cannot be asked any more is why it stopped."""
+    with suppress(HdbridgeError):
+        stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
+        notes.print(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
+
+
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
     """The model that compensates; one without effects where there is none, or none is wanted."""
+    from hdbridge.drive.drive import Drive
     from hdbridge.model import TransmissionModel
 
     if not compensated:

@@ -90,6 +90,11 @@ def step(
     chosen: Path | None = model or files.model
     if scheme and set(scheme) == {Scheme.NONE} and model is None:
         chosen = None  # what compensates nothing needs no model
+    elif model is None and not files.model.exists():
+        raise InputError(
+            f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
+            f"{profile}, or step without one: --scheme none"
+        )
     comparison = run_comparison(
         axis,
         files,

@@ -76,6 +76,7 @@ def test_ctrl_c_ends_the_holding_in_good_order_and_stops_a_move(hdbridge, monkey
     done = hdbridge("-v", "move", "article", 1, "--simulate", "--hold", 1e9 if leg is Hold else 0)
     assert done.returncode == status, done.stderr
     assert ("power is off" in done.stdout) is (status == 0)
+    assert ("stopped on the way, at 0." in done.stderr) is (status == 130)
     assert "disabled  node=1" in done.stderr
 
 

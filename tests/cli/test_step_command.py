@@ -59,3 +59,9 @@ def test_one_scheme_only(hdbridge, tmp_path):
     done = hdbridge("step", "article", "--simulate", "--count", 3, "--scheme", "both", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "none" not in json.loads((tmp_path / "out.json").read_text())
+
+
+def test_a_profile_without_a_model_is_told_how_to_get_one(hdbridge):
+    done = hdbridge("step", "demo", "--simulate")
+    assert done.returncode == 2
+    assert "hdbridge calibrate demo, or step without one: --scheme none" in done.stderr
