@@ -65,4 +65,4 @@ docs: $(VENV)/.docs  ## the guides and the API reference as a site with search, 
 	@echo "open build/site/index.html"
 
 clean:           ## remove the environment and what the commands made
-	rm -rf $(VENV) demo-output dist build
+	rm -rf $(VENV) demo-output demo-output-[0-9]* dist build

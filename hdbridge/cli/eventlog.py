@@ -44,7 +44,7 @@ class _LogFile(logging.FileHandler):
 
     failed = False
 
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802 - logging's own
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's own
         self._fail(sys.exc_info()[1])
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -121,7 +121,7 @@ def move(
 
 
 def _tell_where_it_stands(drive: Drive) -> None:
-    """After it was stopped on the way. What is told of a drive that cannot be asked any more is why it stopped."""
+    """After it was stopped on the way; nothing where the drive cannot be asked any more."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
         notes.print(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
@@ -129,7 +129,6 @@ def _tell_where_it_stands(drive: Drive) -> None:
 
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
     """The model that compensates; one without effects where there is none, or none is wanted."""
-    from hdbridge.drive.drive import Drive
     from hdbridge.model import TransmissionModel
 
     if not compensated:
