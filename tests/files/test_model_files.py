@@ -183,10 +183,10 @@ def test_a_model_of_this_axis_is_accepted_whatever_the_firmware(axis):
     ("model", "identity", "expected"),
     [
         (replace(BOUND, ratio=40.0), None, "ratio: this model is of a gear with ratio 40, but {axis} says 50; use the model of this gear, or calibrate it"),
-        (replace(BOUND, provenance={"axis": "other"}), None, "provenance.axis: this model was made for 'other', but the axis here is 'test' ({axis}); use the model of this axis, or calibrate it"),
-        (BOUND, Identity(vendor_id=0x4844, product_code=0x402, serial=18), "provenance.drive: this model was made for serial 0x11, but the drive here is 0x12 ({axis}); use the model of this drive, or calibrate it"),
-        (BOUND, Identity(vendor_id=0x4844, product_code=0x403), "provenance.drive: this model was made for product_code 0x402, but the drive here is 0x403 ({axis}); use the model of this drive, or calibrate it"),
-        (replace(BOUND, provenance={"gear": {"ratio": 50, "teeth": {"flexspline": 98, "circular_spline": 100, "output": "circular_spline"}}}), None, "provenance.gear: this model was made for 98/100 teeth, circular_spline output, but the gear here is 100/102 teeth, flexspline output ({axis}); use the model of this gear, or calibrate it"),
+        (replace(BOUND, provenance={"axis": "other"}), None, "provenance.axis: this model was made for 'other', but the axis here is 'test' ({axis}); use the model of this axis, or calibrate it (if it is the same gear, correct provenance.axis in the model's file)"),
+        (BOUND, Identity(vendor_id=0x4844, product_code=0x402, serial=18), "provenance.drive: this model was made for serial 0x11, but the drive here is 0x12 ({axis}); use the model of this drive, or calibrate it (if it is the same gear, correct provenance.drive in the model's file)"),
+        (BOUND, Identity(vendor_id=0x4844, product_code=0x403), "provenance.drive: this model was made for product_code 0x402, but the drive here is 0x403 ({axis}); use the model of this drive, or calibrate it (if it is the same gear, correct provenance.drive in the model's file)"),
+        (replace(BOUND, provenance={"gear": {"ratio": 50, "teeth": {"flexspline": 98, "circular_spline": 100, "output": "circular_spline"}}}), None, "provenance.gear: this model was made for 98/100 teeth, circular_spline output, but the gear here is 100/102 teeth, flexspline output ({axis}); use the model of this gear, or calibrate it (if it is the same gear, correct provenance.gear in the model's file)"),
     ],
 )  # fmt: skip
 def test_a_model_of_another_axis_is_refused_with_the_reason(axis, model, identity, expected):

@@ -139,7 +139,8 @@ def test_another_drive_axis_or_gear_is_refused_and_nothing_changes(profile):
     before = {each: each.read_bytes() for each in profile.rglob("*.yaml")}
     line = (
         r"0001\.yaml: provenance\.drive: this model was made for serial 0x11, but the drive here is 0x12 "
-        r"\(.*axis\.yaml\); use the model of this drive, or calibrate it$"
+        r"\(.*axis\.yaml\); use the model of this drive, or calibrate it "
+        r"\(if it is the same gear, correct provenance\.drive in the model's file\)$"
     )
     with pytest.raises(InputError, match=line):
         store.activate(profile, 1, "", DATE, SERIAL_18)
