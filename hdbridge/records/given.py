@@ -18,7 +18,13 @@ def by_name(given: Given) -> dict[Path, Recording]:
     if isinstance(given, Mapping):
         named = dict(given)
     else:
-        several = [given] if isinstance(given, Record | Recording) else list(given)
+        several = [given] if isinstance(given, Record | Recording | str | Path) else list(given)
+        for each in several:
+            if not isinstance(each, Record | Recording):
+                raise InputError(
+                    f"{each!r} is no recording; expected a Record or a Recording: Recording.load(path) reads "
+                    "a folder or a CSV file"
+                )
         recordings = [Recording(each) if isinstance(each, Record) else each for each in several]
         sources = [each.record.source for each in recordings]
         named = {

@@ -87,3 +87,9 @@ def test_a_recording_that_is_given_twice_is_refused(run, model):
         diagnose([run, run], model)
     with pytest.raises(InputError, match="holds the same samples as recording 1"):
         fit([run, run.record], ratio=50)
+
+
+@pytest.mark.parametrize("given", ["one.csv", ["one.csv"], [np.zeros(3)]])
+def test_what_is_no_recording_is_refused_with_what_reads_one(given):
+    with pytest.raises(InputError, match=r"is no recording; expected .* Recording.load\(path\)"):
+        fit(given)
