@@ -69,8 +69,8 @@ def command(
     work = Measurement.asked(axis, plan, out, resume)
     work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
     with (
-        measuring(files.axis),
         kept_in(work.folder),
+        measuring(files.axis),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):
         journal = work.begun(drive, seed if simulate else None)

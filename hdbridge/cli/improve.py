@@ -107,8 +107,8 @@ def command(
     else:
         work.announce(trial)
     with (
-        measuring(files.axis),
         kept_in(work.folder),
+        measuring(files.axis),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
     ):
         journal = None if recordings else work.begun(drive, seed if simulate else None)

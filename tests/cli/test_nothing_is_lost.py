@@ -95,6 +95,7 @@ def test_one_measurement_of_an_axis_at_a_time(hdbridge, profile, tmp_path):
     assert done.returncode == 2
     assert "another hdbridge process is measuring this axis" in done.stderr
     assert "booted" not in done.stderr
+    assert not (tmp_path / "rec").exists()
 
 
 def test_two_calibrations_of_one_second_have_a_folder_each(monkeypatch, tmp_path):
