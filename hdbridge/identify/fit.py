@@ -39,6 +39,8 @@ from hdbridge.units import ARCSEC_PER_DEG
 MINIMUM_USABLE = 50
 LEAST_TRAVEL_DEG = 10.0
 """Motor angle that a record has to cover: less is rest and the beginning of a move, and half of a loop."""
+NO_DEGREES = "where the axis went further, both angles are in radians or turns: convert them to degrees"
+"""Both angles in one other unit give the right ratio: only how little the axis went can show it."""
 EFFECT_SHARE = 1e-3
 """An effect of whose columns less than this is left by the zeros and orders is not in the record."""
 SEARCH_BLOCKS = 8_000
@@ -71,7 +73,7 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
         raise InputError(
             f"{segments[0].name}: the motor moves by {travel:.2g} deg in the {usable} of {len(samples)} "
             f"samples that are slow and steady enough to be used; expected at least "
-            f"{LEAST_TRAVEL_DEG:g}: record slow sweeps at a steady speed, both ways"
+            f"{LEAST_TRAVEL_DEG:g}: record slow sweeps at a steady speed, both ways ({NO_DEGREES})"
         )
     if usable < 0.5 * len(samples):
         warnings.append(
@@ -92,7 +94,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     if not candidates:
         warnings.append(
             f"orders are not fitted: only {turns_covered(design):.2f} turns of the motor are seen, on which "
-            "they cannot be distinguished from anything else; sweep over a turn or more"
+            f"they cannot be distinguished from anything else; sweep over a turn or more ({NO_DEGREES})"
         )
     waves = harmonics(design, [each.per_motor_turn for each in candidates])
     always = np.concatenate([zeros(design), waves], axis=1)

@@ -110,3 +110,17 @@ def test_a_record_of_nothing_but_fast_moves_is_refused():
 def test_no_samples_at_all_are_refused():
     with pytest.raises(InputError, match="expected at least"):
         fit([], 20.0)
+
+
+@pytest.mark.parametrize(("unit_deg", "turns"), [(57.29578, 10.0), (360.0, 4.0)])
+def test_both_angles_in_another_unit_show_in_how_little_the_axis_went(bench, unit_deg, turns):
+    axis = bench.axis()
+    record = [
+        replace(each, motor_deg=each.motor_deg / unit_deg, load_deg=each.load_deg / unit_deg)
+        for each in axis.record(bench.plan(turns=turns))
+    ]
+    try:
+        said = " ".join(fit(record, axis.ratio, bench.options).warnings)
+    except InputError as problem:
+        said = str(problem)
+    assert "both angles are in radians or turns: convert them to degrees" in said
