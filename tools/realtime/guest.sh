@@ -1,6 +1,6 @@
 #!/bin/bash
 # In the guest, on the host's file system: bring vcan0 up, run the command, leave its exit status.
-work=/run/work
+work=/run/job
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 ip link set up lo
 ip link add dev vcan0 type vcan && ip link set up vcan0 || exit
@@ -8,8 +8,8 @@ ulimit -l unlimited -r 99
 (
     # shellcheck disable=SC1091
     source "$work/environment"
-    cd "$(cat /run/work/folder)" || exit 70
-    eval "set -- $(cat /run/work/command)"
+    cd "$(cat /run/job/folder)" || exit 70
+    eval "set -- $(cat /run/job/command)"
     exec "$@"
 ) >>"$work/stdout" 2>>"$work/stderr" </dev/null
 echo $? >"$work/status"
