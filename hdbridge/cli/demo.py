@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hdbridge.cli.options import Profile, console, load_axis, write_json
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
+
+if TYPE_CHECKING:
+    from hdbridge.evaluation.comparison import Comparison
 
 
 def register(app: typer.Typer) -> None:
@@ -40,7 +43,13 @@ def demo(
     axis = load_axis(files, None, None)
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
-    comparison = run_comparison(
+
+    def tell(comparison: Comparison) -> None:
+        write_json(folder / "stepping.json", comparison.as_dict())
+        write_page(folder / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
+        print_result(axis, comparison)
+
+    run_comparison(
         axis,
         files,
         TransmissionModel.load(files.model),
@@ -50,10 +59,8 @@ def demo(
         truth=None,
         seed=seed,
         record=folder,
+        tell=tell,
     )
-    write_json(folder / "stepping.json", comparison.as_dict())
-    write_page(folder / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
-    print_result(axis, comparison)
     console.print(
         f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md",
         soft_wrap=True,

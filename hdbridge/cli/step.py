@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -95,7 +95,15 @@ def step(
             f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
             f"{profile}, or step without one: --scheme none"
         )
-    comparison = run_comparison(
+
+    def tell(comparison: Comparison) -> None:
+        write_json(json_file, comparison.as_dict())
+        if html_file is not None:
+            seed_told = seed if simulate else None
+            write_page(html_file, axis, chosen, comparison, stepping, simulated_seed=seed_told)
+        print_result(axis, comparison)
+
+    run_comparison(
         axis,
         files,
         TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
@@ -106,11 +114,8 @@ def step(
         seed=seed,
         force=force,
         record=record,
+        tell=tell,
     )
-    write_json(json_file, comparison.as_dict())
-    if html_file is not None:
-        write_page(html_file, axis, chosen, comparison, stepping, simulated_seed=seed if simulate else None)
-    print_result(axis, comparison)
 
 
 def run_comparison(
@@ -125,8 +130,12 @@ def run_comparison(
     seed: int,
     force: bool = False,
     record: Path | None = None,
-) -> Comparison:
-    """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there."""
+    tell: Callable[[Comparison], None],
+) -> None:
+    """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there.
+
+    ``tell`` receives the result, also of a test that was stopped: then that of the schemes that are done.
+    """
     from hdbridge.cli.booted import booted
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
@@ -162,7 +171,7 @@ def run_comparison(
         notes.print(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}", soft_wrap=True)
 
     with (
-        _told_when_stopped(axis, done),
+        _told_when_stopped(axis, done, tell),
         booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
         progress_bar() as bar,
     ):
@@ -178,7 +187,7 @@ def run_comparison(
                     bar.update(each, visible=True)
             bar.update(bars[scheme], completed=share)
 
-        return compare_schemes(
+        comparison = compare_schemes(
             drive,
             model,
             wanted,
@@ -188,18 +197,21 @@ def run_comparison(
             finished=keep,
             stopped=stopped,
         )
+    tell(comparison)
 
 
 @contextmanager
-def _told_when_stopped(axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]]) -> Iterator[None]:
-    """Print what the schemes before have given when a test does not come to its end."""
+def _told_when_stopped(
+    axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
+) -> Iterator[None]:
+    """Tell what the schemes before have given when a test does not come to its end."""
     from hdbridge.evaluation.comparison import Comparison
 
     try:
         yield
     except BaseException:
         if done:
-            print_result(axis, Comparison.of(axis, done))
+            tell(Comparison.of(axis, done))
         raise
 
 

@@ -1,6 +1,7 @@
 """Interruptions and full disks: what was measured is kept, printed and told; one axis, one measurement."""
 
 import fcntl
+import json
 import resource
 import signal
 import subprocess
@@ -49,8 +50,9 @@ def test_without_a_folder_the_loss_is_said(tmp_path):
     assert "not kept: it takes --record FOLDER" in errors
 
 
-def test_what_the_schemes_before_have_given_is_printed(tmp_path):
-    process = started(tmp_path, "step", "article", "--simulate", "--count", 40, "--record", "kept")
+def test_what_the_schemes_before_have_given_is_printed_and_written(tmp_path):
+    outputs = ("--record", "kept", "--json", "figures.json", "--html", "page.html")
+    process = started(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
     first = tmp_path / "kept" / "stepping-none.csv.gz"
     while not first.exists():
         assert process.poll() is None
@@ -60,6 +62,10 @@ def test_what_the_schemes_before_have_given_is_printed(tmp_path):
     assert process.returncode == 130, errors
     assert "│ none" in printed
     assert "│ both" not in printed
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert "none" in figures
+    assert "both" not in figures
+    assert (tmp_path / "page.html").exists()
 
 
 def test_what_nohup_ignores_stays_ignored(tmp_path):
