@@ -6,7 +6,7 @@ how long the last one is held. `hdbridge.drive.channels` follows them on line.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
@@ -16,6 +16,13 @@ from hdbridge.files.yamlfile import wrong
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+EveryCycles = Annotated[int, Field(ge=1, le=240, description="it comes with every n-th SYNC")]
+HoldMs = Annotated[
+    float,
+    Field(gt=0, le=600_000, description="how long the last reading is held when none comes; then it is lost"),
+]
 
 
 class Scale(NamedTuple):
@@ -49,13 +56,8 @@ class LoadTorque(_Part):
     maximum_nm: float = Field(
         1000.0, gt=0, le=1e6, description="torque in either direction beyond which a reading is not believed"
     )
-    every_cycles: int = Field(1, ge=1, le=240, description="it comes with every n-th SYNC")
-    hold_ms: float = Field(
-        100.0,
-        gt=0,
-        le=600_000,
-        description="how long the last reading is held when none comes; then it is lost",
-    )
+    every_cycles: EveryCycles = 1
+    hold_ms: HoldMs = 100.0
 
     @property
     def scale(self) -> Scale:
@@ -78,13 +80,8 @@ class Temperature(_Part):
     maximum_celsius: float = Field(
         150.0, ge=-273.15, le=1000, description="temperature above which a reading is not believed"
     )
-    every_cycles: int = Field(25, ge=1, le=240, description="it comes with every n-th SYNC")
-    hold_ms: float = Field(
-        5000.0,
-        gt=0,
-        le=600_000,
-        description="how long the last reading is held when none comes; then it is lost",
-    )
+    every_cycles: EveryCycles = 25
+    hold_ms: HoldMs = 5000.0
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -110,13 +107,8 @@ class Quantity(_Part):
     at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="what a reading of zero means, in its unit")
     minimum: float = Field(-1e9, description="below this a reading is not believed")
     maximum: float = Field(1e9, description="above this a reading is not believed")
-    every_cycles: int = Field(1, ge=1, le=240, description="it comes with every n-th SYNC")
-    hold_ms: float = Field(
-        100.0,
-        gt=0,
-        le=600_000,
-        description="how long the last reading is held when none comes; then it is lost",
-    )
+    every_cycles: EveryCycles = 1
+    hold_ms: HoldMs = 100.0
 
     @property
     def scale(self) -> Scale:

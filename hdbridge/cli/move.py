@@ -157,7 +157,7 @@ def _document(axis: str, model: TransmissionModel, stands: tuple[Standing, ...])
         "stands": [
             {
                 "target_deg": each.target_deg,
-                "load_position_deg": each.target_deg + each.error_arcsec / 3600.0,
+                "load_position_deg": each.load_deg,
                 "error_arcsec": each.error_arcsec,
                 "settle_s": each.settle_s,
             }
@@ -173,7 +173,7 @@ def _print(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) ->
     for each in stands:
         table.add_row(
             f"{each.target_deg:.4f}",
-            f"{each.target_deg + each.error_arcsec / 3600.0:.4f}",
+            f"{each.load_deg:.4f}",
             f"{each.error_arcsec:z.2f}",
             f"{each.settle_s:.2f}",
         )

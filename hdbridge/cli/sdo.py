@@ -27,6 +27,7 @@ from hdbridge.cli.options import (
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
     from hdbridge.drive.drive import Drive
     from hdbridge.drive.values import Object, Value
 
@@ -65,7 +66,8 @@ def get(
     from hdbridge.drive.values import find_object
 
     files = Profile.find(profile)
-    with _drive(files, simulate, truth, seed, interface, channel, force) as drive:
+    axis = load_axis(files, interface, channel, simulate=simulate)
+    with _drive(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as drive:
         wanted = find_object(object_, drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: can only be written, by the EDS")
@@ -103,7 +105,7 @@ def put(
     if not wanted.writable:
         raise InputError(f"{wanted}: can only be read, by the EDS; nothing was written")
     data = wanted.encode(value)
-    with _drive(files, simulate, truth, seed, interface, channel, force) as drive:
+    with _drive(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as drive:
         drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         now = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub) if wanted.readable else data)
     write_json(json_file, _document(wanted, now))
@@ -112,18 +114,11 @@ def put(
 
 @contextmanager
 def _drive(
-    files: Profile,
-    simulate: bool,
-    truth: Path | None,
-    seed: int,
-    interface: str | None,
-    channel: str | None,
-    force: bool,
+    axis: AxisConfig, files: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
 ) -> Iterator[Drive]:
     """The drive, not booted: its objects are read and written as they are."""
     from hdbridge.drive.drive import Drive
 
-    axis = load_axis(files, interface, channel, simulate=simulate)
     with (
         connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
         Drive(bus, axis, clock, force=force) as drive,

@@ -37,7 +37,6 @@ from hdbridge.records.recording import Recording, Segment, versions_here
 
 Outcome = TypeVar("Outcome")
 _log = logging.getLogger(__name__)
-"""The channels that an axis need not have, and their keys in the axis file."""
 _AT_REST = Moment()
 
 

@@ -349,7 +349,7 @@ class Cycle:
             return self._last._replace(cycle=count, time_s=count * self.period_s, fresh=False)
         return Feedback(
             count, count * self.period_s, image.statusword or 0, image.motor_counts, image.load_counts,
-            image.demand_counts, image.torque_permille, False,
+            image.demand_counts, image.torque_permille, False, image.readings,
         )  # fmt: skip
 
     def _fell_out(self) -> None:

@@ -34,14 +34,14 @@ class Sensed:
 
     def take(self, feedback: Feedback) -> bool:
         """One cycle's readings; whether other channels are known than before."""
-        for slot, reading in zip(self._slots, feedback.readings, strict=False):
+        for slot, reading in zip(self._slots, feedback.readings, strict=True):
             if reading is not None:
                 self._values[slot] = reading
         present = tuple([reading is not None for reading in feedback.readings])
         if present == self._present:
             return False
         self._present = present
-        pairs = zip(self._channels, present, strict=False)
+        pairs = zip(self._channels, present, strict=True)
         self.known = frozenset(channel for channel, there in pairs if there)
         return True
 

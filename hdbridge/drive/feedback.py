@@ -19,5 +19,5 @@ class Feedback(NamedTuple):
     torque_permille: int
     fresh: bool
     """False when a TPDO was missing or not believed: the values are the last good ones."""
-    readings: tuple[float | None, ...] = ()
+    readings: tuple[float | None, ...]
     """Of each channel of the axis file the last reading that was believed; None where none is known."""

@@ -20,6 +20,11 @@ class Standing:
     settle_s: float
     """Time from the end of the move until the load stood still."""
 
+    @property
+    def load_deg(self) -> float:
+        """Where the load encoder says that it stands, degrees."""
+        return self.target_deg + self.error_arcsec / ARCSEC_PER_DEG
+
 
 @dataclass(frozen=True, slots=True)
 class SteppingOutcome:
