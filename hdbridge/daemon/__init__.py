@@ -1,0 +1,1 @@
+"""The daemon: holds the drives of one bus, day and night. See docs/architecture.md."""

@@ -1,0 +1,1 @@
+"""Parameters that wear and temperature move, followed by the load encoder."""

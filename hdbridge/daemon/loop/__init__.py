@@ -1,0 +1,1 @@
+"""The control process: one thread, one bus, one turn a period."""

@@ -1,0 +1,1 @@
+"""The flight recorder: MCAP files in a ring on disk."""

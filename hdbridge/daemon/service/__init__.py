@@ -1,0 +1,1 @@
+"""What the service process does for clients: lease, motion queue, commissioning, jobs."""

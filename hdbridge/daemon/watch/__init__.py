@@ -1,0 +1,1 @@
+"""The load-encoder watch: does the model still hold?"""

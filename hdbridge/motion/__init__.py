@@ -1,0 +1,1 @@
+"""Set-points of one axis, period by period: moves, jogs, streams and stops within the limits. Pure."""
