@@ -9,7 +9,10 @@
     │   ├── IdentityError     object 1018h, the ratio or the direction is not what the axis file says
     │   └── TransitionError   a CiA-402 transition that is not allowed, or did not come about in time
     ├── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
-    └── OutputError       6   a result could not be written (a full disk); what was measured was printed
+    ├── OutputError       6   a result could not be written (a full disk); what was measured was printed
+    └── DaemonError       7   the daemon is not reached, or does not do this for this client now
+        ├── LeaseError        who asks does not hold the right to move
+        └── RefusedError      the axis is in the wrong state for it, or busy
 
 A message says what is wrong, where (file:line:column, node and object), what was expected, and what to do.
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
@@ -68,3 +71,17 @@ class OutputError(HdbridgeError):
     """A file could not be written after all, such as on a full disk; the old one stands."""
 
     exit_status = 6
+
+
+class DaemonError(HdbridgeError):
+    """The daemon is not reached, or does not do this for this client now. Nothing moved for it."""
+
+    exit_status = 7
+
+
+class LeaseError(DaemonError):
+    """Who asks does not hold the right to move."""
+
+
+class RefusedError(DaemonError):
+    """The axis is in the wrong state for it, or busy with something else."""
