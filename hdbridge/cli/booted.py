@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.options import Profile, connected, notes
+from hdbridge.cli.options import connected, notes
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig

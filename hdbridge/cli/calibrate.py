@@ -15,7 +15,6 @@ from hdbridge.cli.options import (
     HtmlOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -26,6 +25,7 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.calibration import Calibration

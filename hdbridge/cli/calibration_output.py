@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import Profile, console, print_table, write_result
+from hdbridge.cli.options import console, print_table, write_result
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.calibration import Calibration, Stepped, Validation

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from hdbridge.cli.options import JsonOption, ModelOption, Profile, ProfileArgument, console, notes, write_json
+from hdbridge.cli.options import JsonOption, ModelOption, ProfileArgument, console, notes, write_json
+from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import Profile, console, load_axis, write_json
+from hdbridge.cli.options import console, load_axis, write_json
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.evaluation.comparison import Comparison

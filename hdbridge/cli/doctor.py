@@ -14,7 +14,6 @@ from hdbridge.cli.options import (
     ForceOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -27,6 +26,7 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.errors import DriveError
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.bringup.checks import Row

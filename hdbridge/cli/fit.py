@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.cli.options import HtmlOption, JsonOption, Profile, console, write_json, write_result
+from hdbridge.cli.options import HtmlOption, JsonOption, console, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:

@@ -11,7 +11,6 @@ from hdbridge.cli.options import (
     ForceOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -22,6 +21,7 @@ from hdbridge.cli.options import (
     notes,
     write_json,
 )
+from hdbridge.files.profile import Profile
 
 TOWARDS_SWITCH = 0.1
 """Of the axis's highest speed."""

@@ -15,7 +15,6 @@ from hdbridge.cli.options import (
     HtmlOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -28,6 +27,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.improvement import Improvement

@@ -11,8 +11,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import JsonOption, Profile, ProfileArgument, console, print_table, write_json
+from hdbridge.cli.options import JsonOption, ProfileArgument, console, print_table, write_json
 from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
 from hdbridge.model import store
 from hdbridge.model.difference import Difference, diff
 from hdbridge.model.store import ACTIVE, PENDING, Version

@@ -16,7 +16,6 @@ from hdbridge.cli.options import (
     InterfaceOption,
     JsonOption,
     ModelOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -29,6 +28,7 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.drive.drive import Drive

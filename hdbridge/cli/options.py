@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,8 +19,8 @@ from rich.text import Text
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import is_stream, write_atomically
-from hdbridge.files.bundled import bundled_profile
 from hdbridge.files.outputs import Kind, writing
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     import can
@@ -81,24 +80,6 @@ HtmlOption = Annotated[
     typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
     Kind.PAGE,
 ]
-
-
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """The files of one axis."""
-
-    axis: Path
-    model: Path
-    truth: Path
-
-    @classmethod
-    def find(cls, text: str) -> Profile:
-        """From a folder, an axis file, or the name of a bundled profile."""
-        path = Path(text)
-        if not path.exists() and path.name == text:
-            path = bundled_profile(text)
-        folder, axis = (path, path / "axis.yaml") if path.is_dir() else (path.parent, path)
-        return cls(axis, folder / "model.yaml", folder / "truth.yaml")
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:

@@ -14,7 +14,6 @@ from hdbridge.cli.options import (
     ForceOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     SeedOption,
     SimulateOption,
     TruthOption,
@@ -27,6 +26,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import DriveError, InputError
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     import can

@@ -14,7 +14,6 @@ from hdbridge.cli.options import (
     ForceOption,
     InterfaceOption,
     JsonOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -25,6 +24,7 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig

@@ -10,7 +10,6 @@ from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     ChannelOption,
     InterfaceOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     TruthOption,
@@ -19,6 +18,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:

@@ -17,7 +17,6 @@ from hdbridge.cli.options import (
     InterfaceOption,
     JsonOption,
     ModelOption,
-    Profile,
     ProfileArgument,
     SeedOption,
     SimulateOption,
@@ -33,6 +32,7 @@ from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder
 from hdbridge.files.outputs import Kind, writing
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig

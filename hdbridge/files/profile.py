@@ -1,0 +1,34 @@
+"""The files of one axis, found from what a person types or a machine file says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hdbridge.files.bundled import bundled_profile
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """The files of one axis."""
+
+    axis: Path
+    model: Path
+    truth: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where the axis file lies, and with it the history of its models."""
+        return self.axis.parent
+
+    @classmethod
+    def find(cls, text: str, base: Path = Path()) -> Profile:
+        """From a folder, an axis file, or the name of a bundled profile; InputError where it is neither.
+
+        ``base`` is the folder that a relative path starts from.
+        """
+        path = base / text
+        if not path.exists() and Path(text).name == text:
+            path = bundled_profile(text)
+        folder, axis = (path, path / "axis.yaml") if path.is_dir() else (path.parent, path)
+        return cls(axis, folder / "model.yaml", folder / "truth.yaml")
