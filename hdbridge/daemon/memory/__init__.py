@@ -1,1 +1,41 @@
 """The memory that control process and service process share: rings, mailbox, relay. No locks."""
+
+from hdbridge.daemon.memory.events import EventReader
+from hdbridge.daemon.memory.frames import IncomingReader, RelayedFrame
+from hdbridge.daemon.memory.layout import (
+    AXIS_SAMPLE,
+    NO_FAULT,
+    SAMPLES_KEPT,
+    Command,
+    CommandKind,
+    Event,
+    EventKind,
+    Knot,
+    SampleFlag,
+    sample_dtype,
+)
+from hdbridge.daemon.memory.mailbox import MailboxFullError
+from hdbridge.daemon.memory.memory import Memory
+from hdbridge.daemon.memory.samples import SampleArray, SampleReader
+from hdbridge.daemon.memory.status import Cell
+
+__all__ = [
+    "AXIS_SAMPLE",
+    "NO_FAULT",
+    "SAMPLES_KEPT",
+    "Cell",
+    "Command",
+    "CommandKind",
+    "Event",
+    "EventKind",
+    "EventReader",
+    "IncomingReader",
+    "Knot",
+    "MailboxFullError",
+    "Memory",
+    "RelayedFrame",
+    "SampleArray",
+    "SampleFlag",
+    "SampleReader",
+    "sample_dtype",
+]

@@ -1,0 +1,182 @@
+"""The memory between processes: attached, hammered, killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hdbridge.daemon.memory import Cell, CommandKind, EventKind, Memory
+from hdbridge.daemon.memory.layout import HEADER, KNOT_SLOTS, Layout
+from hdbridge.errors import InputError
+
+HAMMER = """
+import sys
+from hdbridge.daemon.memory import EventKind, Memory
+memory = Memory.attach(int(sys.argv[1]))
+cycle = 0
+while True:
+    cycle += 1
+    # Every number of a sample is the same: a torn one shows.
+    memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0, 0, 0, 0, 0, 0, *(float(cycle),) * 13))
+    if cycle % 16 == 0:
+        memory.events.tell(cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle))
+"""
+OTHER_END = """
+import os, signal, sys
+from hdbridge.daemon.memory import Cell, CommandKind, Knot, Memory
+memory = Memory.attach(int(sys.argv[1]))
+memory.status.set(Cell.SERVICE_PID, os.getpid())
+ids = [memory.commands.post(CommandKind.MOVE, 0, float(each)) for each in range(100)]
+memory.knots[0].put(Knot(1, float(each), 0.0, 0.0) for each in range(50))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def start(script: str, memory: Memory) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", script, str(memory.fd)], pass_fds=[memory.fd])
+
+
+@pytest.mark.parametrize("checked", [False, True])
+def test_no_sample_is_torn_however_fast_the_writer_is(checked: bool) -> None:
+    with Memory.create(1, 0.001, checked=checked) as memory:
+        samples_of, events_of = memory.reader(), memory.event_reader()
+        process = start(HAMMER, memory)
+        try:
+            seen = lost = told = 0
+            last = last_event = 0
+            while seen < 200_000 or told < 2000:
+                assert process.poll() is None
+                samples, missed = samples_of.read()
+                lost += missed
+                seen += len(samples)
+                if len(samples):
+                    cycles = samples["cycle"]
+                    axis = samples["axes"][:, 0]
+                    assert (cycles == samples["sequence"]).all()
+                    for name in ("load_target_deg", "weight", "issued_deg"):
+                        assert (axis[name] == cycles).all()
+                    assert cycles[0] == last + missed + 1
+                    assert (np.diff(cycles) == 1).all()
+                    last = int(cycles[-1])
+                events, missed = events_of.read()
+                told += len(events)
+                for event in events:
+                    assert event.text == str(event.cycle) == str(event.id)
+                    assert event.sequence > last_event
+                    last_event = event.sequence
+            assert seen + lost == last
+        finally:
+            process.kill()
+            process.wait()
+
+
+def test_what_a_service_posted_before_it_was_killed_is_whole_and_a_new_one_goes_on() -> None:
+    with Memory.create(1, 0.001) as memory:
+        process = start(OTHER_END, memory)
+        assert process.wait() == -signal.SIGKILL
+        assert memory.status.service_pid == process.pid
+        taken = [memory.commands.take() for _ in range(101)]
+        assert [each.a for each in taken[:100] if each] == list(map(float, range(100)))
+        assert taken[100] is None
+        assert len(memory.knots[0]) == 50
+        assert memory.knots[0].free == KNOT_SLOTS - 50
+        with Memory.attach(os.dup(memory.fd)) as successor:
+            first = taken[0]
+            assert first is not None
+            assert successor.commands.post(CommandKind.STOP, 0) == first.id + 100
+        command = memory.commands.take()
+        assert command is not None
+        assert command.kind == CommandKind.STOP
+
+
+def test_a_loop_that_takes_the_place_of_a_killed_one_goes_on_with_the_numbers() -> None:
+    with Memory.create(1, 0.001) as memory:
+        reader, events = memory.reader(), memory.event_reader()
+        process = start(HAMMER, memory)
+        while not len(reader.read()[0]):
+            time.sleep(0.01)
+        process.kill()
+        process.wait()
+        samples, lost = reader.read()
+        events.read()
+        with Memory.attach(os.dup(memory.fd)) as successor:
+            successor.samples.write(-1, 0, 0.0, 0.0, 0.0, 0, (0,) * 6 + (0.0,) * 13)
+            successor.events.tell(0, 0, -1, EventKind.BUS_UP)
+        after, lost = reader.read()
+        assert lost == 0
+        assert after["cycle"].tolist() == [-1]
+        if len(samples):
+            assert after["sequence"][0] == samples["sequence"][-1] + 1
+        (event,), lost = events.read()
+        assert (event.kind, lost) == (EventKind.BUS_UP, 0)
+
+
+def test_status_cells_are_seen_by_the_other_side(memory: Memory) -> None:
+    with Memory.attach(os.dup(memory.fd)) as other:
+        assert other.axes == 2
+        assert other.period_s == 0.004
+        for value, cell in enumerate(Cell, 1 << 40):
+            memory.status.set(cell, value)
+        status = other.status
+        assert [
+            status.loop_count,
+            status.loop_time_ns,
+            status.service_time_ns,
+            status.keeper_time_ns,
+            status.loop_pid,
+            status.service_pid,
+        ] == [(1 << 40) + place for place in range(6)]
+        assert status.stop_asked
+
+
+def foreign(data: bytes, size: int) -> int:
+    fd = os.memfd_create("foreign", os.MFD_CLOEXEC)
+    os.write(fd, data)
+    os.ftruncate(fd, size)
+    return fd
+
+
+def header(version: int = 1, axes: int = 1, size: int | None = None) -> bytes:
+    return HEADER.pack(b"hdbridge", version, axes, 1_000_000, size or Layout.of(1).total, 0, False)
+
+
+@pytest.mark.parametrize(
+    ("data", "size", "words"),
+    [
+        (b"", 0, "is not the shared memory of hdbridge"),
+        (b"something else altogether" * 10, 8192, "is not the shared memory of hdbridge"),
+        (header(version=99), 8192, "version 99, expected 1.*restart"),
+        (header(axes=0), 8192, "0 axes"),
+        (header(), 8192, "8192 bytes, expected"),
+        (header(), Layout.of(1).total, "another release"),
+    ],
+)
+def test_memory_of_somebody_else_is_refused_in_words(data: bytes, size: int, words: str) -> None:
+    fd = foreign(data, size)
+    with pytest.raises(InputError, match=words):
+        Memory.attach(fd)
+    os.close(fd)
+
+
+def test_a_descriptor_that_is_closed_is_refused_in_words() -> None:
+    fd = foreign(b"", 0)
+    os.close(fd)
+    with pytest.raises(InputError, match="cannot be read as shared memory"):
+        Memory.attach(fd)
+
+
+def test_the_memory_cannot_be_shrunk_under_those_who_use_it(memory: Memory) -> None:
+    with pytest.raises(PermissionError):
+        os.ftruncate(memory.fd, 0)
+
+
+@pytest.mark.parametrize(("axes", "period_s"), [(0, 0.004), (65, 0.004), (1, 0.0)])
+def test_senseless_sizes_are_refused(axes: int, period_s: float) -> None:
+    with pytest.raises(InputError, match="expected 1 to 64 axes"):
+        Memory.create(axes, period_s)

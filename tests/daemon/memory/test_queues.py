@@ -1,0 +1,171 @@
+"""Mailbox, events, knots, frames and blob: bounded, in order, nothing twice."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError, Memory
+from hdbridge.daemon.memory.layout import (
+    COMMAND_SLOTS,
+    EVENTS_KEPT,
+    INCOMING_KEPT,
+    KNOT_SLOTS,
+    OUTGOING_SLOTS,
+)
+from hdbridge.errors import InputError
+
+
+def test_a_command_arrives_with_its_id_and_its_numbers(memory: Memory) -> None:
+    id_ = memory.commands.post(CommandKind.MOVE, 1, 12.5, float("nan"), 3.0, i=-(1 << 62), j=5, k=6)
+    command = memory.commands.take()
+    assert command is not None
+    assert (command.id, command.kind, command.axis, command.a) == (id_, CommandKind.MOVE, 1, 12.5)
+    assert command.b != command.b
+    assert (command.i, command.j, command.k) == (-(1 << 62), 5, 6)
+    assert memory.commands.take() is None
+
+
+def test_a_full_mailbox_refuses_and_keeps_what_it_has(memory: Memory) -> None:
+    ids = [memory.commands.post(CommandKind.STOP, 0) for _ in range(COMMAND_SLOTS)]
+    with pytest.raises(MailboxFullError, match="has not taken the 256 commands"):
+        memory.commands.post(CommandKind.ENABLE, 0)
+    taken = [memory.commands.take() for _ in range(COMMAND_SLOTS)]
+    assert [each.id for each in taken if each] == ids
+    assert {each.kind for each in taken if each} == {CommandKind.STOP}
+    assert memory.commands.post(CommandKind.ENABLE, 0) == ids[-1] + 1
+
+
+def test_a_loop_that_begins_can_throw_away_what_was_meant_for_another(memory: Memory) -> None:
+    memory.commands.post(CommandKind.ENABLE, 0)
+    memory.commands.clear()
+    assert memory.commands.take() is None
+    memory.commands.post(CommandKind.STOP, 0)
+    command = memory.commands.take()
+    assert command is not None
+    assert command.kind is not None
+    assert command.kind == CommandKind.STOP
+
+
+def test_an_event_arrives_with_its_words(memory: Memory) -> None:
+    reader = memory.event_reader()
+    memory.events.tell(7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°")
+    (event,), lost = reader.read()
+    assert lost == 0
+    assert event == (1, 7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°")
+    assert event.kind is EventKind.REFUSED
+
+
+@pytest.mark.parametrize("before", ["", "x"])
+def test_a_long_text_is_cut_between_two_characters(memory: Memory, before: str) -> None:
+    reader = memory.event_reader()
+    memory.events.tell(0, 0, -1, EventKind.FAULT, text=before + "°" * 400)
+    (event,), _ = reader.read()
+    assert event.text == before + "°" * ((400 - len(before)) // 2)
+
+
+def test_events_that_nobody_read_are_counted(memory: Memory) -> None:
+    reader = memory.event_reader()
+    for cycle in range(EVENTS_KEPT + 10):
+        memory.events.tell(cycle, 0, -1, EventKind.DONE)
+    events, lost = reader.read()
+    assert lost == 11  # one more: the slot that may be under way
+    assert [each.cycle for each in events] == list(range(11, EVENTS_KEPT + 10))
+
+
+def test_frames_in_and_out(memory: Memory) -> None:
+    one, other = memory.incoming_reader(), memory.incoming_reader()
+    memory.incoming.put(5, 0x581, bytes(range(8)))
+    memory.incoming.put(6, 0x701, b"\x05")
+    for reader in (one, other):
+        frames, lost = reader.read()
+        assert lost == 0
+        assert frames == [(5, 0x581, bytes(range(8))), (6, 0x701, b"\x05")]
+    for _ in range(INCOMING_KEPT + 1):
+        memory.incoming.put(7, 0x701, b"")
+    assert one.read()[1] == 2
+
+    for count in range(OUTGOING_SLOTS):
+        assert memory.outgoing.put(count, 0x601, b"\x40")
+    assert not memory.outgoing.put(0, 0x601, b"\x40")
+    assert memory.outgoing.take() == (0, 0x601, b"\x40")
+    assert memory.outgoing.put(0, 0x602, b"")
+    memory.outgoing.clear()
+    assert memory.outgoing.take() is None
+
+
+def test_knots_of_two_axes_do_not_mix_and_are_bounded(memory: Memory) -> None:
+    first, second = memory.knots
+    wanted = [Knot(1, 0.004 * place, float(place), 0.5) for place in range(KNOT_SLOTS + 5)]
+    assert first.put(wanted) == KNOT_SLOTS
+    assert first.free == 0
+    assert second.put(wanted[:1]) == 1
+    assert first.take() == wanted[0]
+    assert second.take() == wanted[0]
+    assert second.take() is None
+    assert first.free == 1
+    first.clear()
+    assert first.take() is None
+
+
+def test_the_blob_gives_only_what_was_stored_under_that_number(memory: Memory) -> None:
+    first = memory.blobs.put(b"one" * 1000)
+    assert memory.blobs.get(first) == b"one" * 1000
+    second = memory.blobs.put(b"two")
+    assert memory.blobs.get(second) == b"two"
+    for number in (first, 0, second + 1):
+        with pytest.raises(InputError, match="overwritten"):
+            memory.blobs.get(number)
+    with pytest.raises(InputError, match="takes 2000000 bytes"):
+        memory.blobs.put(bytes(2_000_000))
+    assert memory.blobs.get(second) == b"two"
+
+
+class MailboxMachine(RuleBasedStateMachine):
+    """The mailbox against a list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.memory = Memory.create(1, 0.001)
+        self.waiting: list[tuple[int, float]] = []
+        self.last = 0
+
+    @rule(burst=st.integers(1, COMMAND_SLOTS + 20))
+    def post(self, burst: int) -> None:
+        for value in range(burst):
+            if len(self.waiting) == COMMAND_SLOTS:
+                with pytest.raises(MailboxFullError):
+                    self.memory.commands.post(CommandKind.MOVE, 0, float(value))
+                return
+            id_ = self.memory.commands.post(CommandKind.MOVE, 0, float(value))
+            assert id_ > self.last
+            self.last = id_
+            self.waiting.append((id_, float(value)))
+
+    @rule(burst=st.integers(1, COMMAND_SLOTS + 20))
+    def take(self, burst: int) -> None:
+        for _ in range(burst):
+            command = self.memory.commands.take()
+            if not self.waiting:
+                assert command is None
+                return
+            assert command is not None
+            assert (command.id, command.a) == self.waiting.pop(0)
+
+    @rule()
+    def clear(self) -> None:
+        self.memory.commands.clear()
+        self.waiting.clear()
+
+    @invariant()
+    def counts(self) -> None:
+        assert len(self.memory.commands) == len(self.waiting)
+
+    def teardown(self) -> None:
+        self.memory.close()
+
+
+MailboxMachine.TestCase.settings = settings(max_examples=30, deadline=None)
+test_the_mailbox_behaves_as_a_bounded_list = MailboxMachine.TestCase

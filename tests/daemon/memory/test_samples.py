@@ -1,0 +1,115 @@
+"""The ring of samples: what is written is read, once, whole, in order, and what is lost is counted."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SAMPLES_KEPT, Memory, SampleFlag
+from hdbridge.daemon.memory.layout import Axis
+
+
+def axis(value: float) -> Axis:
+    flags = SampleFlag.FRESH | SampleFlag.AT_REST
+    return Axis(3, 1, 4, NO_FAULT, 0x1237, flags, *(value + place for place in range(13)))
+
+
+def write(memory: Memory, cycle: int) -> None:
+    values = [number for place in range(memory.axes) for number in axis(cycle + 100.0 * place)]
+    memory.samples.write(cycle, 4_000_000 * cycle, 1.5, 250.0, 0.25, 7, values)
+
+
+def test_a_sample_arrives_as_it_was_written(memory: Memory) -> None:
+    reader = memory.reader()
+    write(memory, 42)
+    samples, lost = reader.read()
+    assert lost == 0
+    (sample,) = samples
+    assert (sample["sequence"], sample["cycle"], sample["time_ns"]) == (1, 42, 168_000_000)
+    assert [sample[name] for name in ("late_us", "busy_us", "bus_load", "skipped")] == [1.5, 250.0, 0.25, 7]
+    assert sample["axes"].dtype == AXIS_SAMPLE
+    for place, found in enumerate(sample["axes"]):
+        assert tuple(found) == tuple(axis(42.0 + 100.0 * place))
+    assert reader.read()[0].size == 0
+
+
+def test_readers_are_independent_and_begin_when_they_are_made(memory: Memory) -> None:
+    write(memory, 0)
+    first = memory.reader()
+    write(memory, 1)
+    second = memory.reader()
+    write(memory, 2)
+    assert first.read()[0]["cycle"].tolist() == [1, 2]
+    assert second.read()[0]["cycle"].tolist() == [2]
+
+
+def test_a_reader_that_was_too_slow_gets_the_newest_and_the_number_of_the_lost(memory: Memory) -> None:
+    reader = memory.reader()
+    total = SAMPLES_KEPT + 500
+    for cycle in range(total):
+        write(memory, cycle)
+    samples, lost = reader.read()
+    assert lost + len(samples) == total
+    assert samples["cycle"].tolist() == list(range(lost, total))
+    # The slot behind the newest may be under way at any time, so it is not read.
+    assert len(samples) == SAMPLES_KEPT - 1
+
+
+def test_what_was_read_stays_as_it_is(memory: Memory) -> None:
+    reader = memory.reader()
+    write(memory, 1)
+    samples, _ = reader.read()
+    for cycle in range(SAMPLES_KEPT + 2):
+        write(memory, 1000 + cycle)
+    assert samples["cycle"].tolist() == [1]
+
+
+def test_nan_says_that_there_is_no_value(memory: Memory) -> None:
+    reader = memory.reader()
+    values = [*axis(1.0)._replace(reading0=math.nan), *axis(2.0)]
+    memory.samples.write(0, 0, 0.0, 0.0, 0.0, 0, values)
+    (sample,) = reader.read()[0]
+    assert math.isnan(sample["axes"]["reading0"][0])
+    assert sample["axes"]["reading0"][1] == 12.0
+
+
+@given(st.lists(st.integers(0, 3 * SAMPLES_KEPT // 2), min_size=1, max_size=4))
+def test_every_sample_is_read_once_or_counted_as_lost(bursts: list[int]) -> None:
+    with Memory.create(1, 0.001) as memory:
+        reader = memory.reader()
+        values = axis(0.0)
+        written, seen, lost = 0, [], 0
+        for burst in bursts:
+            for _ in range(burst):
+                memory.samples.write(written, written, 0.0, 0.0, 0.0, 0, values)
+                written += 1
+            samples, missed = reader.read()
+            lost += missed
+            seen.append(samples["cycle"].copy())
+            assert missed == max(burst - (SAMPLES_KEPT - 1), 0)
+        cycles = np.concatenate(seen)
+        assert len(cycles) + lost == written
+        assert (np.diff(cycles) > 0).all()
+
+
+@pytest.mark.parametrize("field", ["sequence", "last"])
+def test_a_slot_under_way_is_not_read(memory: Memory, field: str) -> None:
+    reader = memory.reader()
+    for cycle in range(3):
+        write(memory, cycle)
+    reader._slots[2][field] = 77  # as a writer leaves it in the middle of a store
+    samples, lost = reader.read()
+    assert samples["cycle"].tolist() == [0, 2]
+    assert lost == 1
+
+
+def test_where_order_is_weak_a_checksum_finds_what_the_numbers_do_not() -> None:
+    with Memory.create(1, 0.001, checked=True) as memory:
+        reader = memory.reader()
+        memory.samples.write(5, 0, 0.0, 0.0, 0.0, 0, axis(0.0))
+        reader._slots[1]["cycle"] = 6
+        assert reader.read()[1] == 1
