@@ -6,6 +6,7 @@ no wish pending the cyclic path pays one attribute look-up.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 Outgoing = tuple[int, bytes]
@@ -30,6 +31,8 @@ class Faults:
     """As good as unplugged: it hears nothing and says nothing; its own watchdogs stop the axis."""
     load_jump_counts: int = 0
     """Added to the load encoder from the next sample on."""
+    load_reading: Callable[[int], int] | None = None
+    """What the load encoder makes of its counts from the next sample on: a drift, a freeze, noise."""
     ignore_lost_heartbeat: bool = False
     """It does not notice that the master's heartbeat stays away."""
     only_report_lost_heartbeat: bool = False

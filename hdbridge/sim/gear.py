@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from typing import ClassVar, Protocol
 
+from hdbridge.sim.ageing import AgeFactor, WornTeeth
 from hdbridge.sim.conditions import Conditions
 from hdbridge.sim.gear_pieces import (
     Creep,
@@ -175,6 +176,8 @@ def pieces_of(truth: Truth) -> list[Piece]:
     pieces += _zero_drift(truth)
     if gear.wear is not None:
         pieces.append(Wear(gear.wear, gear.ratio))
+    if gear.ageing is not None and gear.ageing.motor_orders:
+        pieces.append(WornTeeth(gear.ageing, dt_s))
     if gear.creep:
         pieces.append(Creep(gear.creep, dt_s))
     if gear.jumps:
@@ -215,7 +218,9 @@ def _hysteresis(truth: Truth) -> list[Piece]:
             continue
         rate = SpeedFactor(gear.rate_dependence, truth.substep_s) if gear.rate_dependence else None
         warmth = warmth_factor(truth, truth.temperature.friction_growth_per_k)
-        factors = tuple(factor for factor in (rate, warmth) if factor is not None)
+        ageing = gear.ageing if gear.ageing is not None and gear.ageing.hysteresis_growth else None
+        age = AgeFactor(ageing, truth.substep_s) if ageing is not None else None
+        factors = tuple(factor for factor in (rate, warmth, age) if factor is not None)
         pieces.append(VaryingHysteresis(law, factors) if factors else ElasticHysteresis(law))
     return pieces
 

@@ -6,6 +6,7 @@ Everything that moves is computed in the plant's counts; int32 appears only wher
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final, Protocol
 
 from hdbridge.sim.dictionary import Dictionary
@@ -65,6 +66,7 @@ class Motion:
         self.load_counts = machine.load_counts
         self.load_velocity_counts_s = 0.0
         self.load_jump_counts = 0
+        self.load_reading: Callable[[int], int] | None = None
         self._owed_s = 0.0
         self._polarity = dictionary[0x607E, 0]
         self._min = dictionary[0x607D, 1]
@@ -142,5 +144,8 @@ class Motion:
     def _sample(self, period_s: float) -> None:
         machine = self.machine
         self.motor_counts = machine.motor_counts
-        before, self.load_counts = self.load_counts, machine.load_counts + self.load_jump_counts
+        counts = machine.load_counts + self.load_jump_counts
+        if self.load_reading is not None:
+            counts = self.load_reading(counts)
+        before, self.load_counts = self.load_counts, counts
         self.load_velocity_counts_s = (self.load_counts - before) / period_s

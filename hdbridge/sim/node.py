@@ -312,7 +312,8 @@ class SimulatedDrive:
     # ---------------------------------------------------------------- time
 
     def _advance(self) -> None:
-        self.firmware.motion.load_jump_counts = self.faults.load_jump_counts
+        motion, faults = self.firmware.motion, self.faults
+        motion.load_jump_counts, motion.load_reading = faults.load_jump_counts, faults.load_reading
         self.firmware.advance(self._period_s)
 
     def _next_due_s(self) -> float:

@@ -336,6 +336,23 @@ def test_wear_is_lost_motion_in_either_direction_and_grows_with_the_way() -> Non
     assert back == pytest.approx(11.0, abs=0.2)
 
 
+def test_hours_of_work_change_loop_and_tooth_error_evenly_and_then_no_further() -> None:
+    loop = {"law": "rolling_friction", "offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
+    ageing = {
+        "duration_s": 20.0,
+        "hysteresis_growth": 0.5,
+        "motor_orders": [{"order": 1, "amplitude_arcsec": 10.0, "phase_deg": 90.0}],
+    }
+    machine, exercise = moved(axis(gear__hysteresis=loop, gear__ageing=ageing), 330.0, 120.0)  # 90 deg: -10
+    begun_s = float(exercise.readings().time_s[-1])
+    assert error_arcsec(machine) == pytest.approx(40.0 + (20.0 - 10.0) * begun_s / 20.0, abs=0.2)
+    exercise.hold(30.0)
+    assert error_arcsec(machine) == pytest.approx(50.0, abs=0.2)
+    exercise.move(-90.0, 700.0, 3000.0)
+    exercise.hold(0.5)
+    assert error_arcsec(machine) == pytest.approx(-60.0, abs=0.2)
+
+
 def test_a_damaged_tooth_is_met_at_one_load_angle_in_every_turn() -> None:
     damage = [{"at_deg": 100.0, "width_deg": 4.0, "height_arcsec": 15.0}]
     _, exercise = moved(axis(gear__damage=damage), 800.0 * 50.0, speed_deg_s=2000.0)

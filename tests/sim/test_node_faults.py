@@ -67,6 +67,19 @@ def test_an_encoder_jump_is_seen_at_the_load_alone(running):
     assert (row[1], row[3]) == (0, 5000)
 
 
+def test_a_load_encoder_that_stands_still_while_the_axis_moves(running):
+    running.node.faults.load_reading = lambda counts: 77
+    running.enable_csp()
+    running.cruise(40, 5)
+    running.cycle()
+    moved = running.cycle()
+    assert moved[1] >= 200
+    assert moved[3] == 77
+    running.node.faults.load_reading = None
+    running.cycle()
+    assert running.cycle()[3] == pytest.approx(moved[1] * 7.2, abs=1.0)
+
+
 def test_a_boot_up_in_motion(master, motor):
     master.enable_csp()
     master.cruise(40, 5)

@@ -120,7 +120,16 @@ def test_every_cause_is_off_unless_the_file_says_so() -> None:
         (gear.flank, gear.torque_growth_per_nm, gear.stiffening, gear.backlash_arcsec, gear.second_hysteresis)
     )
     assert not any(
-        (gear.rate_dependence, gear.wear, gear.creep, gear.jumps, gear.damage, gear.roller, gear.seat)
+        (
+            gear.rate_dependence,
+            gear.wear,
+            gear.ageing,
+            gear.creep,
+            gear.jumps,
+            gear.damage,
+            gear.roller,
+            gear.seat,
+        )
     )
     assert not any((load.stribeck, load.thinning, load.gravity, load.vibration))
     assert not any((load.encoder.disc, load.encoder.late_ms, load.encoder.losses, load.encoder.signals))

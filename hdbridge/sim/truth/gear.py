@@ -59,6 +59,18 @@ class TrueWear(Part):
     exponent: float = Field(1.0, ge=0.1, le=3, description="growth with the travel; below 1 it runs in")
 
 
+class TrueAgeing(Part):
+    """What hours of work change, evenly from the time that the axis is switched on, and then no further."""
+
+    duration_s: float = Field(gt=0, le=1e8, description="time that it takes")
+    hysteresis_growth: float = Field(
+        0.0, ge=-0.95, le=10, description="growth of the elastic hysteresis by then"
+    )
+    motor_orders: tuple[TrueOrder, ...] = Field(
+        (), description="tooth error by motor angle that has been added by then"
+    )
+
+
 class TrueCreep(Part):
     """A spring with a dashpot in parallel (Kelvin-Voigt), in series with the gear."""
 
@@ -132,6 +144,7 @@ class TrueGear(Part):
     second_hysteresis: Hysteresis | None = Field(None, description="a second law, added to the first")
     rate_dependence: TrueRate | None = Field(None, description="hysteresis by speed; without it: none")
     wear: TrueWear | None = Field(None, description="lost motion by the travel; without it: none")
+    ageing: TrueAgeing | None = Field(None, description="what hours of work change; without it: nothing")
     creep: tuple[TrueCreep, ...] = Field((), max_length=16, description="elements that yield in time")
     teeth: int | None = Field(None, ge=3, le=100_000, description="teeth of the output; else twice the ratio")
     jumps: tuple[TrueJump, ...] = Field((), description="teeth jumped, each at its time")
@@ -164,9 +177,15 @@ class TrueGear(Part):
     @model_validator(mode="after")
     def _each_order_once(self) -> Self:
         for name in ("motor_orders", "flexspline_orders", "load_orders"):
-            seen: set[int] = set()
-            for position, each in enumerate(getattr(self, name)):
-                if each.order in seen:
-                    raise wrong(f"order {each.order} stands twice", name, position, "order")
-                seen.add(each.order)
+            _refuse_twice(getattr(self, name), name)
+        if self.ageing is not None:
+            _refuse_twice(self.ageing.motor_orders, "ageing", "motor_orders")
         return self
+
+
+def _refuse_twice(orders: tuple[TrueOrder, ...], *where: str) -> None:
+    seen: set[int] = set()
+    for position, each in enumerate(orders):
+        if each.order in seen:
+            raise wrong(f"order {each.order} stands twice", *where, position, "order")
+        seen.add(each.order)
