@@ -55,6 +55,7 @@ The third one ends the program at once.
 | 4 | the drive: absent, refuses, not the one expected, reports a fault |
 | 5 | the supervision stopped the axis while it moved |
 | 6 | a result could not be written after all, on a full disk for example; what was measured is printed |
+| 7 | the daemon: not reached, or does not do this for this client now; nothing moved for it |
 | 130 | Ctrl-C: the axis was stopped, the record kept |
 """
 

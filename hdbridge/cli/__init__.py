@@ -2,7 +2,8 @@
 
 Exit status: 0 done; 1 an error in hdbridge itself; 2 bad input (nothing was written, nothing moved); 3 the
 bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (what was measured is
-printed); 130 Ctrl-C (the axis was stopped, the record kept).
+printed); 7 the daemon is not reached, or does not do this for this client now; 130 Ctrl-C (the axis was
+stopped, the record kept).
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ app = typer.Typer(
     epilog=(
         "Exit status: 0 done, 2 bad input (nothing moved, nothing written), 3 bus, 4 drive, "
         "5 stopped by supervision, 6 a result could not be written (a full disk; the figures are printed), "
-        "130 Ctrl-C (axis stopped, record kept)."
+        "7 the daemon is not reached or does not do it now, 130 Ctrl-C (axis stopped, record kept)."
     ),
 )
 

@@ -1,1 +1,4 @@
-"""Talk to the daemon from Python: messages, and a client with and without asyncio."""
+"""What talks to the daemon from outside: the messages, and the clients that exchange them.
+
+Imports nothing of the daemon. `messages` needs pydantic only, the clients the extra ``hdbridge[daemon]``.
+"""

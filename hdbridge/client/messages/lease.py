@@ -1,0 +1,40 @@
+"""The right to move: one client at a time has it, for as long as it uses it."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from pydantic import ConfigDict, Field
+
+from hdbridge.client.messages.values import Report, Request, Seconds, Words
+
+
+class LeaseRequest(Request):
+    """Ask for the right to move."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"client": "cell controller", "force": False}]})
+
+    client: Words = Field(
+        "", description="who asks, in words that others are shown; else the user and process that asked"
+    )
+    force: bool = Field(
+        False, strict=True, description="take it from whoever holds it: its motion is stopped"
+    )
+
+
+class LeaseGrant(Report):
+    """The right to move; the token goes into the header ``X-Lease`` of each request that moves."""
+
+    token: str = Field(description="secret; whoever has it may move", examples=["mZ3sWJx0b0lq"])
+    client: str = Field(description="who holds it")
+    timeout_s: Seconds = Field(description="it ends when it was not used for so long", examples=[5.0])
+
+
+class LeaseState(Report):
+    """Who may move; the token is not told."""
+
+    held: bool = Field(description="whether anybody has the right to move")
+    client: str | None = Field(None, description="who holds it", examples=["cell controller"])
+    since: datetime | None = Field(None, description="since when")
+    remaining_s: float | None = Field(None, description="until it ends unless it is used", examples=[4.2])
+    timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])

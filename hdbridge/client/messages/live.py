@@ -1,0 +1,122 @@
+"""Samples and events as they come, and what goes over the two WebSockets."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Final, Literal
+
+from pydantic import Field
+
+from hdbridge.client.messages.requests import AXES_MAXIMUM, StreamPoint
+from hdbridge.client.messages.values import Name, Real, Report, Request
+
+POINTS_MAXIMUM: Final = 1000
+"""Stream points of one message."""
+_Column = list[float | None]
+
+
+class EventKind(StrEnum):
+    """What an event of the loop or the service tells."""
+
+    DONE = "done"
+    REFUSED = "refused"
+    STATE = "state"
+    FAULT = "fault"
+    STOPPED = "stopped"
+    MOTION_ENDED = "motion-ended"
+    UNDERRUN = "underrun"
+    BUS_DOWN = "bus-down"
+    BUS_UP = "bus-up"
+    CHANGED = "changed"
+    STREAM_REFUSED = "stream-refused"
+    ENDING = "ending"
+    NOTE = "note"
+    """From the service: a lease, a job, the recorder, the watch, the adaptation."""
+
+
+class Event(Report):
+    """Something that happened."""
+
+    sequence: int = Field(ge=0, description="counts from the start of the service", examples=[17])
+    kind: EventKind
+    date: datetime = Field(description="by the machine's clock")
+    cycle: int | None = Field(None, description="cycle of the loop")
+    axis: Name | None = Field(None, description="None: of the machine")
+    text: str = Field("", description="in words", examples=["cycle 120: a TPDO is missing (282h): freeze"])
+    hint: str | None = Field(None, description="what a person does about it")
+
+
+class Events(Report):
+    """Events since the one that was asked for."""
+
+    events: list[Event]
+    lost: int = Field(0, ge=0, description="older ones that are kept no more")
+    newest: int = Field(0, ge=0, description="ask for those since this one next time")
+
+
+class AxisColumns(Report):
+    """What one axis did: a value per sample in each column, None where there is none."""
+
+    state: list[str]
+    load_target_deg: _Column
+    load_position_deg: _Column
+    motor_position_deg: _Column
+    motor_torque_nm: _Column
+    velocity_deg_s: _Column
+    error_arcsec: _Column
+    correction_arcsec: _Column
+    predicted_arcsec: _Column
+    loop_arcsec: _Column
+    weight: _Column
+    reading0: _Column
+    reading1: _Column
+
+
+class Samples(Report):
+    """A batch of cycles in columns, oldest first."""
+
+    type: Literal["samples"] = "samples"
+    time_s: list[float] = Field(description="of SYNC, by the machine's monotonic clock")
+    cycle: list[int]
+    late_us: list[float]
+    busy_us: list[float]
+    bus_load: list[float]
+    skipped: list[int] = Field(description="periods left out since the loop began")
+    axes: dict[Name, AxisColumns]
+    events: list[Event] = Field(default=[], description="what happened meanwhile")
+    lost: int = Field(0, ge=0, description="cycles that this client was too slow for, since the last batch")
+
+
+class LiveOptions(Request):
+    """What a client of the live feed wants; its first message, and again whenever it wants something else."""
+
+    token: str | None = Field(None, max_length=200, description="over TCP, where the header cannot be set")
+    every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
+        1, description="one sample in so many cycles; the newest of each group", examples=[10]
+    )
+    axes: list[Name] | None = Field(None, max_length=AXES_MAXIMUM, description="only these; else all")
+
+
+class StreamBegin(Request):
+    """The first message of a stream."""
+
+    token: str | None = Field(None, max_length=200, description="over TCP, where the header cannot be set")
+    lease: str = Field(max_length=200, description="the token of the lease")
+    timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
+        0.5, description="without a point for so long the axis stops within its limits"
+    )
+
+
+class StreamPoints(Request):
+    """Knots to append; the stream ends where the last one has speed 0 and ``end`` is set."""
+
+    points: list[StreamPoint] = Field(max_length=POINTS_MAXIMUM)
+    end: bool = Field(False, strict=True, description="no more points follow")
+
+
+class StreamAnswer(Report):
+    """The answer to each message of a stream."""
+
+    accepted: int = Field(ge=0, description="points taken of the message")
+    detail: str | None = Field(None, description="why no more; the axis then stops within its limits")

@@ -1,0 +1,71 @@
+"""Errors over the wire (RFC 9457, ``application/problem+json``), and the way back to `hdbridge.errors`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pydantic import Field
+
+from hdbridge import errors
+from hdbridge.client.messages.values import Report
+from hdbridge.errors import HdbridgeError
+
+CONTENT_TYPE: Final = "application/problem+json"
+TYPE_PREFIX: Final = "urn:hdbridge:problem:"
+
+STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
+    errors.LeaseError: (423, "The right to move is not yours"),
+    errors.RefusedError: (409, "Not in this state"),
+    errors.DaemonError: (403, "Refused"),
+    errors.InputError: (422, "The request cannot be met"),
+    errors.BusInUseError: (409, "Another master is on the bus"),
+    errors.BusError: (503, "The bus is not there"),
+    errors.IdentityError: (409, "Not the drive of the axis file"),
+    errors.TransitionError: (409, "Not in this state"),
+    errors.SdoError: (502, "The drive did not take or give the object"),
+    errors.DriveError: (502, "The drive refused"),
+    errors.SafetyStop: (409, "Stopped by the supervision"),
+    errors.OutputError: (507, "A result could not be written"),
+    HdbridgeError: (500, "An error in hdbridge"),
+}
+"""Status and title of each error raised on purpose; the first row that fits counts."""
+
+
+class Problem(Report):
+    """What went wrong with a request."""
+
+    type: str = Field(description="which kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
+    title: str = Field(description="the kind in words", examples=["The right to move is not yours"])
+    status: int = Field(ge=400, le=599, description="HTTP status", examples=[423])
+    detail: str = Field(
+        description="what is wrong, what was expected and what to do, in one line",
+        examples=["'cell controller' holds the lease for another 4.2 s; wait, or take it with force"],
+    )
+    axis: str | None = Field(None, description="the axis concerned", examples=["joint-3"])
+    hint: str | None = Field(None, description="what a person does about it")
+    errors: list[str] = Field(
+        default=[],
+        description="of a request that is not valid: each complaint with the key it is about",
+        examples=[["target_deg: expected a finite number"]],
+    )
+
+    @classmethod
+    def of(cls, error: HdbridgeError, axis: str | None = None) -> Problem:
+        """The problem that an error is over HTTP."""
+        status, title = next(row for kind, row in STATUS.items() if isinstance(error, kind))
+        detail = str(error)
+        said, _, hint = detail.rpartition("; ")
+        return cls(
+            type=f"{TYPE_PREFIX}{type(error).__name__}",
+            title=title,
+            status=status,
+            detail=detail,
+            axis=axis,
+            hint=hint if said else None,
+        )
+
+    def error(self) -> HdbridgeError:
+        """The error to raise where the request was made; one of a kind that is not known is a DaemonError."""
+        kind = getattr(errors, self.type.removeprefix(TYPE_PREFIX), None)
+        known = isinstance(kind, type) and issubclass(kind, HdbridgeError)
+        return (kind if known else errors.DaemonError)("; ".join((self.detail, *self.errors)))

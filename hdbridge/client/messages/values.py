@@ -1,0 +1,103 @@
+"""What several messages share: bounded numbers, names, closed sets, the two kinds of message."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+WORDS_MAXIMUM: Final = 400
+"""Characters of a text that a client gives."""
+
+Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+"""A number, not the text of one; NaN and infinity are refused."""
+Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
+"""Degrees at the load, multi-turn; the axis's own limits are narrower."""
+Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]
+"""Degrees per second at the load, without a sign."""
+Velocity = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e5, le=1e5)]
+"""Degrees per second at the load, with a sign."""
+Acceleration = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e7)]
+"""Degrees per second squared at the load."""
+Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=86_400)]
+Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+"""Of an axis or a machine, as in its file."""
+Words = Annotated[
+    str, StringConstraints(strict=True, max_length=WORDS_MAXIMUM, pattern=r"^[^\x00-\x1f\x7f]*$")
+]
+"""One line of text."""
+
+
+class Request(BaseModel):
+    """What a client sends: unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Report(BaseModel):
+    """What the daemon sends: keys that a newer daemon adds are ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="null")
+
+
+class ControlState(StrEnum):
+    """Where the control loop has an axis, in the order of the loop's own numbers."""
+
+    UNVERIFIED = "unverified"
+    """The drive was not checked against its axis file yet: nothing is sent to it."""
+    DISABLED = "disabled"
+    ENABLING = "enabling"
+    ENABLED = "enabled"
+    STOPPING = "stopping"
+    """On its way to a stop in order, or to being disabled."""
+    LENT = "lent"
+    """The service has the drive, for homing: the loop sends it no targets."""
+    QUICK_STOPPED = "quick-stopped"
+    """Latched: only a reset leads back."""
+    LATCHED = "latched"
+    """Latched until the drive was verified again."""
+
+
+class MotionMode(StrEnum):
+    """What generates the targets of an axis, in the order of the loop's own numbers."""
+
+    HOLD = "hold"
+    GOTO = "goto"
+    JOG = "jog"
+    STREAM = "stream"
+    STOP = "stop"
+
+
+class PowerState(StrEnum):
+    """The CiA-402 state that the drive's statusword tells."""
+
+    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY_TO_SWITCH_ON = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    OPERATION_ENABLED = "operation enabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
+    FAULT_REACTION_ACTIVE = "fault reaction active"
+    FAULT = "fault"
+    UNKNOWN = "unknown"
+
+
+class Scheme(StrEnum):
+    """Which parts of the model compensate."""
+
+    NONE = "none"
+    SYNCHRONOUS = "synchronous"
+    HYSTERESIS = "hysteresis"
+    BOTH = "both"
+    EXTENDED = "extended"
+    """The whole model, with what a diagnosis added to it."""
+
+
+class AdaptationMode(StrEnum):
+    """Whether parameters follow the load encoder."""
+
+    OFF = "off"
+    OBSERVE = "observe"
+    """Estimates, reports what it would change, and changes nothing."""
+    ON = "on"

@@ -1,0 +1,136 @@
+"""The messages: what a request refuses, that closed sets are those of the house, errors there and back."""
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
+
+from hdbridge import errors
+from hdbridge.client import messages
+from hdbridge.client.messages.problem import STATUS
+from hdbridge.client.messages.values import Request
+from hdbridge.drive.states import State
+from hdbridge.evaluation.stepping import Scheme
+
+REQUESTS = [each for each in vars(messages).values() if isinstance(each, type) and issubclass(each, Request)]
+RAISED = [
+    each
+    for each in vars(errors).values()
+    if isinstance(each, type) and issubclass(each, errors.HdbridgeError)
+]
+EXAMPLES = {
+    messages.Move: {"target_deg": 30.0},
+    messages.Coordinated: {"targets_deg": {"a": 1.0}},
+    messages.Jog: {"velocity_deg_s": 1.0},
+    messages.QueueItem: {"target_deg": 1.0},
+    messages.StreamPoint: {"time_s": 0.0, "position_deg": 1.0, "velocity_deg_s": 0.0},
+    messages.Home: {"method": 37},
+}
+
+
+@pytest.mark.parametrize("request_", EXAMPLES, ids=lambda each: each.__name__)
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e300, "30", True, None, [1.0]])
+def test_a_number_of_a_request_is_finite_bounded_and_a_number(request_, wrong):
+    right = EXAMPLES[request_]
+    assert request_.model_validate(right)
+    name = next(iter(right))
+    value = {"a": wrong} if isinstance(right[name], dict) else wrong
+    with pytest.raises(ValidationError) as refused:
+        request_.model_validate({**right, name: value})
+    assert name in str(refused.value)
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=lambda each: each.__name__)
+def test_a_request_refuses_a_key_that_it_does_not_know(request_):
+    with pytest.raises(ValidationError, match="taget_deg"):
+        request_.model_validate({**EXAMPLES.get(request_, {}), "taget_deg": 1.0})
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=lambda each: each.__name__)
+def test_every_field_that_takes_much_is_bounded(request_):
+    """A list, a text or a mapping without an upper limit would let one request fill the memory."""
+
+    def unbounded(schema, path):
+        kind = schema.get("type")
+        if kind == "string" and not {"maxLength", "enum", "pattern", "const"} & schema.keys():
+            yield path
+        if kind == "array":
+            if "maxItems" not in schema:
+                yield path
+            yield from unbounded(schema["items"], path + "[]")
+        if kind == "object" and "properties" not in schema and "maxProperties" not in schema:
+            yield path
+        if kind in {"number", "integer"}:
+            low, high = {"minimum", "exclusiveMinimum"}, {"maximum", "exclusiveMaximum"}
+            if not (low & schema.keys() and high & schema.keys()) and "options" not in path:
+                yield path
+        for name, below in schema.get("properties", {}).items():
+            yield from unbounded(below, f"{path}.{name}")
+        for below in [*schema.get("anyOf", []), *schema.get("$defs", {}).values()]:
+            yield from unbounded(below, path)
+
+    assert [*unbounded(request_.model_json_schema(), request_.__name__)] == []
+
+
+def test_a_report_ignores_what_a_newer_daemon_adds():
+    state = messages.LeaseState.model_validate({"held": False, "timeout_s": 5.0, "colour": "red"})
+    assert not state.held
+
+
+def test_closed_sets_are_those_of_the_drive_and_the_evaluation():
+    assert [each.value for each in messages.PowerState] == [each.value for each in State]
+    assert [each.value for each in messages.Scheme] == [each.value for each in Scheme]
+
+
+@pytest.mark.parametrize("kind", RAISED, ids=lambda each: each.__name__)
+def test_an_error_comes_back_as_what_it_was(kind):
+    problem = messages.Problem.of(kind("node 3: no answer; check its power"), axis="joint-3")
+    assert problem.hint == "check its power"
+    assert problem.axis == "joint-3"
+    back = messages.Problem.model_validate_json(problem.model_dump_json()).error()
+    assert type(back) is kind
+    assert str(back) == "node 3: no answer; check its power"
+    assert back.exit_status == kind.exit_status
+
+
+def test_the_narrowest_row_of_an_error_counts():
+    """A kind that stands behind one that it is derived from would never be told."""
+    kinds = list(STATUS)
+    assert [
+        (early, late)
+        for place, early in enumerate(kinds)
+        for late in kinds[place + 1 :]
+        if issubclass(late, early)
+    ] == []
+
+
+@given(st.text(max_size=60), st.text(max_size=60))
+def test_a_problem_of_another_server_is_still_an_error_of_hdbridge(kind, detail):
+    back = messages.Problem(type=kind, title="?", status=418, detail=detail).error()
+    assert isinstance(back, errors.HdbridgeError)
+
+
+def test_a_number_that_is_not_one_never_gets_into_json():
+    columns = {name: [math.nan] for name in messages.AxisColumns.model_fields}
+    columns["state"] = ["enabled"]
+    batch = messages.Samples(
+        time_s=[0.0],
+        cycle=[1],
+        late_us=[0.0],
+        busy_us=[0.0],
+        bus_load=[0.0],
+        skipped=[0],
+        axes={"a": messages.AxisColumns(**columns)},
+    )
+    assert json.loads(batch.model_dump_json())["axes"]["a"]["weight"] == [None]
+
+
+@pytest.mark.parametrize("name", messages.__all__)
+def test_every_message_says_what_it_is(name):
+    found = getattr(messages, name)
+    assert found.__doc__
+    if isinstance(found, type) and issubclass(found, BaseModel):
+        assert found.model_json_schema()["title"] == name
