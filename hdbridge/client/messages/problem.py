@@ -66,6 +66,6 @@ class Problem(Report):
 
     def error(self) -> HdbridgeError:
         """The error to raise where the request was made; one of a kind that is not known is a DaemonError."""
-        kind = getattr(errors, self.type.removeprefix(TYPE_PREFIX), None)
-        known = isinstance(kind, type) and issubclass(kind, HdbridgeError)
-        return (kind if known else errors.DaemonError)("; ".join((self.detail, *self.errors)))
+        name = self.type.removeprefix(TYPE_PREFIX)
+        kind = next((each for each in STATUS if each.__name__ == name), errors.DaemonError)
+        return kind("; ".join((self.detail, *self.errors)))
