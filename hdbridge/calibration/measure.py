@@ -11,7 +11,8 @@ from typing import Any
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.calibration.journal import Journal
-from hdbridge.control.bench import Bench, axis_view, lost_channels
+from hdbridge.control.bench import axis_view, lost_channels
+from hdbridge.control.rig import ProcedureBench, Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
@@ -101,7 +102,7 @@ def start_journal(
 
 
 def measure(
-    drive: Drive,
+    drive: Drive | Rig,
     journal: Journal,
     *,
     progress: Callable[[str, float, float], None] = lambda *_: None,
@@ -118,7 +119,7 @@ def measure(
         return
     make_folder(journal.folder)  # a disk that cannot be written is noticed before the axis moves
     pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
-    bench = Bench(drive, interrupted=pace.interrupted)
+    bench = bench_on(drive, interrupted=pace.interrupted)
     journal.begin_session()
     for task in left.tasks:
         pace.begin(task.name)
@@ -128,12 +129,12 @@ def measure(
             raise  # refused before anything moved
         except (HdbridgeError, KeyboardInterrupt):
             with suppress(OSError, OutputError):
-                _add(journal, task, bench, complete=False)
+                _add(journal, drive.axis, task, bench, complete=False)
             raise
-        _add(journal, task, bench, complete=True)
+        _add(journal, drive.axis, task, bench, complete=True)
 
 
-def _add(journal: Journal, task: Task, bench: Bench, *, complete: bool) -> None:
+def _add(journal: Journal, axis: AxisConfig, task: Task, bench: ProcedureBench, *, complete: bool) -> None:
     record = bench.record()
-    lost = lost_channels(bench.axis, record)
+    lost = lost_channels(axis, record)
     journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.survived)

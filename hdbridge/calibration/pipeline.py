@@ -16,6 +16,7 @@ from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import left_realtime
+from hdbridge.control.rig import Rig
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import write_atomically
@@ -32,7 +33,7 @@ Progress = Callable[[str, float, float], None]
 
 @left_realtime()  # a fit takes its time; a bench goes back for each motion
 def calibrate(
-    drive: Drive,
+    drive: Drive | Rig,
     journal: Journal,
     profile: Path,
     date: datetime,
@@ -83,7 +84,9 @@ def calibrate(
     return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
 
 
-def proposed(profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive) -> Offer:
+def proposed(
+    profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
+) -> Offer:
     """The model as pending; where it cannot be written, the figures are told nonetheless."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
@@ -156,7 +159,7 @@ def concluded(folder: Path) -> Calibration:
 
 
 def active_model(
-    profile: Path, axis: AxisConfig, drive: Drive, tell: Callable[[str], None] = lambda _: None
+    profile: Path, axis: AxisConfig, drive: Drive | Rig, tell: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
     """The profile's active model, where it is this axis's and this drive's."""
     path = profile / "model.yaml"

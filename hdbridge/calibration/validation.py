@@ -14,7 +14,8 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import resting
 from hdbridge.calibration.measure import Pace
-from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.rig import ProcedureBench, Rig, bench_on
 from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.evaluation.accuracy import AxisAccuracy, axis_accuracy
@@ -204,7 +205,7 @@ def validation_s(plan: Plan, axis: AxisConfig) -> float:
 
 
 def validate(
-    drive: Drive,
+    drive: Drive | Rig,
     plan: Plan,
     before: TransmissionModel | None,
     after: TransmissionModel,
@@ -231,7 +232,7 @@ def validate(
     ):
         pace.begin(f"stepping {name}")
         compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
-        bench = Bench(drive, compensation, interrupted=pace.interrupted)
+        bench = bench_on(drive, compensation, interrupted=pace.interrupted)
         with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
             run = bench.run(stepping)
             results.append(Stepped.of(words, run.outcome))
@@ -254,7 +255,7 @@ def validate(
 
 
 @contextmanager
-def record_kept(bench: Bench, path: Path) -> Iterator[None]:
+def record_kept(bench: ProcedureBench, path: Path) -> Iterator[None]:
     """Write what the bench measures within, also when it is stopped."""
     try:
         yield

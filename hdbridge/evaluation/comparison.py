@@ -8,7 +8,8 @@ from functools import partial
 from typing import Any
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.bench import Bench, Run, compensation_for
+from hdbridge.control.bench import Run, compensation_for
+from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import lines
 from hdbridge.drive.drive import Drive
 from hdbridge.evaluation.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
@@ -47,7 +48,7 @@ class Comparison:
 
 
 def compare_schemes(
-    drive: Drive,
+    drive: Drive | Rig,
     model: TransmissionModel,
     schemes: Sequence[Scheme],
     stepping: Stepping,
@@ -66,7 +67,7 @@ def compare_schemes(
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme, compensation in compensations.items():
-        bench = Bench(drive, compensation, interrupted=interrupted)
+        bench = bench_on(drive, compensation, interrupted=interrupted)
         try:
             runs[scheme] = bench.run(stepping, partial(progress, scheme))
         except BaseException:

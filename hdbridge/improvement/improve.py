@@ -19,6 +19,7 @@ from hdbridge.calibration.validation import floor_of
 from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import left_realtime
+from hdbridge.control.rig import Rig
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -52,7 +53,7 @@ class Source:
 
 @left_realtime()  # a fit takes its time; a bench goes back for each motion
 def improve(
-    drive: Drive,
+    drive: Drive | Rig,
     source: Source,
     profile: Path,
     active: TransmissionModel,
@@ -121,7 +122,7 @@ def improve(
 class _Bench:
     """What every measurement here is run with."""
 
-    drive: Drive
+    drive: Drive | Rig
     date: datetime
     progress: Progress
     interrupted: Callable[[], bool]

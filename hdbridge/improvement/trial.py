@@ -13,7 +13,8 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
 from hdbridge.calibration.validation import CHANCE, Floor, Stepped, Validation, record_kept, worse_ways
-from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Hysteresis, HysteresisMemory
@@ -76,7 +77,7 @@ class Trial:
 
 
 def try_out(
-    drive: Drive,
+    drive: Drive | Rig,
     plan: Plan,
     active: TransmissionModel,
     model: TransmissionModel,
@@ -101,7 +102,7 @@ def try_out(
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             title = f"{name}-{'before' if which == 0 else 'after'}"
             pace.begin(title.replace("-", " "))
-            bench = Bench(drive, compensations[which], interrupted=pace.interrupted)
+            bench = bench_on(drive, compensations[which], interrupted=pace.interrupted)
             with record_kept(bench, folder / f"{title}.csv.gz"):
                 run = bench.run(procedure)
                 outcomes[which].append(run.outcome)
