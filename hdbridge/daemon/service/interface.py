@@ -14,14 +14,13 @@ raise an `HdbridgeError` whose text is one line that a person can act on:
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hdbridge.client import messages
 from hdbridge.evaluation.stepping import Scheme
 
 if TYPE_CHECKING:
+    from hdbridge.daemon.memory import Event, SampleArray
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.drive.values import Object, Value
 
@@ -51,9 +50,9 @@ class StreamPoint(NamedTuple):
 class Batch(NamedTuple):
     """What a subscriber gets at a time."""
 
-    samples: NDArray[np.void]
-    """One row per cycle, of the dtype `hdbridge.daemon.memory` describes."""
-    events: Sequence[Any]
+    samples: SampleArray
+    """One row per cycle, as `hdbridge.daemon.memory.sample_dtype` has it."""
+    events: Sequence[Event]
     lost: int
     """Cycles that this subscriber was too slow for."""
 
@@ -80,6 +79,10 @@ class AxisPort(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    def state(self) -> messages.AxisState:
+        """Everything about it at the newest cycle."""
+        ...
 
     async def enable(self, holder: str) -> None:
         """Power on, standing still; the drive is booted and verified first where it is not."""
@@ -151,8 +154,8 @@ class AxisPort(Protocol):
         """Compensate by this part of the model in use; faded over, also in motion."""
         ...
 
-    async def activate_model(self, holder: str, version: str) -> None:
-        """Make another model of the profile the active one and use it: a number, ``pending`` or ``active``.
+    async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
+        """Make another model of the profile the active one and use it: a version, ``pending`` or ``active``.
 
         ``pending`` commits it; ``active`` reads the profile's model again. Faded over, also in motion.
         """
@@ -166,8 +169,10 @@ class AxisPort(Protocol):
         """Write an object of the drive, the value as text; refused while the axis is enabled."""
         ...
 
-    async def job(self, holder: str, kind: str, options: Mapping[str, Any] | None = None) -> str:
-        """Begin a job (``step``, ``calibrate``, ``improve``) and return its id; see `Bridge.jobs`."""
+    async def job(
+        self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
+    ) -> messages.Job:
+        """Begin a job; `Bridge.jobs` tells how far it is. ``options``: of the command of that name."""
         ...
 
 
@@ -178,6 +183,18 @@ class Bridge(Protocol):
     def axes(self) -> Mapping[str, AxisPort]: ...
     @property
     def lease(self) -> Lease: ...
+
+    def state(self) -> messages.MachineState:
+        """Everything about the machine at the newest cycle."""
+        ...
+
+    def events(self, since: int = 0) -> messages.Events:
+        """Events with a higher sequence number than ``since``, oldest first."""
+        ...
+
+    def jobs(self) -> list[messages.Job]:
+        """The jobs that run and the last ones that ran, newest last."""
+        ...
 
     async def quick_stop(self) -> None:
         """Every axis at once."""
@@ -195,4 +212,20 @@ class Bridge(Protocol):
 
     async def cancel_job(self, holder: str, job_id: str) -> None:
         """Stop a job's axis in order; what it has measured is kept."""
+        ...
+
+    def mark(self, text: str) -> None:
+        """A remark for the event log and the flight recorder, at the present cycle."""
+        ...
+
+    async def load_loop(self, holder: str, axis: str, on: bool) -> None:
+        """Switch an axis's slow integral of the measured error on or off; InputError where it has none."""
+        ...
+
+    async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
+        """How an axis's parameters follow the load encoder from now on."""
+        ...
+
+    async def adaptation_back(self, holder: str, axis: str) -> None:
+        """Forget what the adaptation of an axis has changed: the model as it was activated."""
         ...
