@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
+from hdbridge.daemon.machinefile import MachineFile
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.model.file import ModelFile
 from hdbridge.model.store import LogFile
@@ -76,6 +77,7 @@ def procedure_table() -> str:
 
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
+    "machine": lambda: key_table(MachineFile),
     "model": lambda: key_table(ModelFile),
     "columns": column_table,
     "recording": lambda: key_table(RecordingFile),

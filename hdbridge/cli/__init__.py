@@ -32,7 +32,7 @@ PANELS: Final = {
     "Before the first move": {
         "new": "Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of "
         "itself.",
-        "check": "Read an axis file, its EDS and its model; say what they mean, or what is wrong and where.",
+        "check": "Read the files of an axis or of a machine; say what they mean, or what is wrong and where.",
         "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
         "axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "

@@ -1,11 +1,29 @@
-"""``hdbridge check``: are the files of an axis right?"""
+"""``hdbridge check``: are the files of an axis, or of a machine, right?"""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
 import typer
 
-from hdbridge.cli.options import JsonOption, ModelOption, ProfileArgument, console, notes, write_json
+from hdbridge.cli.options import JsonOption, ModelOption, console, notes, write_json
+from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.daemon.machine import Machine
+    from hdbridge.drive.writes import PlannedWrite
+
+CheckedArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROFILE",
+        help="A folder with axis.yaml (and model.yaml), an axis file, a machine file, or one that comes with "
+        "hdbridge: article, demo, cell.",
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -13,50 +31,94 @@ def register(app: typer.Typer) -> None:
     app.command("check")(check)
 
 
-def check(profile: ProfileArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
-    """Read an axis file, its EDS and its model; say what they mean, or what is wrong and where."""
+def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
+    """Read the files of an axis or of a machine; say what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
-    from hdbridge.control.bench import compensation_for
-    from hdbridge.control.caps import cap_remark
-    from hdbridge.drive import load_eds, plan
-    from hdbridge.drive.writes import left_out
-    from hdbridge.evaluation.stepping import quantisation_floor_arcsec
-    from hdbridge.model import TransmissionModel
+    from hdbridge.daemon.machine import Machine, machine_file
 
-    files = Profile.find(profile)
-    axis = AxisConfig.load(files.axis)
-    od = load_eds(axis.eds_path, axis.drive.node_id)
-    plan(axis, od)
-    floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
-    facts = {
-        "axis": axis.name,
-        "bus": f"{axis.bus.interface}:{axis.bus.channel}, node {axis.drive.node_id}",
-        "cycle": f"{axis.drive.cycle_ms:g} ms",
-        "ratio": f"{axis.gear.ratio:g}",
-        "one motor count": f"{floor / 3 * 12**0.5:.3g} arcsec at the load",
-        "quantisation floor": f"{floor:.3g} arcsec (3 sigma)",
-        "travel": f"{axis.limits.position_min_deg:g} to {axis.limits.position_max_deg:g} deg",
+    path = machine_file(profile)
+    if path is None:
+        files = Profile.find(profile)
+        reports = [_Report(AxisConfig.load(files.axis), model or _existing(files.model))]
+        document: dict[str, Any] = {"schema": "hdbridge.check/1", **reports[0].document()}
+    elif model is not None:
+        raise InputError("--model goes with one axis: a machine's axes have their models in their profiles")
+    else:
+        machine = Machine.load(path)
+        reports = [_Report(axis.config, _existing(axis.profile.model)) for axis in machine.axes]
+        facts = _of_machine(machine)
+        document = {"schema": "hdbridge.check/1", **facts, "axes": [each.document() for each in reports]}
+        _print(facts)
+    write_json(json_file, document)
+    for report in reports:
+        report.print()
+    console.print("all right")
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.exists() else None
+
+
+def _of_machine(machine: Machine) -> dict[str, str]:
+    names = ", ".join(axis.name for axis in machine.axes)
+    return {
+        "machine": machine.name,
+        "axes of it": names,
     }
-    if axis.channels:
-        facts["other channels"] = ", ".join(axis.channels).replace("_", " ")
-    remark = None
-    path = model or (files.model if files.model.exists() else None)
-    if path is not None:
-        loaded = TransmissionModel.load(path)
-        compensation_for(axis, loaded)
-        remark = cap_remark(axis, loaded)
-        facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
-    lacking = left_out(axis, od)
-    write_json(json_file, {"schema": "hdbridge.check/1", **facts, "left to the drive": [*map(str, lacking)]})
+
+
+def _print(facts: dict[str, str]) -> None:
     for name, value in facts.items():
         console.print(f"{name:>20}  {value}")
-    for row in lacking:
-        source = f" ({axis.where(row.field)})" if row.field else ""
-        console.print(
-            f"{'left to the drive':>20}  {row.index:04X}h:{row.sub:02X}, which {axis.drive.eds} lacks: "
-            f"{row.why}{source}",
-            soft_wrap=True,
-        )
-    if remark:
-        notes.print(remark, markup=False, soft_wrap=True)
-    console.print("all right")
+
+
+class _Report:
+    """What the files of one axis mean."""
+
+    def __init__(self, axis: AxisConfig, model: Path | None) -> None:
+        from hdbridge.control.bench import compensation_for
+        from hdbridge.control.caps import cap_remark
+        from hdbridge.drive import load_eds, plan
+        from hdbridge.drive.writes import left_out
+        from hdbridge.evaluation.stepping import quantisation_floor_arcsec
+        from hdbridge.model import TransmissionModel
+
+        self._axis = axis
+        od = load_eds(axis.eds_path, axis.drive.node_id)
+        plan(axis, od)
+        floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+        self.facts = {
+            "axis": axis.name,
+            "bus": f"{axis.bus.interface}:{axis.bus.channel}, node {axis.drive.node_id}",
+            "cycle": f"{axis.drive.cycle_ms:g} ms",
+            "ratio": f"{axis.gear.ratio:g}",
+            "one motor count": f"{floor / 3 * 12**0.5:.3g} arcsec at the load",
+            "quantisation floor": f"{floor:.3g} arcsec (3 sigma)",
+            "travel": f"{axis.limits.position_min_deg:g} to {axis.limits.position_max_deg:g} deg",
+        }
+        if axis.channels:
+            self.facts["other channels"] = ", ".join(axis.channels).replace("_", " ")
+        self.remark: str | None = None
+        if model is not None:
+            loaded = TransmissionModel.load(model)
+            compensation_for(axis, loaded)
+            self.remark = cap_remark(axis, loaded)
+            self.facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
+        self.lacking: list[PlannedWrite] = left_out(axis, od)
+
+    def document(self) -> dict[str, Any]:
+        """For machines."""
+        return {**self.facts, "left to the drive": [*map(str, self.lacking)]}
+
+    def print(self) -> None:
+        """For a person."""
+        _print(self.facts)
+        for row in self.lacking:
+            source = f" ({self._axis.where(row.field)})" if row.field else ""
+            console.print(
+                f"{'left to the drive':>20}  {row.index:04X}h:{row.sub:02X}, which {self._axis.drive.eds} "
+                f"lacks: {row.why}{source}",
+                soft_wrap=True,
+            )
+        if self.remark:
+            notes.print(self.remark, markup=False, soft_wrap=True)

@@ -29,7 +29,7 @@ def test_every_table_is_on_the_page(tool):
 def test_every_key_has_a_meaning(tool):
     rows = [
         row
-        for name in ("axis", "model", "recording", "history", "plan", "procedures")
+        for name in ("axis", "machine", "model", "recording", "history", "plan", "procedures")
         for row in tool.BLOCKS[name]().splitlines()[2:]
     ]
     assert [row for row in rows if row.endswith("|  |")] == []

@@ -1,0 +1,267 @@
+"""The machine that a daemon holds: axes on one bus, checked together before anything is opened.
+
+`Machine` is what came of a machine file and the profiles that it names, or of one profile alone. It is read
+once, by the keeper, and handed to the other processes whole: who edits a file while the daemon runs changes
+nothing before the next start.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self, TypeVar
+
+from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
+from hdbridge.control.bench import compensation_for
+from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import (
+    ApiSettings,
+    AxisEntry,
+    LimitSettings,
+    LoadLoopSettings,
+    MachineFile,
+    token_complaint,
+)
+from hdbridge.drive import load_eds, plan
+from hdbridge.errors import InputError
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.profile import Profile
+from hdbridge.files.yamlfile import Document, Location, read_yaml
+from hdbridge.model import TransmissionModel
+
+T = TypeVar("T")
+
+
+def machine_file(text: str) -> Path | None:
+    """The machine file that a person means by its path, its folder or a bundled name; None: a profile."""
+    path = Path(text)
+    if not path.exists() and path.name == text and text:
+        path = bundled_folder("profiles") / text
+    if path.is_dir():
+        return path / "machine.yaml" if (path / "machine.yaml").is_file() else None
+    if not path.is_file():
+        return None
+    try:
+        data = read_yaml(path).data
+    except InputError:
+        return None  # whoever reads it as an axis file complains
+    schema = data.get("schema") if isinstance(data, dict) else None
+    return path if str(schema).startswith("hdbridge.machine/") else None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the machine, with its files."""
+
+    config: AxisConfig
+    """The axis file, on the machine's bus."""
+    profile: Profile
+    compensation: Scheme = Scheme.EXTENDED
+    """Which part of the active model compensates from the start."""
+    adaptation: AdaptationSettings = AdaptationSettings()
+    load_loop: LoadLoopSettings | None = None
+
+    @property
+    def name(self) -> str:
+        """As clients call it: the name in the axis file."""
+        return self.config.name
+
+    def model(self) -> TransmissionModel:
+        """The active model as it is on disk now; one without effects where the axis has none yet.
+
+        InputError where it cannot be read, or is of another axis, drive or gear.
+        """
+        if not self.profile.model.exists():
+            return TransmissionModel(self.config.gear.ratio)
+        model = TransmissionModel.load(self.profile.model)
+        compensation_for(self.config, model)
+        return model
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Axes on one bus with one cycle, and all that the daemon needs to know of its machine."""
+
+    name: str
+    path: Path
+    """The machine file, or the axis file where there is none."""
+    axes: tuple[Axis, ...]
+    bus: BusConfig
+    realtime: RealtimeConfig
+    api: ApiSettings
+    lease_s: float
+    limits: LimitSettings
+
+    @property
+    def folder(self) -> Path:
+        """Where the file lies; relative paths in it start here."""
+        return self.path.parent
+
+    @property
+    def cycle_s(self) -> float:
+        """The one cycle, seconds."""
+        return self.axes[0].config.drive.cycle_s
+
+    def beside(self, text: str) -> Path:
+        """A path as the machine file has it, relative to that file, made absolute."""
+        return (self.folder / text).absolute()
+
+    @classmethod
+    def find(cls, text: str) -> Self:
+        """From a machine file, a folder with ``machine.yaml``, a profile, or the name of a bundled one."""
+        path = machine_file(text)
+        return cls.load(path) if path is not None else cls.of_profile(text)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a machine file, or the one in a folder; InputError with file:line:column."""
+        path = Path(path)
+        document = read_yaml(path / "machine.yaml" if path.is_dir() else path)
+        file = document.validate(MachineFile)
+        return cls._of(file, document.path, document)
+
+    @classmethod
+    def of_profile(cls, name: str) -> Self:
+        """The machine of one axis by its profile, with the default of everything else."""
+        profile = Profile.find(name)
+        axis = AxisConfig.load(profile.axis)
+        entry = AxisEntry(profile=str(profile.axis.absolute()))
+        file = MachineFile(schema="hdbridge.machine/1", name=axis.name, axes=(entry,))
+        return cls._of(file, profile.axis, None)
+
+    @classmethod
+    def _of(cls, file: MachineFile, path: Path, document: Document | None) -> Self:
+        places = _Places(path, document)
+        axes = [_axis(file, number, places) for number in range(len(file.axes))]
+        bus = file.bus or _agreed(axes, lambda axis: axis.bus, places, "bus")
+        realtime = file.realtime or _agreed(axes, lambda axis: axis.realtime, places, "realtime")
+        axes = [
+            replace(axis, config=axis.config.model_copy(update={"bus": bus, "realtime": realtime}))
+            for axis in axes
+        ]
+        _check_together(axes, places)
+        _check_tcp(file, places)
+        return cls(
+            file.name, path.absolute(), tuple(axes), bus, realtime, file.api, file.lease_s, file.limits
+        )
+
+    def on_bus(self, **changes: str | int | None) -> Self:
+        """The same machine on another bus (keys of `BusConfig`)."""
+        axes = tuple(replace(axis, config=axis.config.on_bus(**changes)) for axis in self.axes)
+        return replace(self, axes=axes, bus=axes[0].config.bus)
+
+    def axis(self, name: str) -> Axis:
+        """An axis by its name; InputError says which there are."""
+        for axis in self.axes:
+            if axis.name == name:
+                return axis
+        names = ", ".join(axis.name for axis in self.axes)
+        raise InputError(f"{self.path}: no axis '{name}'; expected one of: {names}")
+
+
+class _Places:
+    """Complaints about a machine file; where there is none, about the axis file that stands for it."""
+
+    def __init__(self, path: Path, document: Document | None) -> None:
+        self._path, self._document = path, document
+        self.folder = path.parent
+
+    def error(self, at: Location, message: str) -> InputError:
+        if self._document is None:
+            return InputError(f"{self._path}: {message}")
+        return self._document.error(at, message)
+
+    def where(self, at: Location) -> str:
+        """``line 5`` of the file, for another complaint to point at."""
+        return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
+
+
+def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
+    """Read one axis and everything that belongs to it, before any of it is needed."""
+    entry = file.axes[number]
+    try:
+        profile = Profile.find(entry.profile, places.folder)
+    except InputError as problem:
+        raise places.error(("axes", number, "profile"), str(problem)) from None
+    config = AxisConfig.load(profile.axis)
+    plan(config, load_eds(config.eds_path, config.drive.node_id))
+    adaptation = file.adaptation
+    if entry.adapt is not None:
+        adaptation = adaptation.model_copy(update={"mode": entry.adapt})
+    axis = Axis(config, _absolute(profile), entry.compensation, adaptation, entry.load_loop)
+    axis.model()
+    return axis
+
+
+def _absolute(profile: Profile) -> Profile:
+    """The processes of the daemon need not share a working folder with who started it."""
+    return Profile(profile.axis.absolute(), profile.model.absolute(), profile.truth.absolute())
+
+
+def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Places, key: str) -> T:
+    """What all axis files say; InputError where they differ, since the machine has one of it."""
+    first = ask(axes[0].config)
+    for number, axis in enumerate(axes[1:], start=1):
+        if ask(axis.config) != first:
+            raise places.error(
+                ("axes", number, "profile"),
+                f"{axis.config.where(key)}: differs from that of '{axes[0].name}' "
+                f"({axes[0].config.where(key)}); expected the same in both, or '{key}' in the machine file",
+            )
+    return first
+
+
+def _check_together(axes: Sequence[Axis], places: _Places) -> None:
+    """One SYNC and one master for all; names and node ids that nobody else has.
+
+    Identifiers of PDOs follow from the node ids, so they are distinct as well.
+    """
+    names: dict[str, int] = {}
+    nodes: dict[int, str] = {}
+    first = axes[0].config
+    for number, axis in enumerate(axes):
+        at = ("axes", number, "profile")
+        config = axis.config
+        if (other := names.setdefault(axis.name, number)) != number:
+            raise places.error(
+                at,
+                f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
+                f"name in {config.where('name')}",
+            )
+        for key in ("cycle_ms", "master_node_id"):
+            found, expected = getattr(config.drive, key), getattr(first.drive, key)
+            if found != expected:
+                raise places.error(
+                    at,
+                    f"{config.where(f'drive.{key}')}: found {found:g}; expected {expected:g}, as of "
+                    f"'{first.name}': one master sends one SYNC to all axes",
+                )
+        for node, key in _nodes(config):
+            if (owner := nodes.setdefault(node, axis.name)) != axis.name:
+                raise places.error(
+                    at, f"{config.where(key)}: node {node} is of '{owner}' already; expected another node id"
+                )
+
+
+def _nodes(config: AxisConfig) -> Iterator[tuple[int, str]]:
+    yield config.drive.node_id, "drive.node_id"
+    if config.load_encoder.source.node is not None:
+        yield config.load_encoder.source.node, "load_encoder.source.node"
+
+
+def _check_tcp(file: MachineFile, places: _Places) -> None:
+    """What lets clients in from the network is there, and the token is nobody else's to read."""
+    tcp = file.api.tcp
+    if tcp is None:
+        return
+    if complaint := token_complaint(places.folder / tcp.token_file):
+        raise places.error(("api", "tcp", "token_file"), complaint)
+    for key in ("certificate", "key"):
+        text: str | None = getattr(tcp, key)
+        if text is not None and not os.access(places.folder / text, os.R_OK):
+            raise places.error(
+                ("api", "tcp", key), f"{places.folder / text} cannot be read; expected a PEM file"
+            )

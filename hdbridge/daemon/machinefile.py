@@ -1,0 +1,142 @@
+"""The machine file as it stands: which axes, on which bus, for whom, recorded where.
+
+``machine.yaml`` is written by a person and never rewritten by the program. `hdbridge.daemon.machine` reads
+it together with the profiles that it names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hdbridge.axis import BusConfig, RealtimeConfig
+from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode
+from hdbridge.daemon.memory.layout import AXES_AT_MOST
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.files.yamlfile import wrong
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
+"""What names a machine; its socket and its service are called so, too."""
+
+
+class _Part(BaseModel):
+    """A mapping of the file: frozen, no unknown keys, finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class LoadLoopSettings(_Part):
+    """A slow integral of the error that the load encoder measures, in addition to the model."""
+
+    gain_1_s: float = Field(0.5, gt=0, le=50, description="share of the error that it takes away per second")
+    maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="most that it may add, at the load")
+    slew_arcsec_s: float = Field(
+        20.0, gt=0, le=10_000, description="fastest change of what it adds, at the load"
+    )
+
+
+class AxisEntry(_Part):
+    """One axis of the machine."""
+
+    profile: str = Field(
+        min_length=1,
+        description="folder with axis.yaml, or an axis file, relative to this file; else a bundled profile",
+    )
+    compensation: Scheme = Field(
+        Scheme.EXTENDED,
+        description="which part of the active model compensates from the start: extended is the whole of it",
+    )
+    adapt: Mode | None = Field(
+        None, description="adaptation of this axis, where it is not the machine's (adaptation.mode)"
+    )
+    load_loop: LoadLoopSettings | None = Field(
+        None, description="a slow loop on the load encoder; without the key there is none"
+    )
+
+
+class TcpSettings(_Part):
+    """The API on the network."""
+
+    host: str = Field("127.0.0.1", min_length=1, description="address to listen at")
+    port: int = Field(8402, ge=1, le=65_535, description="port to listen at")
+    token_file: str = Field(
+        min_length=1,
+        description="file with the token that clients show, of mode 600, relative to this file",
+    )
+    certificate: str | None = Field(
+        None, min_length=1, description="certificate chain for TLS, PEM, relative to this file"
+    )
+    key: str | None = Field(None, min_length=1, description="its private key, PEM, relative to this file")
+
+    @model_validator(mode="after")
+    def _pair(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            there, lacking = ("key", "certificate") if self.certificate is None else ("certificate", "key")
+            raise wrong(f"a {there} without a {lacking}; expected both, or neither", there)
+        return self
+
+
+class ApiSettings(_Part):
+    """Where clients reach the daemon."""
+
+    socket: str | None = Field(
+        None,
+        min_length=1,
+        description="Unix socket, relative to this file; without it NAME.sock in the runtime folder",
+    )
+    group: str | None = Field(
+        None, min_length=1, description="group whose members may use the socket; else that of the daemon"
+    )
+    tcp: TcpSettings | None = Field(None, description="a port on the network, too; without the key none")
+
+
+class LimitSettings(_Part):
+    """How much the daemon takes before it gives up or refuses."""
+
+    restarts_per_minute: int = Field(
+        3, ge=0, le=60, description="how often a control process that died is started again before all ends"
+    )
+
+
+class MachineFile(_Part):
+    """The content of a machine file."""
+
+    schema_: Literal["hdbridge.machine/1"] = Field(
+        alias="schema", description="kind and version of this file"
+    )
+    name: str = Field(pattern=NAME, description="name: letters, digits, '.', '_', '-'")
+    axes: tuple[AxisEntry, ...] = Field(
+        min_length=1, max_length=AXES_AT_MOST, description="the axes, all on one bus with one cycle"
+    )
+    bus: BusConfig | None = Field(
+        None, description="the CAN bus; without the key that of the axis files, which then agree"
+    )
+    api: ApiSettings = Field(default_factory=ApiSettings, description="where clients reach the daemon")
+    lease_s: Annotated[float, Field(ge=0.5, le=3600)] = Field(
+        10.0, description="time after which the right to move lapses when its holder does not renew it"
+    )
+    limits: LimitSettings = Field(default_factory=LimitSettings, description="how much the daemon takes")
+    adaptation: AdaptationSettings = Field(
+        default_factory=AdaptationSettings, description="what follows the load encoder, and how fast"
+    )
+    realtime: RealtimeConfig | None = Field(
+        None, description="how the control process runs; without the key as the axis files say, which agree"
+    )
+
+
+def token_complaint(path: Path) -> str | None:
+    """What is wrong with the file of the token; None where nothing is."""
+    try:
+        content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = problem.strerror if isinstance(problem, OSError) else "not ASCII text"
+        return f"{path}: cannot be read: {reason}; expected a file with the token in one line"
+    if mode & 0o077:
+        return f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
+    if len(content) < 16 or not content.isprintable() or " " in content:
+        return (
+            f"{path}: found {len(content)} characters; expected a token of 16 or more: openssl rand -hex 16"
+        )
+    return None
