@@ -182,6 +182,10 @@ class ProcessImage:
         handler(data)
         return True
 
+    def handler(self, can_id: int) -> Callable[[bytes], None]:
+        """What takes the data of one of the image's TPDOs: `accept` for one that looks it up only once."""
+        return self._handlers[can_id]
+
     def length_of(self, can_id: int) -> int:
         """Bytes that a TPDO of the image has to have."""
         layouts = (*self.tpdos, *self.channel_tpdos)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from enum import Enum, IntEnum
+from itertools import islice
 from typing import Final, NamedTuple
 
 from hdbridge.errors import SafetyStop
@@ -126,7 +127,7 @@ class Supervision:
     Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
     """
 
-    __slots__ = ("_frozen", "_hang", "_runs", "counts", "events", "gravest", "stop")
+    __slots__ = ("_frozen", "_hang", "_runs", "counts", "events", "gravest", "noted", "stop")
 
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}
@@ -134,6 +135,8 @@ class Supervision:
         self._hang: Event | None = None
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         """Every fault seen, oldest first."""
+        self.noted = 0
+        """How many were seen, those that are no longer kept included."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
         """Cycles in which each fault was seen."""
         self.stop: Event | None = None
@@ -182,6 +185,7 @@ class Supervision:
                 reaction = Reaction.QUICK_STOP
         event = Event(cycle, fault, reaction, detail)
         self.events.append(event)
+        self.noted += 1
         self.counts[fault] += 1
         if fault is Fault.HANG:
             self._hang = event
@@ -191,6 +195,11 @@ class Supervision:
             if reaction > self.reaction:
                 self.gravest = event
         return reaction
+
+    def since(self, noted: int) -> list[Event]:
+        """The events that came after ``noted`` had been seen, oldest first, as far as they are kept."""
+        new = min(self.noted - noted, len(self.events))
+        return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 
     def error(self) -> SafetyStop:
         """The latched stop as the error to raise."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from hdbridge.drive.objects import COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, NmtState
+from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, NmtState
 from hdbridge.drive.supervision import Fault
 
 if TYPE_CHECKING:
@@ -20,10 +20,19 @@ _STATES: Final[dict[int, str]] = {
 }
 
 
-class Traffic:
-    """Judges the frames that the control cycle does not wait for."""
+def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
+    """What a frame says that only the one master of a bus sends; ``heartbeat_id`` is its heartbeat's."""
+    return {
+        COB_SYNC: (Fault.FOREIGN_SYNC, ""),
+        heartbeat_id: (Fault.OWN_ID_ELSEWHERE, f"{heartbeat_id:03X}h, the master's heartbeat"),
+        COB_NMT: (Fault.OWN_ID_ELSEWHERE, f"{COB_NMT:03X}h, an NMT command"),
+    }
 
-    __slots__ = ("_monitor", "_node_id", "_nodes", "_own", "_sync_id", "heard_s")
+
+class Traffic:
+    """Judges the frames of one axis's nodes that the control cycle does not wait for."""
+
+    __slots__ = ("_monitor", "_node_id", "_nodes", "_own", "heard_s", "identifiers")
 
     def __init__(self, image: ProcessImage, monitor: NetworkMonitor, now_s: float) -> None:
         self._monitor = monitor
@@ -31,13 +40,14 @@ class Traffic:
         self._nodes = {can_id & _NODE_MASK for can_id in image.tpdo_ids}
         for node_id in self._nodes:
             monitor.watch(node_id)
-        self._sync_id = image.sync_id
         self._own = {
             image.rpdo_id: "the RPDO",
-            image.heartbeat_id: "the master's heartbeat",
-            COB_NMT: "an NMT command",
             COB_SDO_REQUEST + image.node_id: "an SDO request",
         }
+        self.identifiers: frozenset[int] = frozenset(
+            (*self._own, *(base + node_id for node_id in self._nodes for base in (COB_EMCY, COB_HEARTBEAT)))
+        )
+        """Identifiers of the frames that say something of this axis."""
         self.heard_s = now_s
         """When the drive's last heartbeat came."""
 
@@ -59,7 +69,5 @@ class Traffic:
                 yield Fault.BOOT_UP, f"node {node_id}"
             elif state != NmtState.OPERATIONAL:
                 yield Fault.NMT_CHANGE, f"node {node_id}, NMT state {state:02X}h{_STATES.get(state, '')}"
-        elif can_id == self._sync_id:
-            yield Fault.FOREIGN_SYNC, ""
         elif can_id in self._own:
             yield Fault.OWN_ID_ELSEWHERE, f"{can_id:03X}h, {self._own[can_id]}"

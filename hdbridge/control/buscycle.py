@@ -1,0 +1,465 @@
+"""The control cycle of one bus: one thread, absolute deadlines, the same order in every period.
+
+    wait - drain - SYNC - receive - check - RPDOs - heartbeat
+
+* *drain*: what waited since the last cycle is not of this one. Heartbeats and emergencies are noted, TPDOs
+  are stale and thrown away.
+* *receive*: until every TPDO of every axis is there, or the window closes. The newest of each identifier
+  wins. Those of the optional channels are waited for when they come with every SYNC and are not lost, else
+  taken when they come.
+* *check*: axis by axis, by the fault table of `hdbridge.drive.supervision`.
+* *RPDOs*: with this cycle's feedback already in them; each is sent before the next axis is looked at.
+* *heartbeat*: the master's own comes from this loop and nowhere else, so that a loop that hangs is noticed
+  by the drives.
+
+A fault of one axis stops that axis and no other (`hdbridge.control.axiscycle`); a fault of the bus concerns
+all. A period that begins more than half a period late is given up, with those behind it: the next SYNC comes
+on the next whole period. SYNCs are never sent closer than half a period.
+
+This is the one place where speed comes before looks: no logging, no SDO, no allocation that can be avoided.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from hdbridge.clock import Clock
+from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.control.busmembers import check_members
+from hdbridge.control.latency import Histogram
+from hdbridge.drive.busload import FRAME_BITS
+from hdbridge.drive.fastlink import fast_link
+from hdbridge.drive.link import Frame, Link, TransmitBufferFull
+from hdbridge.drive.objects import COB_SYNC, NmtState
+from hdbridge.drive.pdo import PdoLengthError
+from hdbridge.drive.supervision import Fault
+from hdbridge.drive.traffic import bus_faults
+from hdbridge.errors import BusError
+
+WINDOW: Final = 0.8
+"""Share of the period after SYNC in which the TPDOs must arrive; the rest is for the RPDOs to get through."""
+LATE: Final = 0.5
+"""Share of the period by which a cycle may begin late before it is given up."""
+SPARE: Final = 0.1
+"""Share of the period before the next SYNC in which nothing is sent for others."""
+DRAIN_MAXIMUM: Final = 256
+"""Frames read before SYNC; at 1 Mbit/s a full bus brings at most 220 in 10 ms."""
+FLUSH_MAXIMUM: Final = 10_000
+"""Frames thrown away when the cycle begins."""
+_HEARTBEAT_DATA: Final = bytes([NmtState.OPERATIONAL])
+
+_Slot = tuple[int, Callable[[bytes], None], AxisCycle]
+"""A TPDO: its bit among those of a turn, what takes its data, and whose it is."""
+
+
+class BusCycle:
+    """Runs the axes of one bus over a link, one `exchange` per period.
+
+    ``on_frame`` is given every frame that is no PDO of the cycle: SDO answers, heartbeats, emergencies.
+    ``outgoing`` is asked once per turn, when everything of the cycle is sent, for one more frame to send.
+    Both may be set at any time. They run within the cycle, so they must be quick, and raise nothing.
+    """
+
+    __slots__ = (
+        "_all", "_beginning", "_bits", "_bits_of_turn", "_bus_faults", "_changed", "_deadline",
+        "_discarded", "_early", "_heartbeat_id", "_heartbeat_period_s", "_heartbeat_s", "_late_s", "_link",
+        "_listeners", "_listening", "_per_bit", "_rested", "_slots", "_speaking", "_window_s", "axes",
+        "busy_s", "clock", "count", "down", "faults", "histogram", "late_s", "on_frame", "outgoing",
+        "overruns", "period_s", "refused", "skipped", "woke_s",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        link: Link,
+        clock: Clock,
+        period_s: float,
+        *,
+        bitrate_bps: int | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
+        outgoing: Callable[[], tuple[int, bytes] | None] | None = None,
+    ) -> None:
+        self.clock = clock
+        self.period_s = period_s
+        self.on_frame = on_frame
+        self.outgoing = outgoing
+        self.axes: tuple[AxisCycle, ...] = ()
+        """In the order in which they are answered."""
+        self.histogram = Histogram()
+        """How late each period began."""
+        self.overruns = 0
+        """Cycles that were given up for lateness."""
+        self.skipped = 0
+        """Whole periods without a SYNC."""
+        self.refused = 0
+        """Frames of ``outgoing`` for which there was no room; they are dropped."""
+
+        self.count = -1
+        """Number of the last period; skipped periods are counted."""
+        self.woke_s = clock.now()
+        """When the last turn began, on the clock."""
+        self.late_s = 0.0
+        """How late that was."""
+        self.busy_s = 0.0
+        """From there to its end."""
+        self.faults: list[tuple[Fault, str]] = []
+        """What was wrong with the bus itself in the last turn; each speaking axis has judged it as well."""
+        self.down: str | None = None
+        """How the interface failed in the last turn, or None."""
+
+        self._window_s = WINDOW * period_s
+        self._late_s = LATE * period_s
+        self._per_bit = 1.0 / (bitrate_bps * period_s) if bitrate_bps is not None else math.nan
+        self._slots: dict[int, _Slot] = {}
+        self._listeners: dict[int, AxisCycle] = {}
+        self._speaking: tuple[AxisCycle, ...] = ()
+        self._listening: tuple[AxisCycle, ...] = ()
+        self._beginning: list[AxisCycle] = []
+        self._all = self._early = 0
+        self._bits = self._bits_of_turn = FRAME_BITS[0]
+        self._heartbeat_id = 0
+        self._heartbeat_period_s = math.inf
+        self._heartbeat_s = self.woke_s
+        self._bus_faults = bus_faults(self._heartbeat_id)
+        self._discarded = 0
+        self._changed = True
+        self.relink(link)
+
+    @property
+    def bus_load(self) -> float:
+        """Share of the period that the last turn's frames took at worst; NaN where no bit rate was given.
+
+        A frame that was awaited counts even if it did not come.
+        """
+        return self._bits_of_turn * self._per_bit
+
+    def join(self, axis: AxisCycle) -> None:
+        """Take an axis on the bus; it is silent until its ``begin``. Not within a turn.
+
+        InputError where an identifier of it is another axis's, or where it needs another cycle or master.
+        """
+        check_members((*self.axes, axis), self.period_s)
+        self._take_axes((*self.axes, axis))
+
+    def leave(self, axis: AxisCycle) -> None:
+        """Forget an axis: its frames are those of a stranger from now on. Not within a turn."""
+        self._take_axes(tuple(each for each in self.axes if each is not axis))
+
+    def restart(self) -> None:
+        """Begin anew at the next `exchange`, at once; the numbers of the cycles go on.
+
+        For when the cycle has rested: what arrived meanwhile, and how far the encoders moved, is not judged.
+        The latches and the histogram stay, and who is silent.
+        """
+        self._deadline: float | None = None
+        self._rested = True
+        for axis in self.axes:
+            if not axis.silent:
+                axis.begin()
+
+    def relink(self, link: Link) -> None:
+        """Go on with another link, on a bus that was opened anew after the last one failed.
+
+        The axes stay latched: each has to be verified, released (`AxisCycle.reset`) and begun.
+        """
+        self._link = fast_link(link)
+        self.restart()
+
+    def exchange(self) -> None:
+        """Run one period for all axes; what came of it is in each axis and here.
+
+        It raises nothing of the bus or the axes: a failure is latched in the axes that it concerns.
+        """
+        now = self._wait()
+        count = self.count
+        time_s = count * self.period_s
+        self.down = None
+        if self._changed:
+            self._rebuild(now)
+        self._bits_of_turn = self._bits
+        try:
+            read = self._drain(now)
+            try:
+                self._link.send(COB_SYNC, b"")
+            except TransmitBufferFull as error:
+                self._everybody(Fault.TRANSMIT_FULL, f"SYNC: {error}")
+                got = 0
+            else:
+                got = self._receive(self.clock.now() + self._window_s)
+                if not read:
+                    got = 0
+
+            for axis in self._speaking:
+                data = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
+                if data is not None:
+                    try:
+                        self._link.send(axis.rpdo_id, data)
+                    except TransmitBufferFull as error:
+                        # Stale set-points are worse than none: it is not sent again, and the axes stop.
+                        self._no_room(f"RPDO: {error}")
+            for axis in self._listening:
+                axis.listen(count, time_s, got & axis.needed == axis.needed)
+            if now >= self._heartbeat_s:
+                self._heartbeat(now)
+            if self.outgoing is not None:
+                self._send_for_others(self.outgoing)
+        except BusError as error:
+            self._failed(str(error))
+        self.busy_s = self.clock.now() - now
+
+    # ---------------------------------------------------------------- the parts of a turn
+
+    def _wait(self) -> float:
+        """Sleep to the next deadline, skipping whole periods when it is long past; the time then."""
+        clock, deadline, period_s = self.clock, self._deadline, self.period_s
+        self.count += 1
+        if self.faults:
+            self.faults.clear()
+        if deadline is None:
+            self.woke_s = now = clock.now()
+            self.late_s = 0.0
+            self._deadline = now + period_s
+            return now
+        clock.sleep_until(deadline)
+        now = clock.now()
+        self.late_s = late_s = now - deadline
+        self.histogram.record(late_s)
+        if late_s > self._late_s:
+            missed = int(late_s / period_s) + 1
+            self._overrun(late_s, missed)
+            deadline += missed * period_s
+            clock.sleep_until(deadline)
+            now = clock.now()
+        self._deadline = deadline + period_s
+        self.woke_s = now
+        return now
+
+    def _overrun(self, late_s: float, missed: int) -> None:
+        self.overruns += 1
+        self.skipped += missed
+        self.count += missed
+        self._everybody(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
+        hang = False
+        for axis in self._speaking:
+            if late_s + self.period_s > axis.patience_s:
+                patience = f"{1e3 * axis.patience_s:.0f} ms"
+                what = (Fault.HANG, f"{1e3 * late_s:.0f} ms; the drive waits {patience}")
+                axis.pending.append(what)
+                if not hang:
+                    self.faults.append(what)
+                hang = True
+
+    def _drain(self, now: float) -> bool:
+        """Read what waited; whether that was all of it."""
+        recv, slots = self._link.recv, self._slots
+        self._early = 0
+        most = DRAIN_MAXIMUM
+        if self._rested:
+            # Whatever waited is old news.
+            most = FLUSH_MAXIMUM
+            self._heartbeat_s = now
+        for _ in range(most):
+            frame = recv(now)
+            if frame is None:
+                break
+            slot = slots.get(frame.can_id)
+            if slot is None:
+                self._other(frame)
+            else:
+                self._before_sync(frame, slot)
+        else:
+            if not self._rested:
+                self._everybody(Fault.FLOOD, f"more than {DRAIN_MAXIMUM} before SYNC")
+                return False
+        if self._rested:
+            self._rested = False
+            self._discarded = self._link.dropped.total
+        if self._beginning:
+            for axis in self._beginning:
+                axis.rested = False
+            self._beginning.clear()
+        return True
+
+    def _before_sync(self, frame: Frame, slot: _Slot) -> None:
+        """A TPDO out of its window: stale, unless nobody waits for it."""
+        bit, accept, axis = slot
+        if axis.awaited:
+            if not axis.rested:
+                axis.pending.append((Fault.DUPLICATE_TPDO, f"{frame.can_id:03X}h before SYNC"))
+            return
+        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        try:
+            accept(frame.data)
+        except PdoLengthError:
+            return
+        self._early |= bit
+
+    def _receive(self, window_end_s: float) -> int:
+        """Take this cycle's TPDOs until all are there or the window closes; the bits of those that came."""
+        recv, slots, everything = self._link.recv, self._slots, self._all
+        got = self._early
+        spoilt: dict[int, int] | None = None
+        while got & everything != everything:
+            frame = recv(window_end_s)
+            if frame is None:
+                break
+            can_id, data, time_s = frame
+            slot = slots.get(can_id)
+            if slot is None:
+                self._other(frame)
+                if time_s > window_end_s:
+                    break
+                continue
+            bit, accept, axis = slot
+            if got & bit and axis.awaited:
+                axis.pending.append((Fault.DUPLICATE_TPDO, f"{can_id:03X}h twice"))
+            try:
+                accept(data)
+            except PdoLengthError:
+                spoilt = spoilt or {}
+                spoilt[can_id] = len(data)
+                continue
+            got |= bit
+        dropped = self._link.dropped
+        discarded = dropped.remote + dropped.extended + dropped.error + dropped.fd
+        if discarded != self._discarded:
+            self._discarded = discarded
+            self._everybody(Fault.DISCARDED_FRAME, "remote, extended, FD or error frame")
+        if spoilt is not None or got & everything != everything:
+            self._note_missing(got, spoilt or {})
+        return got
+
+    def _note_missing(self, got: int, spoilt: dict[int, int]) -> None:
+        """What did not come, or came with the wrong length, is a fault of the axis that waits for it."""
+        for can_id, length in spoilt.items():
+            bit, _, axis = self._slots[can_id]
+            if axis.awaited:
+                # A fault of the axis only where no good one of that identifier came and it is needed.
+                fault = Fault.WRONG_LENGTH if bit & axis.needed & ~got else Fault.DISCARDED_FRAME
+                expected = axis.image.length_of(can_id)
+                axis.pending.append((fault, f"{can_id:03X}h with {length} bytes, expected {expected}"))
+        for axis in self._speaking:
+            missing = axis.needed & ~got
+            if missing and axis.awaited:
+                lost = [
+                    f"{can_id:03X}h"
+                    for can_id in axis.image.tpdo_ids
+                    if self._slots[can_id][0] & missing and can_id not in spoilt
+                ]
+                if lost:
+                    axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
+
+    def _other(self, frame: Frame) -> None:
+        """A frame that is not waited for: what it means, and to whom."""
+        self._bits_of_turn += FRAME_BITS[len(frame.data)]
+        axis = self._listeners.get(frame.can_id)
+        if axis is not None:
+            axis.hear(frame)
+        elif not self._rested:
+            fault = self._bus_faults.get(frame.can_id)
+            if fault is not None:
+                self._everybody(*fault)
+        if self.on_frame is not None:
+            self.on_frame(frame)
+
+    def _heartbeat(self, now: float) -> None:
+        """The master's heartbeat, when it is due; one that was missed is not made up for."""
+        self._heartbeat_s += self._heartbeat_period_s
+        if self._heartbeat_s <= now:
+            self._heartbeat_s = now + self._heartbeat_period_s
+        self._bits_of_turn += FRAME_BITS[1]
+        try:
+            self._link.send(self._heartbeat_id, _HEARTBEAT_DATA)
+        except TransmitBufferFull as error:
+            self._no_room(f"heartbeat: {error}")
+
+    def _send_for_others(self, outgoing: Callable[[], tuple[int, bytes] | None]) -> None:
+        """One frame that is not of the cycle, while there is time for it before the next SYNC."""
+        if self.clock.now() > self.woke_s + (1.0 - SPARE) * self.period_s:
+            return
+        frame = outgoing()
+        if frame is None:
+            return
+        self._bits_of_turn += FRAME_BITS[len(frame[1])]
+        try:
+            self._link.send(*frame)
+        except TransmitBufferFull:
+            self.refused += 1
+
+    # ---------------------------------------------------------------- faults of the bus
+
+    def _everybody(self, fault: Fault, detail: str) -> None:
+        """A fault of the bus that is noticed before the axes are answered."""
+        self.faults.append((fault, detail))
+        for axis in self._speaking:
+            if not axis.rested:
+                axis.pending.append((fault, detail))
+
+    def _no_room(self, detail: str) -> None:
+        """A frame of the cycle did not get out: those that are answered stop with the next turn."""
+        self.faults.append((Fault.TRANSMIT_FULL, detail))
+        for axis in self._speaking:
+            if axis.feedback.cycle == self.count:
+                axis.also(self.count, Fault.TRANSMIT_FULL, detail)
+            else:
+                axis.pending.append((Fault.TRANSMIT_FULL, detail))
+
+    def _failed(self, detail: str) -> None:
+        self.down = detail
+        self.faults.append((Fault.BUS_DOWN, detail))
+        time_s = self.count * self.period_s
+        for axis in self._speaking:
+            axis.bus_down(self.count, time_s, detail)
+        for axis in self._listening:
+            axis.stale(self.count, time_s)
+
+    # ---------------------------------------------------------------- who is on the bus
+
+    def _take_axes(self, axes: tuple[AxisCycle, ...]) -> None:
+        for axis in self.axes:
+            axis.changed = _nobody
+        self.axes = axes
+        for axis in axes:
+            axis.changed = self._change
+        self._heartbeat_id = axes[0].image.heartbeat_id if axes else 0
+        self._heartbeat_period_s = min((axis.image.heartbeat_period_s for axis in axes), default=math.inf)
+        self._bus_faults = bus_faults(self._heartbeat_id)
+        self._changed = True
+
+    def _change(self) -> None:
+        """Some axis is to be treated otherwise from the next turn on."""
+        self._changed = True
+
+    def _rebuild(self, now: float) -> None:
+        """Sort the axes and their identifiers anew: a turn looks up, and decides nothing."""
+        self._changed = False
+        self._speaking = tuple(axis for axis in self.axes if not axis.silent)
+        self._listening = tuple(axis for axis in self.axes if axis.silent)
+        slots: dict[int, _Slot] = {}
+        listeners: dict[int, AxisCycle] = {}
+        everything, bits = 0, FRAME_BITS[0]
+        for axis in self.axes:
+            image = axis.image
+            tpdos, channels = axis.route()
+            axis.needed = 0
+            for can_id in (*tpdos, *channels):
+                bit = 1 << len(slots)
+                slots[can_id] = (bit, image.handler(can_id), axis)
+                if can_id in tpdos:
+                    axis.needed |= bit
+                if axis.awaited:
+                    everything |= bit
+                    bits += FRAME_BITS[image.length_of(can_id)]
+            if not axis.silent:
+                bits += FRAME_BITS[image.rpdo.length]
+                if axis.rested:
+                    axis.start(now, self.count)
+                    self._beginning.append(axis)
+            listeners.update(dict.fromkeys(axis.identifiers, axis))
+        self._slots, self._listeners = slots, listeners
+        self._all, self._bits = everything, bits
+
+
+def _nobody() -> None:
+    """The axis is on no bus."""

@@ -1,0 +1,126 @@
+"""How much of the bus the cycle of its axes takes at worst. Pure.
+
+The longest that a frame of s data bytes can become on the wire, with every stuff bit that the bit-stuffing
+rule allows and the three bits of interframe space, is
+
+    g + 8 s + 13 + floor((g + 8 s - 1) / 4) bits,    g = 34 with 11-bit identifiers
+
+(R. I. Davis, A. Burns, R. J. Bril, J. J. Lukkien: Controller Area Network (CAN) schedulability analysis:
+Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g are the bits of the header and of the
+checksum that are subject to stuffing; the other 13 are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.drive.image import HEARTBEATS_PER_TIMEOUT, channel_layouts, rpdo_layout, tpdo_layouts
+from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+
+MAXIMUM_LOAD: Final = 0.8
+"""Share of the cycle that its frames may take: the rest is for repeated frames, and for what others send."""
+_STUFFED: Final = 34
+_UNSTUFFED: Final = 13
+_LARGEST: Final = 8
+_SDO_BYTES: Final = 8
+_HEARTBEAT_BYTES: Final = 1
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Most bits that a data frame with an 11-bit identifier takes, its interframe space included."""
+    if not 0 <= data_bytes <= _LARGEST:
+        raise InputError(f"a CAN frame has 0 to {_LARGEST} data bytes, not {data_bytes}")
+    stuffed = _STUFFED + 8 * data_bytes
+    return stuffed + _UNSTUFFED + (stuffed - 1) // 4
+
+
+FRAME_BITS: Final = tuple(frame_bits(length) for length in range(_LARGEST + 1))
+"""`frame_bits` by the number of data bytes."""
+
+
+def cycle_bits(axes: Sequence[AxisConfig]) -> float:
+    """Most bits of one cycle of these axes on one bus, on average over the cycles.
+
+    SYNC, the TPDOs and the RPDO of each axis, the optional channels as often as they come, the heartbeats of
+    the nodes and of the master, and one SDO request with its answer.
+    """
+    bits = float(frame_bits(0) + 2 * frame_bits(_SDO_BYTES))
+    heartbeat = frame_bits(_HEARTBEAT_BYTES)
+    for axis in axes:
+        layouts = (*tpdo_layouts(axis), *channel_layouts(axis), rpdo_layout(axis))
+        bits += sum(frame_bits(layout.codec.length) / layout.every for layout in layouts)
+        nodes = len({layout.node_id for layout in layouts})
+        bits += nodes * heartbeat * axis.drive.cycle_ms / axis.drive.heartbeat_ms
+    if axes:
+        masters = max(axis.drive.cycle_ms / axis.drive.heartbeat_ms for axis in axes) * HEARTBEATS_PER_TIMEOUT
+        bits += heartbeat * min(masters, 1.0)
+    return bits
+
+
+def bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
+    """Share of each cycle that its frames take at worst; None where no bit rate is known.
+
+    ``bitrate_bps`` is by default that of the axis files. InputError where these differ in it or in the cycle.
+    """
+    rate = bitrate_bps if bitrate_bps is not None else _common_bitrate(axes)
+    if rate is None or not axes:
+        return None
+    return cycle_bits(axes) / (rate * _common_cycle_s(axes))
+
+
+def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
+    """`bus_load`; InputError where it is above `MAXIMUM_LOAD`, with what would fit."""
+    load = bus_load(axes, bitrate_bps)
+    if load is None or load <= MAXIMUM_LOAD:
+        return load
+    rate = bitrate_bps if bitrate_bps is not None else _common_bitrate(axes)
+    assert rate is not None
+    cycle_s = _common_cycle_s(axes)
+    fits_s = cycle_s
+    while fits_s < 1.0 and _load_at(axes, rate, fits_s) > MAXIMUM_LOAD:
+        fits_s += 1e-3
+    longer = f"a cycle_ms of {1e3 * fits_s:.3g} or more" if fits_s < 1.0 else "a higher bit rate"
+    fitting = max(
+        (n for n in range(len(axes)) if _load_at(axes[:n], rate, cycle_s) <= MAXIMUM_LOAD), default=0
+    )
+    fewer = f", or {fitting} of the {len(axes)} axes" if fitting else ""
+    raise InputError(
+        f"the cycle of {' and '.join(axis.name for axis in axes)} takes {100 * load:.0f} % of the bus "
+        f"({cycle_bits(axes):.0f} bits at most in {1e3 * cycle_s:g} ms at {rate} bit/s), "
+        f"allowed are {100 * MAXIMUM_LOAD:.0f} %; what fits is {longer}{fewer}"
+    )
+
+
+def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
+    """The load if the cycle lasted so long."""
+    return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
+
+
+def _with_cycle(axis: AxisConfig, cycle_ms: float) -> AxisConfig:
+    return axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": cycle_ms})})
+
+
+def _common_cycle_s(axes: Sequence[AxisConfig]) -> float:
+    return 1e-3 * _common(((axis, axis.drive.cycle_ms) for axis in axes), "drive.cycle_ms")
+
+
+def _common_bitrate(axes: Sequence[AxisConfig]) -> int | None:
+    given = [(axis, axis.bus.bitrate_bps) for axis in axes if axis.bus.bitrate_bps is not None]
+    return int(_common(given, "bus.bitrate_bps")) if given else None
+
+
+def _common(values: Iterable[tuple[AxisConfig, float]], field: str) -> float:
+    """The one value of a field on all axes; InputError where two differ."""
+    pairs = list(values)
+    first, value = pairs[0]
+    for axis, other in pairs[1:]:
+        if other != value:
+            raise InputError(
+                f"{axis.where(field)} gives {other:g}, {first.where(field)} gives {value:g}; "
+                "axes on one bus have to agree"
+            )
+    return value
