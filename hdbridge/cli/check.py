@@ -60,10 +60,14 @@ def _existing(path: Path) -> Path | None:
 
 
 def _of_machine(machine: Machine) -> dict[str, str]:
+    from hdbridge.drive.busload import bus_load
+
+    load = bus_load([axis.config for axis in machine.axes], machine.bus.bitrate_bps)
     names = ", ".join(axis.name for axis in machine.axes)
     return {
         "machine": machine.name,
         "axes of it": names,
+        "bus load": f"{100 * load:.0f} % at most" if load is not None else "not known: no bitrate_bps",
     }
 
 

@@ -25,6 +25,7 @@ from hdbridge.daemon.machinefile import (
     token_complaint,
 )
 from hdbridge.drive import load_eds, plan
+from hdbridge.drive.busload import check_bus_load
 from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.bundled import bundled_folder
@@ -143,6 +144,7 @@ class Machine:
             for axis in axes
         ]
         _check_together(axes, places)
+        _check_load([axis.config for axis in axes], bus, places)
         _check_tcp(file, places)
         return cls(
             file.name, path.absolute(), tuple(axes), bus, realtime, file.api, file.lease_s, file.limits
@@ -250,6 +252,13 @@ def _nodes(config: AxisConfig) -> Iterator[tuple[int, str]]:
     yield config.drive.node_id, "drive.node_id"
     if config.load_encoder.source.node is not None:
         yield config.load_encoder.source.node, "load_encoder.source.node"
+
+
+def _check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: _Places) -> None:
+    try:
+        check_bus_load(axes, bus.bitrate_bps)
+    except InputError as problem:
+        raise places.error(("axes",), str(problem)) from None
 
 
 def _check_tcp(file: MachineFile, places: _Places) -> None:

@@ -148,6 +148,12 @@ def test_axes_that_do_not_go_together(folder: Path, changes: dict[str, str], exp
     assert str(folder / "two" / "axis.yaml") + ":" in complaint
 
 
+def test_a_bus_with_too_much_on_it(folder: Path) -> None:
+    text = GOOD + "bus: {interface: socketcan, channel: can0, bitrate_bps: 125000}\n"
+    assert "axes: the cycle of one and two takes" in refused(folder, text)
+    assert load(folder, text.replace("125000", "1000000")).bus.bitrate_bps == 1_000_000
+
+
 def test_a_model_of_another_axis(folder: Path) -> None:
     model = (bundled_profile("article") / "model.yaml").read_text(encoding="utf-8")
     (folder / "two" / "model.yaml").write_text(model, encoding="utf-8")

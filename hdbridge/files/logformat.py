@@ -1,0 +1,66 @@
+"""An event as a line: in words for a person, a JSON object for a machine.
+
+The library tells events through `logging`: the message is the event's name, its argument a dictionary of
+facts.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from datetime import datetime
+
+
+class ForPeople(logging.Formatter):
+    """``12:30:01.250 sdo write  node=1 object=6060h:00 value=8``"""
+
+    def format(self, record: logging.LogRecord) -> str:
+        facts = " ".join(f"{name}={value}" for name, value in _facts(record).items())
+        return f"{_date(record):%H:%M:%S}.{int(record.msecs):03d} {record.msg}  {facts}".rstrip()
+
+
+class ForMachines(logging.Formatter):
+    """A JSON object: date, level, where, event, and the event's facts."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        about = {
+            "date": _date(record).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "where": record.name,
+            "event": record.msg,
+        }
+        return json.dumps({**about, **_facts(record)}, default=str)
+
+
+class LogFile(logging.FileHandler):
+    """Ends, with one line, where its disk is full: the axis is worth more than its log."""
+
+    failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's own
+        self._fail(sys.exc_info()[1])
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self.failed:
+            super().emit(record)
+
+    def close(self) -> None:
+        try:
+            super().close()
+        except OSError as problem:
+            self._fail(problem)
+
+    def _fail(self, problem: BaseException | None) -> None:
+        if not self.failed:
+            self.failed = True
+            why = problem.strerror if isinstance(problem, OSError) else problem
+            print(f"hdbridge: {self.baseFilename}: cannot be written: {why}", file=sys.stderr)
+
+
+def _facts(record: logging.LogRecord) -> dict[str, object]:
+    return dict(record.args) if isinstance(record.args, dict) else {}
+
+
+def _date(record: logging.LogRecord) -> datetime:
+    return datetime.fromtimestamp(record.created).astimezone()

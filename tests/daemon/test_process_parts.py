@@ -1,0 +1,175 @@
+"""What the processes of the daemon are made of: runtime folder, start, notification, patience, log."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hdbridge.daemon.logs import LogSettings, RateLimit, begin_log
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.notify import Notifier
+from hdbridge.daemon.patience import BackOff, Budget
+from hdbridge.daemon.runtime import runtime_folder, socket_path
+from hdbridge.daemon.start import Start
+from hdbridge.errors import InputError
+
+
+def test_the_service_manager_s_folder_comes_first(tmp_path: Path) -> None:
+    session = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    assert runtime_folder({"RUNTIME_DIRECTORY": "/run/hdbridge:/run/other", **session}) == Path(
+        "/run/hdbridge"
+    )
+    folder = runtime_folder(session)
+    assert folder == tmp_path / "hdbridge"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert runtime_folder(session) == folder
+    assert socket_path("cell", folder) == folder / "cell.sock"
+    assert socket_path("cell", folder, tmp_path / "own.sock") == tmp_path / "own.sock"
+
+
+def test_a_folder_that_others_could_use_is_refused(tmp_path: Path) -> None:
+    session = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    runtime_folder(session).chmod(0o755)
+    with pytest.raises(InputError, match="not a folder of this user alone"):
+        runtime_folder(session)
+    (tmp_path / "hdbridge").rmdir()
+    (tmp_path / "hdbridge").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="not a folder of this user alone"):
+        runtime_folder(session)
+
+
+def test_a_child_reads_what_it_was_told() -> None:
+    start = Start(Machine.find("article"), memory_fd=7, keeper=os.getpid())
+    fd = start.hand_over(restarts=2, api_fds=(8, 9))
+    told = Start.inherited([str(fd)])
+    assert (told.machine, told.restarts, told.api_fds) == (start.machine, 2, (8, 9))
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)
+
+
+@pytest.mark.parametrize("arguments", [[], ["x"], ["0", "1"], ["9999"]])
+def test_a_child_is_not_started_by_hand(arguments: list[str]) -> None:
+    with pytest.raises(InputError, match="use 'hdbridge run'"):
+        Start.inherited(arguments)
+
+
+def test_a_child_whose_keeper_is_gone_ends() -> None:
+    program = (
+        "from hdbridge.daemon.start import Start, begin_child\n"
+        "from hdbridge.daemon.machine import Machine\n"
+        "begin_child(Start(Machine.find('article'), 0, keeper=1), 'name')\n"
+        "print('went on')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, b"")
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[socket.socket]:
+    """The service manager's end of the notifications."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
+        made.bind(str(tmp_path / "notify"))
+        made.settimeout(5.0)
+        yield made
+
+
+def test_the_service_manager_is_told(manager: socket.socket) -> None:
+    environment = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "3000000"}
+    notifier = Notifier.of_environment(environment)
+    assert environment == {}
+    assert notifier.watchdog_s == 3.0
+    notifier.ready()
+    notifier.status("one")
+    notifier.status("one")
+    notifier.alive()
+    notifier.stopping()
+    said = [manager.recv(100).decode() for _ in range(4)]
+    assert said == ["READY=1", "STATUS=one", "WATCHDOG=1", "STOPPING=1"]
+
+
+def test_a_watchdog_for_another_process_is_not_fed(manager: socket.socket) -> None:
+    environment = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
+    notifier = Notifier.of_environment(environment)
+    notifier.alive()
+    notifier.stopping()
+    assert manager.recv(100) == b"STOPPING=1"
+
+
+def test_without_a_service_manager_nobody_is_told(tmp_path: Path) -> None:
+    for notifier in (Notifier.of_environment({}), Notifier(str(tmp_path / "nobody"), 1.0)):
+        notifier.ready()
+        notifier.alive()
+
+
+def test_a_budget_is_for_a_window_of_time() -> None:
+    budget = Budget(2, 60.0)
+    assert [budget.spend(at) for at in (0.0, 10.0, 59.0, 60.0, 65.0, 70.0)] == [
+        True, True, False, True, False, True,
+    ]  # fmt: skip
+    assert not Budget(0, 60.0).spend(0.0)
+
+
+def test_delays_double_until_something_has_lived() -> None:
+    back_off = BackOff(0.5, 3.0, 60.0)
+    assert [back_off.delay_s(lived) for lived in (0.1, 0.1, 0.1, 0.1, 61.0, 0.1)] == [0.5, 1, 2, 3, 0.5, 1]
+
+
+@pytest.fixture
+def log() -> Iterator[logging.Logger]:
+    """The project's logger, put back afterwards."""
+    root = logging.getLogger("hdbridge")
+    before = root.handlers[:], root.level, root.propagate
+    yield root
+    for handler in set(root.handlers) - set(before[0]):
+        root.removeHandler(handler)
+        handler.close()
+    root.setLevel(before[1])
+    root.propagate = before[2]
+
+
+def test_the_log_is_json_where_nobody_looks(
+    log: logging.Logger, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin_log(LogSettings(verbose=1, file=tmp_path / "log"))
+    logging.getLogger("hdbridge.test").info("begun", {"axes": 2})
+    logging.getLogger("hdbridge.test").debug("detail", {})
+    (line,) = capsys.readouterr().err.splitlines()
+    event = json.loads(line)
+    assert (event["level"], event["event"], event["axes"]) == ("info", "begun", 2)
+    assert [json.loads(each)["event"] for each in (tmp_path / "log").read_text().splitlines()] == [
+        "begun", "detail",
+    ]  # fmt: skip
+
+
+def test_the_journal_is_told_the_priority(
+    log: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("JOURNAL_STREAM", "8:1")
+    begin_log(LogSettings())
+    logging.getLogger("hdbridge.test").warning("odd", {})
+    assert capsys.readouterr().err.startswith('<4>{"date": ')
+
+
+def test_an_event_that_comes_too_often_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("hdbridge.daemon.logs.time.monotonic", lambda: now_s)
+    limit = RateLimit(burst=2, window_s=10.0)
+
+    def record(event: str) -> logging.LogRecord:
+        return logging.LogRecord("hdbridge.test", logging.INFO, "", 0, event, ({"axis": "a"},), None)
+
+    assert [limit.filter(record("often")) for _ in range(5)] == [True, True, False, False, False]
+    assert limit.filter(record("other"))
+    now_s = 11.0
+    later = record("often")
+    assert limit.filter(later)
+    assert later.args == {"axis": "a", "left_out_before": 3}
