@@ -1,1 +1,7 @@
 """Set-points of one axis, period by period: moves, jogs, streams and stops within the limits. Pure."""
+
+from hdbridge.motion.coordinated import CoordinatedPlan, coordinated
+from hdbridge.motion.modes import MotionMode
+from hdbridge.motion.setpoint import SetPoint
+
+__all__ = ["CoordinatedPlan", "MotionMode", "SetPoint", "coordinated"]

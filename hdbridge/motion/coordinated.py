@@ -1,0 +1,171 @@
+"""Synchronised moves of several axes: all begin together, arrive together, and go straight in between.
+
+The result is knots at the control period for each axis, which a stream (`SetPoint.stream`) follows to the
+bit. To be made outside of the loop: it takes milliseconds.
+
+Ruckig's free version plans no path through intermediate points (it would ask a server on the internet). So a
+path through way points rests at each at which its direction changes; points on a straight line are passed in
+motion. To round a corner without a rest, one has to leave the points: that is for the caller to decide, by
+other points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from ruckig import InputParameter, Ruckig, RuckigError, Synchronization, Trajectory
+
+from hdbridge.effects import FloatArray
+from hdbridge.errors import InputError
+from hdbridge.motion.generator import SHARES, SOLVED
+from hdbridge.motion.stream import ACCELERATION_MARGIN
+from hdbridge.procedures.moves import MotionLimits
+
+_STRAIGHT = 1e-9
+"""Of the direction's unit vector, so far two may be apart and still be one."""
+MOST_S = 3600.0
+"""Longest plan; its knots are kept in memory."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoordinatedPlan:
+    """Knots of several axes for the same times."""
+
+    duration_s: float
+    knots: dict[str, FloatArray]
+    """Per axis, shape (n, 3): time in s (from 0, at each control period), load angle in degrees, velocity in
+    deg/s.
+
+    The first is where the axis stood, the last its target; both at rest.
+    """
+
+
+def coordinated(
+    starts_deg: Mapping[str, float],
+    points_deg: Sequence[Mapping[str, float]],
+    limits: Mapping[str, MotionLimits],
+    period_s: float,
+    share: float = 1.0,
+) -> CoordinatedPlan:
+    """Move axes from rest, together, through points to rest at the last of them.
+
+    ``starts_deg`` is where each axis stands. Each point gives load angles of some or all axes; the others
+    stay. ``share``, above 0 and up to 1, is taken of all limits of velocity and acceleration. InputError for
+    an axis that is not known, an angle outside its limits or not finite, and a plan longer than an hour.
+    """
+    if not points_deg:
+        raise InputError("a coordinated move without a point; expected at least one")
+    if not (0.0 < share <= 1.0 and 0.0 < period_s < math.inf):
+        raise InputError(f"a share of {share!r} of the limits; expected more than 0 and at most 1")
+    names = [each for each in starts_deg if any(each in point for point in points_deg)]
+    for point in points_deg:
+        for name in point:
+            if name not in starts_deg or name not in limits:
+                raise InputError(
+                    f"no axis '{name}' in this move; expected one of {', '.join(map(repr, starts_deg))}"
+                )
+            _check_inside(name, point[name], limits[name])
+    if not names:
+        raise InputError("a coordinated move of no axis; expected a target for at least one")
+    here = np.array([starts_deg[each] for each in names])
+    if not np.isfinite(here).all():
+        raise InputError(f"a coordinated move that begins at {here.tolist()} deg; expected finite angles")
+    corners = [here]
+    for point in points_deg:
+        here = np.array([point.get(name, at) for name, at in zip(names, here.tolist(), strict=True)])
+        corners.append(here)
+    eased = [_eased(limits[each], period_s, share) for each in names]
+    legs = [_leg(begin, end, eased, period_s) for begin, end in _straight(corners)]
+    if not legs:
+        legs = [(np.stack([here, here]), np.zeros((2, len(names))))]
+    position = np.concatenate([legs[0][0], *(each[0][1:] for each in legs[1:])])
+    velocity = np.concatenate([legs[0][1], *(each[1][1:] for each in legs[1:])])
+    time_s = period_s * np.arange(len(position))
+    knots = {
+        name: np.column_stack([time_s, position[:, place], velocity[:, place]])
+        for place, name in enumerate(names)
+    }
+    return CoordinatedPlan(float(time_s[-1]), knots)
+
+
+def _check_inside(name: str, angle_deg: float, limits: MotionLimits) -> None:
+    if not limits.position_min_deg <= angle_deg <= limits.position_max_deg:
+        raise InputError(
+            f"axis '{name}': a target of {angle_deg!r} deg; the position limits are "
+            f"{limits.position_min_deg:g} and {limits.position_max_deg:g} deg"
+        )
+
+
+class _Eased(NamedTuple):
+    """Limits within which the cubics between the knots keep to the axis's."""
+
+    velocity_deg_s: float
+    acceleration_deg_s2: float
+    jerk_deg_s3: float
+
+
+def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
+    """Where the jerk changes within a period T, the cubic passes the acceleration by up to 4/27 of jerk T,
+    and the velocity by up to 0.015 of jerk T^2.
+    """
+    velocity, acceleration = share * limits.velocity_deg_s, share * limits.acceleration_deg_s2
+    jerk = min(
+        limits.jerk_deg_s3,
+        (ACCELERATION_MARGIN - 1.0) * 27.0 / 4.0 * acceleration / period_s,
+        velocity / period_s**2,
+    )
+    return _Eased(velocity - 0.015 * jerk * period_s**2, acceleration, jerk)
+
+
+def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
+    """From corner to corner, without points that are passed straight on; legs of no length left out."""
+    legs: list[tuple[FloatArray, FloatArray]] = []
+    for begin, end in pairwise(corners):
+        way = end - begin
+        length = float(np.linalg.norm(way))
+        if not length:
+            continue
+        if legs:
+            before = legs[-1][1] - legs[-1][0]
+            bend = before / np.linalg.norm(before) - way / length
+            if float(np.linalg.norm(bend)) < _STRAIGHT:
+                legs[-1] = (legs[-1][0], end)
+                continue
+        legs.append((begin, end))
+    return legs
+
+
+def _leg(
+    begin: FloatArray, end: FloatArray, limits: Sequence[_Eased], period_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Positions and velocities at each period from rest to rest, both of shape (n, axes)."""
+    count = len(begin)
+    demand = InputParameter(count)
+    demand.synchronization = Synchronization.Phase
+    demand.current_position = [0.0] * count
+    demand.target_position = (end - begin).tolist()
+    demand.max_jerk = [each.jerk_deg_s3 for each in limits]
+    for share in SHARES:
+        demand.max_velocity = [share * each.velocity_deg_s for each in limits]
+        demand.max_acceleration = [share * each.acceleration_deg_s2 for each in limits]
+        trajectory = Trajectory(count)
+        with suppress(RuckigError):
+            if Ruckig(count).calculate(demand, trajectory) in SOLVED and trajectory.duration <= MOST_S:
+                break
+    else:
+        raise InputError(
+            f"no synchronised move from {begin.tolist()} to {end.tolist()} deg within the limits and "
+            f"{MOST_S:g} s: check the targets, the share, and the limits in the axis files"
+        )
+    periods = max(math.ceil(trajectory.duration / period_s - 1e-9), 1)
+    states = [trajectory.at_time(number * period_s) for number in range(periods)]
+    rest = np.zeros((1, count))
+    position = np.concatenate([begin + np.array([each[0] for each in states]), end[np.newaxis]])
+    velocity = np.concatenate([np.array([each[1] for each in states]), rest])
+    return position, velocity

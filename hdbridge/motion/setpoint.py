@@ -1,0 +1,333 @@
+"""The set-point of one axis, period by period, for whatever is asked of it and whenever.
+
+Every motion goes on from the present position, velocity and acceleration: nothing has to be at rest to be
+given a new target. What cannot be done is refused (InputError) before anything has changed, and the motion
+under way goes on.
+
+It stays within the position limits at all times. A plan is taken only if its extremes are within them, and
+braking has a way out that always exists (`SetPoint._brake`). The last bit of rounding is cut off.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.errors import InputError
+from hdbridge.motion.generator import Bounds, Generator, Kinematics, Plan
+from hdbridge.motion.modes import MotionMode
+from hdbridge.motion.stream import Cubic, Stream
+from hdbridge.procedures.moves import MotionLimits
+
+MOST_TIMEOUT_S = 60.0
+"""Longer, a dead man's time-out is none."""
+
+
+class SetPoint:
+    """Where the load shall be, once per control period.
+
+    Pure: time is counted in calls of `step`. An axis that stands outside its position limits may hold there
+    and move inwards.
+    """
+
+    __slots__ = (
+        "_acceleration_deg_s2", "_bounds", "_generator", "_left", "_limits", "_mode", "_path", "_period_s",
+        "_position_deg", "_since_s", "_steps", "_stream", "_stream_timeout", "_underrun", "_velocity_deg_s",
+    )  # fmt: skip
+
+    def __init__(self, limits: MotionLimits, period_s: float) -> None:
+        """``period_s``: time from one `step` to the next. Stands at zero until `reset`.
+
+        InputError for limits that are not finite, or that leave no room.
+        """
+        numbers = (limits.velocity_deg_s, limits.acceleration_deg_s2, limits.jerk_deg_s3, period_s)
+        if not all(math.isfinite(each) and each > 0.0 for each in numbers):
+            raise InputError(
+                f"velocity, acceleration, jerk limit and period are {numbers}; expected finite numbers "
+                "above 0"
+            )
+        ends = (limits.position_min_deg, limits.position_max_deg)
+        if not (all(map(math.isfinite, ends)) and ends[0] <= ends[1]):
+            raise InputError(f"position limits of {ends[0]!r} to {ends[1]!r} deg; expected a finite range")
+        self._limits = limits
+        self._period_s = period_s
+        self._generator = Generator(limits)
+        self._stream: Stream | None = None
+        self._path: Plan | Cubic | None = None
+        """What is followed; None at rest and in a stream."""
+        self._steps = 0
+        """Periods since ``_path`` was made, which was ``_since_s`` ago then."""
+        self._since_s = 0.0
+        self._left = self._stream_timeout = 0
+        """Periods that are left to a jog, or to a stream that rests."""
+        self._mode = MotionMode.HOLD
+        self._underrun = False
+        self._position_deg = self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
+        self._bounds = Bounds(*ends)
+
+    @property
+    def position_deg(self) -> float:
+        """The load target of the last `step`."""
+        return self._position_deg
+
+    @property
+    def velocity_deg_s(self) -> float:
+        """Its velocity."""
+        return self._velocity_deg_s
+
+    @property
+    def acceleration_deg_s2(self) -> float:
+        """Its acceleration."""
+        return self._acceleration_deg_s2
+
+    @property
+    def mode(self) -> MotionMode:
+        """What moves it."""
+        return self._mode
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether it stands, and would for good if nothing more came."""
+        if self._stream is not None:
+            return self._stream.waiting
+        return self._path is None
+
+    @property
+    def underrun(self) -> bool:
+        """Whether the last stream ran out of knots in motion and had to be braked."""
+        return self._underrun
+
+    @property
+    def room(self) -> int:
+        """Knots that would be taken now; 0 outside of a stream."""
+        return 0 if self._stream is None else self._stream.room
+
+    def reset(self, load_deg: float) -> None:
+        """Stand here: forget all motion. For an axis that is not being driven. InputError: not finite."""
+        _check_finite("load angle", load_deg)
+        self._rest_at(load_deg)
+        self._underrun = False
+
+    def goto(
+        self,
+        target_deg: float,
+        velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+    ) -> None:
+        """Move to a load angle and rest there; from rest or from any motion.
+
+        Velocity and acceleration of this move, where given, are no more than the axis's in any case.
+        InputError for a target outside of the position limits or a number that is none; and, in motion, where
+        the axis would have to leave the position limits on its way (stop it first).
+        """
+        limits = self._limits
+        _check_finite("target", target_deg)
+        speed = _positive("velocity", velocity_deg_s)
+        acceleration = _positive("acceleration", acceleration_deg_s2)
+        if not limits.position_min_deg <= target_deg <= limits.position_max_deg:
+            raise InputError(
+                f"a target of {target_deg:.9g} deg; the position limits are {limits.position_min_deg:g} and "
+                f"{limits.position_max_deg:g} deg"
+            )
+        self._take(self._planned(target_deg, speed, acceleration), MotionMode.GOTO)
+
+    def jog(self, velocity_deg_s: float, timeout_s: float) -> None:
+        """Move at a velocity (no faster than the axis may) until the time-out; zero brakes.
+
+        To be called again before the time is out. It brakes before a position limit and waits there.
+        InputError for numbers that are none, and a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        """
+        _check_finite("velocity", velocity_deg_s)
+        timeout = self._timeout(timeout_s)
+        limits = self._limits
+        speed = min(abs(velocity_deg_s), limits.velocity_deg_s)
+        if not speed:
+            self.stop()
+            return
+        # Planned as a move, so that the position limit is kept by the plan: to the limit, or farther than
+        # it comes before its time is out.
+        easing_s = speed / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
+        reach = self._coasting_deg() + speed * (timeout_s + 2.0 * (easing_s + self._period_s))
+        bounds = self._bounds_here()
+        if velocity_deg_s > 0.0:
+            target_deg = min(self._position_deg + reach, bounds.upper_deg)
+        else:
+            target_deg = max(self._position_deg - reach, bounds.lower_deg)
+        self._take(self._planned(target_deg, speed, math.inf), MotionMode.JOG)
+        self._left = timeout
+
+    def stop(self) -> None:
+        """Brake to rest within the limits. Never refused; at rest it ends a stream or a jog."""
+        if self.at_rest:
+            self._rest_at(self._position_deg)
+        elif self._mode is not MotionMode.STOP:
+            self._brake(0.0)
+
+    def stream(self, timeout_s: float) -> None:
+        """Follow knots from here (`knot`), their time beginning with the first `step` after `begin_stream`.
+
+        It ends in a hold when it has rested without a knot for the time-out. InputError: in motion, or a
+        time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        """
+        timeout = self._timeout(timeout_s)
+        if not self.at_rest:
+            raise InputError("a stream begins at rest: stop the axis first")
+        self._rest_at(self._position_deg)
+        self._stream = Stream(self._position_deg, self._limits, self._bounds_here(), self._period_s)
+        self._stream_timeout = timeout
+        self._left = timeout
+        self._underrun = False
+        self._mode = MotionMode.STREAM
+
+    def begin_stream(self) -> None:
+        """Let the stream's time begin with the next `step`. InputError without a `stream`."""
+        self._streaming().begin()
+
+    def knot(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
+        """One more knot of the stream: time from its beginning, and load angle and velocity then.
+
+        Between two knots it follows the cubic with their velocities. InputError, and the stream goes on as if
+        nothing had come, where the knot is no later than the last, or position, speed or (by more than 5 %)
+        acceleration would leave the limits, anywhere on the way to it or when braking from it; for a first
+        knot that is not at rest where the axis stands; and for one too many (`room`).
+        """
+        self._streaming().add(time_s, position_deg, velocity_deg_s)
+
+    def step(self) -> float:
+        """One period on: the load target in degrees."""
+        if self._stream is not None:
+            return self._step_stream(self._stream)
+        if self._mode is MotionMode.JOG:
+            self._left -= 1
+            if self._left < 0:
+                self.stop()
+        return self._follow()
+
+    def _follow(self) -> float:
+        path = self._path
+        if path is None:
+            return self._position_deg
+        self._steps += 1
+        time_s = self._since_s + self._steps * self._period_s
+        self._set(path.state(time_s))
+        if time_s >= path.duration_s:
+            self._path = None
+            self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
+            if self._mode is not MotionMode.JOG:
+                self._mode = MotionMode.HOLD
+        return self._position_deg
+
+    def _step_stream(self, stream: Stream) -> float:
+        self._set(stream.step())
+        if stream.overrun_s is not None:
+            self._brake(stream.overrun_s - self._period_s)
+            self._underrun = True
+            return self._follow()
+        if not stream.waiting:
+            self._left = self._stream_timeout
+        elif self._left:
+            self._left -= 1
+        else:
+            self._rest_at(self._position_deg)
+        return self._position_deg
+
+    def _set(self, state: Kinematics) -> None:
+        position, self._velocity_deg_s, self._acceleration_deg_s2 = state
+        lower, upper = self._bounds
+        self._position_deg = lower if position < lower else upper if position > upper else position
+
+    def _state(self) -> Kinematics:
+        return Kinematics(self._position_deg, self._velocity_deg_s, self._acceleration_deg_s2)
+
+    def _rest_at(self, position_deg: float) -> None:
+        self._position_deg = position_deg
+        self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
+        self._path = self._stream = None
+        self._mode = MotionMode.HOLD
+        self._bounds = self._bounds_here()
+
+    def _bounds_here(self) -> Bounds:
+        """The position limits, and where it stands if that is outside of them."""
+        limits, here = self._limits, self._position_deg
+        return Bounds(min(limits.position_min_deg, here), max(limits.position_max_deg, here))
+
+    def _take(self, path: Plan | Cubic, mode: MotionMode, since_s: float = 0.0) -> None:
+        self._bounds = self._bounds_here()
+        self._path, self._steps, self._since_s = path, 0, since_s
+        self._stream = None
+        self._mode = mode
+        self._underrun = False
+
+    def _planned(self, target_deg: float, velocity_deg_s: float, acceleration_deg_s2: float) -> Plan:
+        """The way to a target; InputError where there is none."""
+        now, bounds = self._state(), self._bounds_here()
+        for acceleration in (acceleration_deg_s2, math.inf):
+            # In motion a gentle move may have to brake as hard as the axis can, to stay within its limits.
+            plan = self._generator.to_position(now, target_deg, bounds, velocity_deg_s, acceleration)
+            if plan is not None:
+                return plan
+            if self.at_rest:
+                break
+        raise InputError(
+            f"no way from {now.position_deg:.9g} deg at {now.velocity_deg_s:.4g} deg/s to {target_deg:.9g} "
+            "deg within the limits: check velocity and acceleration of the move and the limits in the axis "
+            "file, or stop the axis first"
+        )
+
+    def _brake(self, since_s: float) -> None:
+        """To rest, in the first of three ways that stays within the position limits.
+
+        As fast as jerk allows; or, where that would swing beyond a limit, back to where it is now, which
+        brakes as hard and lets go later; or with constant acceleration, which needs no more room than any
+        path within the limits and is always possible. The last is needed only out of a stream whose knots
+        brake against a limit with more jerk than the axis may.
+        """
+        now, bounds = self._state(), self._bounds_here()
+        path = (
+            self._generator.to_rest(now, bounds)
+            or self._generator.to_position(now, now.position_deg, bounds)
+            or self._steady_stop(now, bounds)
+        )
+        self._take(path, MotionMode.STOP, since_s)
+
+    def _steady_stop(self, now: Kinematics, bounds: Bounds) -> Cubic:
+        """With constant deceleration at the limit, or what the room asks for."""
+        place, speed = now.position_deg, abs(now.velocity_deg_s)
+        left_deg = bounds.upper_deg - place if now.velocity_deg_s > 0.0 else place - bounds.lower_deg
+        travel_deg = min(speed * speed / (2.0 * self._limits.acceleration_deg_s2), left_deg)
+        if not (speed and travel_deg > 0.0):
+            return Cubic.between(0.0, place, 0.0, self._period_s, place, 0.0)
+        end_deg = place + math.copysign(travel_deg, now.velocity_deg_s)
+        return Cubic.between(0.0, place, now.velocity_deg_s, 2.0 * travel_deg / speed, end_deg, 0.0)
+
+    def _coasting_deg(self) -> float:
+        """At most so far it comes before it has slowed down."""
+        limits, speed = self._limits, abs(self._velocity_deg_s)
+        easing_s = (abs(self._acceleration_deg_s2) + limits.acceleration_deg_s2) / limits.jerk_deg_s3
+        return limits.velocity_deg_s * (speed / limits.acceleration_deg_s2 + 2.0 * easing_s)
+
+    def _timeout(self, timeout_s: float) -> int:
+        """In periods."""
+        if not 0.0 < timeout_s <= MOST_TIMEOUT_S:
+            raise InputError(
+                f"a time-out of {timeout_s!r} s; expected more than 0 and at most {MOST_TIMEOUT_S:g}"
+            )
+        return max(round(timeout_s / self._period_s), 1)
+
+    def _streaming(self) -> Stream:
+        if self._stream is None:
+            raise InputError("no stream has been begun: begin one before its knots come")
+        return self._stream
+
+
+def _check_finite(name: str, value: float) -> None:
+    if not math.isfinite(value):
+        raise InputError(f"a {name} of {value!r}; expected a finite number")
+
+
+def _positive(name: str, value: float | None) -> float:
+    """A limit of a move; infinite where none is given."""
+    if value is None:
+        return math.inf
+    if not (math.isfinite(value) and value > 0.0):
+        raise InputError(f"a {name} of {value!r} for this move; expected a finite number above 0")
+    return value
