@@ -1,0 +1,68 @@
+// Requests to the daemon: the token, the lease, and errors as the daemon words them.
+
+const ROOT = "/api/v1";
+const TOKEN_KEY = "hdbridge.token";
+let leaseToken = null;
+
+export class Problem extends Error {
+  constructor(status, body) {
+    super(body.detail || body.title || `status ${status}`);
+    this.status = status;
+    this.hint = body.hint || null;
+  }
+}
+
+export const token = () => sessionStorage.getItem(TOKEN_KEY);
+export const keepToken = (text) => sessionStorage.setItem(TOKEN_KEY, text);
+export const holdsLease = () => leaseToken !== null;
+
+export async function ask(method, path, body) {
+  const headers = { Accept: "application/json" };
+  if (token()) headers.Authorization = `Bearer ${token()}`;
+  if (leaseToken) headers["X-Lease"] = leaseToken;
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  const answer = await fetch(ROOT + path, {
+    method,
+    headers,
+    body: body === undefined ? undefined : JSON.stringify(body),
+    cache: "no-store",
+    credentials: "omit",
+  });
+  const text = await answer.text();
+  let parsed = {};
+  try {
+    parsed = text ? JSON.parse(text) : {};
+  } catch {
+    parsed = { detail: `the daemon answered with what is no JSON (status ${answer.status})` };
+  }
+  if (!answer.ok) {
+    if (answer.status === 423) leaseToken = null;
+    throw new Problem(answer.status, parsed);
+  }
+  return parsed;
+}
+
+export async function takeLease(force) {
+  const grant = await ask("POST", "/lease", { client: "live page", force });
+  leaseToken = grant.token;
+  return grant;
+}
+
+export const renewLease = () => ask("PUT", "/lease");
+
+export async function releaseLease() {
+  try {
+    await ask("DELETE", "/lease");
+  } finally {
+    leaseToken = null;
+  }
+}
+
+export const axisPath = (axis, what) => `/axes/${encodeURIComponent(axis)}/${what}`;
+
+export function socket(path) {
+  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+  // A browser cannot set a header here, and an address ends up in logs: the token goes as a subprotocol.
+  const offered = ["hdbridge.v1", ...(token() ? [`bearer.${token()}`] : [])];
+  return new WebSocket(`${scheme}//${location.host}${ROOT}${path}`, offered);
+}

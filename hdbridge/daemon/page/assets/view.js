@@ -1,0 +1,139 @@
+// What stands on the page besides the charts: figures, fault, model, events.
+
+import { holdsLease } from "./api.js";
+
+const at = (id) => document.getElementById(id);
+const EVENTS_SHOWN = 100;
+const GRAVE = new Set(["stopped", "bus-down", "refused", "stream-refused"]);
+const number = (value, digits) => (value === null || value === undefined ? "-" : value.toFixed(digits).replace("-", "\u2212"));
+
+export function age(seconds) {
+  if (seconds === null || seconds === undefined) return "unknown";
+  for (const [unit, length] of [["days", 86400], ["hours", 3600], ["minutes", 60]]) {
+    if (seconds >= 2 * length) return `${Math.floor(seconds / length)} ${unit}`;
+  }
+  return `${Math.floor(seconds)} s`;
+}
+
+export function say(error) {
+  const notice = at("notice");
+  notice.hidden = error === null;
+  if (error !== null) notice.textContent = error.message;
+}
+
+export function connection(state, text) {
+  const line = at("connection");
+  line.className = state;
+  line.textContent = text;
+}
+
+export function tabs(names, chosen, choose) {
+  const box = at("axes");
+  box.hidden = names.length < 2;
+  if (box.childElementCount !== names.length) {
+    box.replaceChildren(
+      ...names.map((name) => {
+        const button = document.createElement("button");
+        button.type = "button";
+        button.role = "tab";
+        button.textContent = name;
+        button.onclick = () => choose(name);
+        return button;
+      }),
+    );
+  }
+  for (const button of box.children) button.setAttribute("aria-selected", String(button.textContent === chosen));
+}
+
+/** The newest sample of the axis that is shown. */
+export function figures(axis) {
+  at("load").textContent = number(axis.load_position_deg, 4);
+  at("target").textContent = number(axis.load_target_deg, 4);
+  at("error").textContent = number(axis.error_arcsec, 1);
+  at("correction").textContent = number(axis.correction_arcsec, 1);
+}
+
+function facts(list, rows) {
+  list.replaceChildren(
+    ...rows.flatMap(([name, value]) => {
+      const term = document.createElement("dt");
+      const text = document.createElement("dd");
+      term.textContent = name;
+      text.textContent = value;
+      return [term, text];
+    }),
+  );
+}
+
+function adaptation(state) {
+  if (state.mode === "off") return "off";
+  return state.frozen ? `${state.mode}; frozen: ${state.frozen}` : state.mode;
+}
+
+export function machine(state) {
+  document.title = `${state.name}: hdbridge`;
+  at("machine").textContent = state.name;
+  at("simulated").hidden = !state.simulated;
+  const load = state.bus.load;
+  at("bus-load").textContent = load === null || load === undefined ? "-" : (100 * load).toFixed(0);
+  at("cycle-figures").textContent = `${(1e3 * state.cycle.period_s).toFixed(1)} ms a cycle, ${state.cycle.skipped} left out`;
+  const mine = holdsLease();
+  at("holder").textContent = mine ? "you have control" : state.lease.held ? `${state.lease.client || "another client"} has control` : "nobody has control";
+  at("lease").textContent = mine ? "Release control" : "Take control";
+  at("lease").disabled = false;
+  at("controls").disabled = !mine;
+  at("reset").disabled = !mine;
+  at("controls-why").hidden = mine;
+  const warnings = [...state.warnings, ...(state.recorder.note ? [`recorder: ${state.recorder.note}`] : []), ...state.axes.flatMap((each) => each.advice.map((text) => `${each.name}: ${text}`))];
+  at("warnings").hidden = warnings.length === 0;
+  at("warnings").replaceChildren(...warnings.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+}
+
+export function axis(state) {
+  at("state").textContent = state.state;
+  at("mode").textContent = state.state === "enabled" ? state.mode : state.power;
+  at("fault").hidden = !state.fault;
+  if (state.fault) {
+    at("fault-text").textContent = state.fault.text;
+    at("fault-hint").textContent = state.fault.hint;
+    at("reset").textContent = state.fault.needs_verification ? "Verify the drive and reset" : "Reset";
+  }
+  const select = at("scheme");
+  const offered = ["none", "synchronous", "hysteresis", "both", "extended"];
+  if (!select.options.length) select.append(...offered.map((name) => new Option(name, name)));
+  if (document.activeElement !== select) select.value = state.scheme;
+  at("move-to").min = state.limits.position_min_deg;
+  at("move-to").max = state.limits.position_max_deg;
+  at("jog-speed").max = state.limits.velocity_deg_s;
+  const model = state.model;
+  const rows = model
+    ? [
+        ["version", model.version === null ? "not in the history" : String(model.version)],
+        ["made", model.date ? `${new Date(model.date).toLocaleString()} (${age(model.age_s)} ago)` : "unknown"],
+        ["why", model.reason || "not told"],
+        ["effects", model.effects.join(", ") || "none"],
+        ["file", model.file],
+      ]
+    : [["model", "none: this axis is not compensated"]];
+  rows.push(
+    ["compensation", state.compensating ? `${state.scheme}${state.changing ? ", changing" : ""}${state.limited ? ", at its limit" : ""}` : "off"],
+    ["hysteresis state", state.memory_known ? "known" : "not known until the axis has turned both ways"],
+    ["load-side loop", state.load_loop.on ? `on, ${number(state.load_loop.correction_arcsec, 1)} arcsec` : "off"],
+    ["adaptation", adaptation(state.adaptation)],
+  );
+  facts(at("model"), rows);
+}
+
+export function events(news) {
+  const list = at("events");
+  for (const event of news) {
+    const line = document.createElement("li");
+    const time = document.createElement("time");
+    time.textContent = new Date(event.date).toLocaleTimeString();
+    line.append(time, [event.axis, event.kind, event.text].filter(Boolean).join(": "));
+    if (GRAVE.has(event.kind)) line.className = "grave";
+    if (event.hint) line.title = event.hint;
+    list.prepend(line);
+  }
+  while (list.childElementCount > EVENTS_SHOWN) list.lastElementChild.remove();
+}

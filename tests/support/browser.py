@@ -1,0 +1,138 @@
+"""A headless Chromium, driven by its own DevTools protocol: what a person would see and press."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+FINDER = Path(__file__).parents[2] / "tools" / "chromium.sh"
+PATIENCE_S = 30.0
+"""For what a page does: far more than it needs, on a machine that stalls."""
+
+
+class Page:
+    """One page of the browser."""
+
+    def __init__(self, line: ClientConnection) -> None:
+        self._line = line
+        self._asked = 0
+        self.complaints: list[str] = []
+        """Errors that the page raised, and what it wrote to the console as an error."""
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+        self.requested: list[str] = []
+        """Addresses that the page has asked for."""
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """One command of the protocol and its answer; what happens meanwhile is noted."""
+        self._asked += 1
+        self._line.send(json.dumps({"id": self._asked, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._line.recv(timeout=PATIENCE_S))
+            if message.get("id") == self._asked:
+                assert "error" not in message, message["error"]
+                return message.get("result", {})
+            self._note(message.get("method", ""), message.get("params", {}))
+
+    def _note(self, method: str, told: dict[str, Any]) -> None:
+        if method == "Runtime.exceptionThrown":
+            details = told["exceptionDetails"]
+            self.complaints.append(details.get("exception", {}).get("description") or details["text"])
+        elif method == "Log.entryAdded" and told["entry"]["level"] == "error":
+            self.complaints.append(f"{told['entry']['text']} {told['entry'].get('url', '')}".strip())
+        elif method == "Network.requestWillBeSent":
+            self.requested.append(told["request"]["url"])
+
+    def open(self, url: str, *, width: int = 1280, height: int = 900, dark: bool = False) -> None:
+        """Load a page in a window of this size."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
+        )  # fmt: skip
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=url)
+        self.until("document.readyState === 'complete'")
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression in the page; a promise is awaited."""
+        answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def until(self, condition: str) -> Any:
+        """Wait until an expression is true in the page; its value."""
+        end = time.monotonic() + PATIENCE_S
+        while not (value := self.evaluate(condition)):
+            assert time.monotonic() < end, f"never became true: {condition}; complaints: {self.complaints}"
+            time.sleep(0.05)
+        return value
+
+    def text(self, selector: str) -> str:
+        """What stands in an element."""
+        return str(self.evaluate(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+    def click(self, selector: str) -> None:
+        """Press a button."""
+        self.evaluate(f"document.querySelector({json.dumps(selector)}).click()")
+
+    def press(self, key: str, *, hold_s: float = 0.0) -> None:
+        """Press a key, hold it, let it go."""
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key)
+        time.sleep(hold_s)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def screenshot(self, path: Path) -> None:
+        """The whole page as PNG."""
+        picture = self.call("Page.captureScreenshot", captureBeyondViewport=True)["data"]
+        path.write_bytes(base64.b64decode(picture))
+
+
+@contextmanager
+def browser() -> Iterator[Page]:
+    """A page of a new Chromium; the test is skipped, and says so, where there is none to be had."""
+    found = subprocess.run([FINDER], capture_output=True, text=True, check=False)
+    if found.returncode:
+        pytest.skip(found.stderr.strip())
+    home = tempfile.mkdtemp(prefix="chromium-")
+    flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run"]
+    process = subprocess.Popen(
+        [found.stdout.strip(), *flags, f"--user-data-dir={home}", "--remote-debugging-port=0", "about:blank"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        with connect(_address(Path(home), process), max_size=None) as line:
+            yield Page(line)
+    finally:
+        process.kill()
+        process.wait()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def _address(home: Path, process: subprocess.Popen[bytes]) -> str:
+    """The WebSocket of the first page: Chromium writes its port into its folder once it listens."""
+    end = time.monotonic() + PATIENCE_S
+    port_file = home / "DevToolsActivePort"
+    while time.monotonic() < end:
+        assert process.poll() is None, f"Chromium ended with status {process.returncode}"
+        if port_file.exists() and (found := re.match(r"(\d+)\n", port_file.read_text())):
+            with urlopen(f"http://127.0.0.1:{found[1]}/json", timeout=PATIENCE_S) as answer:
+                pages = [each for each in json.load(answer) if each["type"] == "page"]
+            if pages:
+                return str(pages[0]["webSocketDebuggerUrl"])
+        time.sleep(0.05)
+    raise AssertionError("Chromium did not open its debugging port")
