@@ -17,7 +17,6 @@ class Notifier:
         self.watchdog_s = watchdog_s
         """How long the manager waits for `alive`; None where it does not watch."""
         self._address = "\0" + address[1:] if address and address.startswith("@") else address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
         self._status = ""
 
     @classmethod
@@ -48,6 +47,8 @@ class Notifier:
             self._tell(f"STATUS={words}")
 
     def _tell(self, line: str) -> None:
-        if self._socket is not None and self._address is not None:
-            with suppress(OSError):  # the axis is worth more than who watches it
-                self._socket.sendto(line.encode(), socket.MSG_DONTWAIT, self._address)
+        if self._address is None:
+            return
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            # The axis is worth more than who watches it: a manager that does not listen is not waited for.
+            sender.sendto(line.encode(), socket.MSG_DONTWAIT, self._address)

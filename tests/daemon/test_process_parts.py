@@ -22,6 +22,8 @@ from hdbridge.daemon.runtime import runtime_folder, socket_path
 from hdbridge.daemon.start import Start
 from hdbridge.errors import InputError
 
+_log = logging.getLogger("hdbridge.test")
+
 
 def test_the_service_manager_s_folder_comes_first(tmp_path: Path) -> None:
     session = {"XDG_RUNTIME_DIR": str(tmp_path)}
@@ -140,8 +142,8 @@ def test_the_log_is_json_where_nobody_looks(
     log: logging.Logger, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     begin_log(LogSettings(verbose=1, file=tmp_path / "log"))
-    logging.getLogger("hdbridge.test").info("begun", {"axes": 2})
-    logging.getLogger("hdbridge.test").debug("detail", {})
+    _log.info("begun", {"axes": 2})
+    _log.debug("detail", {})
     (line,) = capsys.readouterr().err.splitlines()
     event = json.loads(line)
     assert (event["level"], event["event"], event["axes"]) == ("info", "begun", 2)
@@ -155,7 +157,7 @@ def test_the_journal_is_told_the_priority(
 ) -> None:
     monkeypatch.setenv("JOURNAL_STREAM", "8:1")
     begin_log(LogSettings())
-    logging.getLogger("hdbridge.test").warning("odd", {})
+    _log.warning("odd", {})
     assert capsys.readouterr().err.startswith('<4>{"date": ')
 
 
