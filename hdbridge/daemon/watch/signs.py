@@ -1,0 +1,192 @@
+"""Signs by which a fault of the load encoder is told from a change of the gear. Pure functions of arrays.
+
+A gear's error is tied to its motor: it does not jump while the motor hardly moves, does not stop while the
+motor turns, does not tremble more from one second to the next, and does not run away while the axis rests.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from hdbridge.daemon.watch.residual import Residuals
+from hdbridge.effects import FloatArray
+from hdbridge.units import ARCSEC_PER_DEG
+
+SIDE = 5
+"""Samples on either side of a jump; their medians do not see two misread ones."""
+_MEDIAN = 1.25
+"""Deviation of a median of few, by that of a mean."""
+PREDICTED_SHARE = 0.5
+"""Of what the model says changes meanwhile, so much may be said too early or too late."""
+SHAKE_S = 0.002
+"""A change of speed may show in the error as so much time: wind-up, and the skew between two encoders."""
+
+
+_DIFFERENCES = 1.0 / (0.6745 * np.sqrt(2.0))
+STEP_ARCSEC = 6.0
+STEP_SIGMAS = 8.0
+STEP_BLOCKS = 20
+"""Blocks on either side of a step of the zero."""
+STEP_BETTER = 0.6
+"""Mean square that a step leaves, by that of a trend."""
+
+
+class Jump(NamedTuple):
+    """Where the residual steps, and by how much."""
+
+    row: int
+    by_arcsec: float
+    allowed_arcsec: float
+
+
+def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> Jump | None:
+    """The first step of the residual that neither noise nor motor nor model can have made.
+
+    ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` one count of the motor encoder
+    at the load.
+    """
+    span = 2 * SIDE
+    if len(found) < span:
+        return None
+    windows = sliding_window_view(found.residual_arcsec, span)
+    step = np.median(windows[:, SIDE:], axis=1) - np.median(windows[:, :SIDE], axis=1)
+    allowed = (
+        sigmas * noise_arcsec * _MEDIAN * np.sqrt(2.0 / SIDE)
+        + count_arcsec
+        + PREDICTED_SHARE * _span(found.predicted_arcsec, span)
+        + SHAKE_S * ARCSEC_PER_DEG * _span(found.velocity_deg_s, span)
+    )
+    together = np.all(sliding_window_view(found.usable, span), axis=1)
+    together &= found.cycle[span - 1 :] - found.cycle[: len(together)] < 2 * span
+    rows = np.flatnonzero(together & (np.abs(step) > allowed))
+    if not len(rows):
+        return None
+    # Several windows see one step; the one in the middle of it sees most of it.
+    near = rows[rows < rows[0] + span]
+    row = int(near[np.argmax(np.abs(step[near]))])
+    return Jump(row + SIDE, float(step[row]), float(allowed[row]))
+
+
+def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> int:
+    """How many samples are elsewhere, and back with the next one or two."""
+    if len(found) < SIDE:
+        return 0
+    windows = sliding_window_view(found.residual_arcsec, SIDE)
+    middle = slice(SIDE // 2, SIDE // 2 + len(windows))
+    away = np.abs(found.residual_arcsec[middle] - np.median(windows, axis=1))
+    allowed = (
+        sigmas * noise_arcsec
+        + count_arcsec
+        + PREDICTED_SHARE * _span(found.predicted_arcsec, SIDE)
+        + SHAKE_S * ARCSEC_PER_DEG * _span(found.velocity_deg_s, SIDE)
+    )
+    return int(np.count_nonzero((away > allowed) & np.all(sliding_window_view(found.usable, SIDE), axis=1)))
+
+
+def _span(values: FloatArray, width: int) -> FloatArray:
+    windows = sliding_window_view(values, width)
+    return np.asarray(windows.max(axis=1) - windows.min(axis=1))
+
+
+def local_noise_arcsec(found: Residuals) -> float:
+    """Standard deviation of one reading, by the median change from one to the next: a jump is one of many."""
+    steps = np.abs(np.diff(found.residual_arcsec))
+    return float(_DIFFERENCES * np.median(steps)) if len(steps) else 0.0
+
+
+class Trend(NamedTuple):
+    """How the zero of the residual goes on, with the direction of motion and the speed taken out."""
+
+    rate_arcsec_min: float
+    error_arcsec_min: float
+    """Standard error, which allows for noise that is not white."""
+    zero_arcsec: float
+    """In the middle of the time."""
+
+
+class Step(NamedTuple):
+    """Where the zero of the residual is another from one block to the next."""
+
+    time_s: float
+    by_arcsec: float
+    error_arcsec: float
+
+
+def trend(
+    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
+) -> Trend | None:
+    """Least squares of block means on time; None where there are too few to tell."""
+    minutes = (time_s - float(np.mean(time_s))) / 60.0
+    design = np.column_stack([minutes, _plain(direction, velocity_deg_s)])
+    fitted = _fit(design, residual_arcsec)
+    if fitted is None:
+        return None
+    solution, _, error = fitted
+    return Trend(float(solution[0]), error, float(solution[1]))
+
+
+def find_step(
+    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
+) -> Step | None:
+    """The place where block means step, if a step explains them far better than a trend does."""
+    plain = _plain(direction, velocity_deg_s)
+    basis, _ = np.linalg.qr(plain)
+    rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
+    count = len(rest)
+    after = np.arange(1, count)
+    mean_step = np.cumsum(rest[::-1])[::-1][1:] / (count - after) - np.cumsum(rest)[:-1] / after
+    near = slice(STEP_BLOCKS, count - STEP_BLOCKS)
+    weight = np.sqrt(after * (count - after) / count)
+    likely = np.abs(mean_step * weight)[near]
+    if not len(likely):
+        return None
+    row = int(np.argmax(likely)) + STEP_BLOCKS + 1
+    stepped = _fit(np.column_stack([np.arange(count) >= row, plain]), residual_arcsec)
+    sloping = _fit(np.column_stack([time_s - time_s[0], plain]), residual_arcsec)
+    if stepped is None or sloping is None:
+        return None
+    solution, left, error = stepped
+    by = float(solution[0])
+    if abs(by) < max(STEP_ARCSEC, STEP_SIGMAS * error) or left > STEP_BETTER * sloping[1]:
+        return None
+    return Step(float(time_s[row]), by, error)
+
+
+def _plain(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
+    """What a zero is told beside: a constant, and what goes with the direction and the speed."""
+    columns = [np.ones(len(direction))]
+    for each in (direction, velocity_deg_s):
+        size = float(np.ptp(each))
+        if size:
+            columns.append(each / size)
+    return np.column_stack(columns)
+
+
+def _fit(design: FloatArray, values: FloatArray) -> tuple[FloatArray, float, float] | None:
+    """Solution, mean square left, and standard error of the first one; None where it cannot be told."""
+    free = len(values) - design.shape[1]
+    if free < 10:
+        return None
+    solution, _, rank, _ = np.linalg.lstsq(design, values, rcond=1e-9)
+    if rank < design.shape[1]:
+        return None
+    left = values - design @ solution
+    variance = float(left @ left) / free + 1e-12
+    follows = float(left[1:] @ left[:-1]) / (free * variance)
+    follows = min(max(follows, 0.0), 0.95)
+    inflation = (1.0 + follows) / (1.0 - follows)
+    spread = np.linalg.inv(design.T @ design)[0, 0] * variance * inflation
+    return np.asarray(solution, dtype=np.float64), variance, float(np.sqrt(spread))
+
+
+def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
+    """The last row at which the load's reading changed (0: not at all), and how far the motor has gone since,
+    arcsec at the load.
+    """
+    changed = np.flatnonzero(np.diff(load_deg) != 0.0)
+    since = int(changed[-1]) + 1 if len(changed) else 0
+    travel = np.max(np.abs(motor_deg[since:] - motor_deg[since])) / ratio * ARCSEC_PER_DEG
+    return since, float(travel)

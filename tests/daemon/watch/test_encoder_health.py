@@ -1,0 +1,141 @@
+"""Faults of the load encoder are named; a gear that wears is not taken for one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.axis_samples import SampleMaker, moves_and_rests
+
+from hdbridge.axis import AxisConfig
+from hdbridge.daemon.watch.encoder_health import EncoderFault, EncoderHealth
+from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.model import TransmissionModel
+
+DEMO = Path("profiles/demo/axis.yaml")
+AXIS = AxisConfig.from_text(DEMO.read_text().replace("cycle_ms: 4", "cycle_ms: 10"), DEMO)
+PERIOD_S = AXIS.drive.cycle_s
+FAULT_S = 160.0
+FAULT = int(FAULT_S / PERIOD_S)
+
+
+def model_of(offset=31.6, second=13.7, phase=161.5):
+    orders = (
+        MotorOrder(order=1, amplitude_arcsec=6.4, phase_deg=38.0),
+        MotorOrder(order=2, amplitude_arcsec=second, phase_deg=phase),
+        MotorOrder(order=4, amplitude_arcsec=8.1, phase_deg=-22.6),
+    )
+    effects = (Synchronous(orders=orders), Hysteresis(offset_arcsec=offset, width_deg=26.0, exponent=1.7))
+    return TransmissionModel(50.0, effects, provenance={"held_out": {"after_arcsec": 1.0}})
+
+
+MODEL = model_of()
+
+
+def judged(samples, health=None, batch=25):
+    """The judgements over the samples: when each first came, and what it said."""
+    health = health or EncoderHealth(AXIS, MODEL)
+    seen = []
+    for first in range(0, len(samples), batch):
+        judgement = health.take(samples[first : first + batch])
+        if not seen or judgement.fault is not seen[-1][1].fault:
+            seen.append((first * PERIOD_S, judgement))
+    return seen
+
+
+def working(truth=MODEL, duration_s=360.0, seed=1, speed_deg_s=10.0):
+    return SampleMaker(AXIS, MODEL, truth, seed).make(
+        moves_and_rests(duration_s, PERIOD_S, seed, speed_deg_s)
+    )
+
+
+def faulty(change, **options):
+    samples = working(**options)
+    load = samples["axes"]["load_position_deg"][FAULT:, 0]
+    load[:] = change(load, PERIOD_S * np.arange(len(load)))
+    return samples
+
+
+@pytest.mark.parametrize(
+    ("fault", "change", "within_s"),
+    [
+        (EncoderFault.FROZEN, lambda load, _: load[0], 5.0),
+        (EncoderFault.JUMPED, lambda load, _: load + 100.0 / 3600.0, 0.2),
+        (EncoderFault.JUMPED, lambda load, _: load + 12.0 / 3600.0, 20.0),
+        (
+            EncoderFault.NOISY,
+            lambda load, _: load + np.random.default_rng(3).normal(0.0, 3.0 / 3600.0, len(load)),
+            5.0,
+        ),
+        (EncoderFault.DRIFTING, lambda load, time_s: load + 6.0 / 60.0 * time_s / 3600.0, 180.0),
+    ],
+)
+def test_a_fault_is_named_with_figures_and_not_before_it_is_there(fault, change, within_s):
+    seen = judged(faulty(change))
+    assert [each.fault for _, each in seen][:2] == [None, fault]
+    at_s, judgement = seen[1]
+    assert FAULT_S - 0.2 <= at_s <= FAULT_S + within_s
+    assert not judgement.believed
+    assert judgement.why.startswith(f"load encoder {fault.value}: ")
+    assert "arcsec" in judgement.why
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("speed_deg_s", [2.0, 20.0])
+def test_a_healthy_encoder_stays_believed(seed, speed_deg_s):
+    assert [each.believed for _, each in judged(working(seed=seed, speed_deg_s=speed_deg_s))] == [True]
+
+
+@pytest.mark.parametrize("truth", [model_of(offset=38.0), model_of(second=17.0), model_of(phase=150.0)])
+def test_a_gear_that_has_changed_is_no_fault_of_the_encoder(truth):
+    assert [each.believed for _, each in judged(working(truth))] == [True]
+
+
+def test_wear_in_the_course_of_time_is_no_fault_of_the_encoder():
+    """The loop grows by a fifth within minutes, which no gear's does."""
+    path = moves_and_rests(360.0, PERIOD_S, 5)
+    before, after = (
+        SampleMaker(AXIS, MODEL, truth, 5).make(path) for truth in (MODEL, model_of(offset=38.0))
+    )
+    share = np.clip(np.linspace(-0.3, 1.3, len(path)), 0.0, 1.0)
+    load = before["axes"]["load_position_deg"][:, 0]
+    load += share * (after["axes"]["load_position_deg"][:, 0] - load)
+    assert [each.believed for _, each in judged(before)] == [True]
+
+
+def test_one_misread_sample_is_no_fault():
+    samples = working(duration_s=60.0)
+    samples["axes"]["load_position_deg"][3000] += 0.5
+    assert [each.believed for _, each in judged(samples)] == [True]
+
+
+def test_an_encoder_that_follows_again_is_believed_again():
+    def for_a_while(load, time_s):
+        return np.where(time_s < 10.0, load[0], load)
+
+    seen = judged(faulty(for_a_while))
+    assert [each.fault for _, each in seen] == [None, EncoderFault.FROZEN, None]
+    assert seen[2][0] >= FAULT_S + 15.0
+
+
+def test_a_jump_stays_until_the_drive_was_verified_again():
+    samples = faulty(lambda load, _: load + 100.0 / 3600.0)
+    health = EncoderHealth(AXIS, MODEL)
+    judged(samples, health)
+    assert not health.judgement.believed
+    again = working(duration_s=60.0, seed=9)
+    again["cycle"] += samples["cycle"][-1]
+    again["axes"]["state"][:10] = 0  # unverified
+    assert judged(again, health)[-1][1].believed
+
+
+def test_it_does_not_depend_on_how_the_samples_come():
+    samples = faulty(lambda load, _: load + 100.0 / 3600.0, duration_s=165.0)
+    at_s = [judged(samples, batch=batch)[1][0] for batch in (2, 5, 100)]
+    assert max(at_s) - min(at_s) <= 1.1
+
+
+def test_while_the_memory_is_not_known_the_model_blames_nobody():
+    samples = working()
+    samples["axes"]["flags"] &= ~np.uint16(8)
+    samples["axes"]["predicted_arcsec"] += np.where(samples["cycle"] % 1000 < 500, 40.0, 0.0)[:, None]
+    assert [each.believed for _, each in judged(samples)] == [True]
