@@ -9,7 +9,8 @@ frames. The frames themselves are real: python-can messages over python-can ``vi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from queue import Queue
@@ -20,6 +21,7 @@ import can
 from can.interfaces.virtual import VirtualBus, channels_lock
 
 from hdbridge.canframe import DataFrame
+from hdbridge.errors import InputError
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
 from hdbridge.sim.nameplate import Nameplate
@@ -214,6 +216,52 @@ def simulated_bench(
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
     with lockstep_bench(Machine(known, seed), eds_path, node_id, channel, nameplate_of(known)) as bench:
         yield bench
+
+
+@dataclass(frozen=True)
+class SimulatedAxis:
+    """One simulated axis of several on a bus."""
+
+    truth: Truth | Path | str
+    """What moves, or the truth file that says so."""
+    eds_path: Path
+    node_id: int
+    seed: int = 0
+
+
+@contextmanager
+def simulated_benches(
+    axes: Sequence[SimulatedAxis], channel: str | None = None, start_s: float = 0.0
+) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[SimulatedDrive, ...]]]:
+    """Several simulated axes on one bus and one clock, and the master's bus to them; as `lockstep_bench`.
+
+    The same axes give the same frames, whatever the others do: each has its own noise. The clock begins at
+    ``start_s``. InputError where two have the same node id.
+    """
+    node_ids = [axis.node_id for axis in axes]
+    twice = next((node_id for node_id in node_ids if node_ids.count(node_id) > 1), None)
+    if twice is not None:
+        raise InputError(f"two simulated drives are node {twice}; give each a node id of its own")
+    private = channel is None
+    channel = channel or f"hdbridge-{uuid4()}"
+    clock = VirtualClock(start_s)
+    with ExitStack() as stack:
+        for serial, axis in enumerate(axes, start=1):
+            known = axis.truth if isinstance(axis.truth, Truth) else Truth.load(Path(axis.truth))
+            node_bus = stack.enter_context(_PolledBus(channel))
+            node = SimulatedDrive(
+                node_bus,
+                Machine(known, axis.seed),
+                axis.eds_path,
+                axis.node_id,
+                clock,
+                nameplate_of(known, serial),
+            )
+            node.poll(clock.now())
+            clock.nodes.append(node)
+        bus = stack.enter_context(LockstepBus(channel, clock))
+        bus.private = private
+        yield bus, clock, tuple(node for node in clock.nodes if isinstance(node, SimulatedDrive))
 
 
 def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:

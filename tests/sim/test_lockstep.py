@@ -8,7 +8,16 @@ from pathlib import Path
 import can
 import pytest
 
-from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench, nameplate_of, simulated_bench
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import (
+    LockstepBus,
+    SimulatedAxis,
+    VirtualClock,
+    lockstep_bench,
+    nameplate_of,
+    simulated_bench,
+    simulated_benches,
+)
 from hdbridge.sim.truth import Truth
 
 ROOT = Path(__file__).parents[2]
@@ -166,3 +175,35 @@ def test_two_benches_do_not_meet(motor):
         bus_b.send(message(0x080))
         assert bus_b.recv(0) is None
         assert node_a.nmt == 5
+
+
+def run_several(node_ids: list[int]) -> dict[int, list[bytes]]:
+    """Two hundred SYNCs for several axes on one bus: each one's TPDO1, by its node id."""
+    frames: dict[int, list[bytes]] = {node_id: [] for node_id in node_ids}
+    axes = [SimulatedAxis(ARTICLE, EDS, node_id, seed=node_id) for node_id in node_ids]
+    with simulated_benches(axes) as (bus, clock, nodes):
+        assert [node.node_id for node in nodes] == node_ids
+        bus.send(message(0x000, b"\x01\x00"))
+        for k in range(200):
+            clock.sleep_until(k * 0.004)
+            bus.send(message(0x080))
+            while (frame := bus.recv(0)) is not None:
+                if 0x180 <= frame.arbitration_id < 0x200:
+                    frames[frame.arbitration_id - 0x180].append(bytes(frame.data))
+            for node_id in node_ids:
+                word = 0x0006 if k < 3 else 0x0007 if k < 5 else 0x000F
+                bus.send(message(0x200 + node_id, struct.pack("<Hi", word, 20 * max(0, k - 6))))
+    return frames
+
+
+def test_several_axes_share_a_bus_and_do_not_disturb_each_other():
+    together = run_several([1, 2, 5])
+    assert all(len(frames) == 200 for frames in together.values())
+    for node_id in (1, 2, 5):
+        assert together[node_id] == run_several([node_id])[node_id]
+
+
+def test_two_simulated_drives_cannot_be_one_node():
+    twice = [SimulatedAxis(ARTICLE, EDS, 4), SimulatedAxis(ARTICLE, EDS, 4)]
+    with pytest.raises(InputError, match="node 4"), simulated_benches(twice):
+        pass

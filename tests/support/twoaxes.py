@@ -1,0 +1,171 @@
+"""Two simulated axes on one virtual bus and one clock, driven by one `BusCycle`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from uuid import uuid4
+
+import can
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault, Reaction, Supervision
+from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
+from hdbridge.sim.node import SimulatedDrive
+
+PROFILE: Final = Path(__file__).resolve().parents[2] / "profiles" / "article"
+STEP_COUNTS: Final = 40
+"""Target step per cycle: 9 load degrees per second at 4 ms."""
+
+
+def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: object) -> AxisConfig:
+    """The article's axis under another node id."""
+    axis = AxisConfig.load(profile)
+    changed = axis.drive.model_copy(update={"node_id": node_id, **drive})
+    return axis.model_copy(update={"drive": changed, "name": name or f"axis {node_id}"})
+
+
+class RelayBus(can.BusABC):
+    """What commissioning sees of the bus while the cycle runs: its frames go out between the cycle's."""
+
+    def __init__(self, cycle: BusCycle) -> None:
+        super().__init__("relay")
+        self.cycle = cycle
+        self.came: list[Frame] = []
+        self.to_send: list[tuple[int, bytes]] = []
+        self.private = True
+        cycle.on_frame = self.came.append
+        cycle.outgoing = lambda: self.to_send.pop(0) if self.to_send else None
+
+    def now(self) -> float:
+        return self.cycle.clock.now()
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Time passes by turns of the cycle."""
+        while self.now() < deadline_s:
+            self.cycle.exchange()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.to_send.append((msg.arbitration_id, bytes(msg.data)))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        deadline_s = self.now() + (timeout or 0.0)
+        while not self.came:
+            if self.now() >= deadline_s:
+                return None
+            self.cycle.exchange()
+        frame = self.came.pop(0)
+        return can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return self.recv(timeout), True
+
+
+@dataclass
+class TwoAxes:
+    """Two axes under way, and everything a test may turn."""
+
+    bus: LockstepBus
+    clock: VirtualClock
+    nodes: tuple[SimulatedDrive, ...]
+    cycle: BusCycle
+    axes: tuple[AxisCycle, ...]
+    drives: tuple[Drive, ...]
+    intruder: can.BusABC
+    moving: list[bool] = field(default_factory=lambda: [False, False])
+    fresh: list[list[bool]] = field(default_factory=lambda: [[], []])
+    """Of each turn, whether the feedback of each axis was fresh."""
+
+    def enable(self, place: int) -> None:
+        """Begin with an axis whose drive has been prepared, and turn until its power is on."""
+        axis = self.axes[place]
+        axis.command = None
+        axis.begin()
+        axis.image.power.go(State.OPERATION_ENABLED)
+        for _ in range(50):
+            self.turn()
+            if axis.image.power.state is State.OPERATION_ENABLED:
+                break
+        assert axis.image.power.state is State.OPERATION_ENABLED
+        axis.command = axis.feedback.motor_counts
+        self.moving[place] = True
+
+    def turn(self, turns: int = 1) -> None:
+        """Both go on at constant speed."""
+        for _ in range(turns):
+            for axis, moves in zip(self.axes, self.moving, strict=True):
+                if moves and isinstance(axis.command, int):
+                    axis.command += STEP_COUNTS
+            self.cycle.exchange()
+            for axis, fresh in zip(self.axes, self.fresh, strict=True):
+                fresh.append(axis.feedback.fresh)
+
+    def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
+        """A frame from another node, on the bus before the next cycle."""
+        kind = {"is_extended_id": False, **kind}
+        self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
+
+    def hang(self, duration_s: float) -> None:
+        """The master does nothing for so long."""
+        self.clock.sleep_until(self.clock.now() + duration_s)
+
+    def reactions(self, place: int, fault: Fault) -> list[Reaction]:
+        return [event.reaction for event in self.axes[place].supervision.events if event.fault is fault]
+
+    def stands(self, place: int) -> bool:
+        """The axis itself is at rest over the next turns."""
+        machine = self.nodes[place].firmware.motion.machine
+        before = machine.motor_counts
+        self.turn(20)
+        return abs(machine.motor_counts - before) <= 2
+
+    def follows(self, place: int, turns: int = 60) -> bool:
+        """The axis goes on: each feedback fresh, a target in each turn, and the motor moves with it."""
+        axis, machine = self.axes[place], self.nodes[place].firmware.motion.machine
+        before, seen = machine.motor_counts, len(self.fresh[place])
+        self.turn(turns)
+        gone = machine.motor_counts - before
+        return (
+            axis.supervision.stop is None
+            and all(self.fresh[place][seen:])
+            and abs(gone - turns * STEP_COUNTS) <= 3 * STEP_COUNTS
+        )
+
+
+@contextmanager
+def two_axes(
+    make_bus: object = None, boot: tuple[int, ...] = (0, 1), bitrate_bps: int | None = 1_000_000
+) -> Iterator[TwoAxes]:
+    """Two axes of which those in ``boot`` are booted and ready to be enabled; nothing moves yet.
+
+    ``make_bus(bus, channel, clock)`` may put another bus in place of the master's.
+    """
+    configs = [axis_of(node_id) for node_id in (1, 2)]
+    channel = f"two-{uuid4()}"
+    simulated = [
+        SimulatedAxis(PROFILE / "truth.yaml", axis.eds_path, axis.drive.node_id, seed)
+        for seed, axis in enumerate(configs)
+    ]
+    with simulated_benches(simulated, channel) as (first, clock, nodes):
+        bus = make_bus(first, channel, clock) if callable(make_bus) else first
+        intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
+        with intruder, bus:
+            drives = tuple(Drive(bus, axis, clock) for axis in configs)
+            for place in boot:
+                drives[place].boot()
+            for place in boot:
+                drives[place].enable()
+                drives[place].image.power.go(State.SWITCH_ON_DISABLED)
+            cycle = BusCycle(Link(bus, clock), clock, configs[0].drive.cycle_s, bitrate_bps=bitrate_bps)
+            axes = tuple(AxisCycle(drive.image, Supervision(), monitor=drive.monitor) for drive in drives)
+            for axis in axes:
+                cycle.join(axis)
+            yield TwoAxes(bus, clock, nodes, cycle, axes, drives, intruder)
