@@ -16,8 +16,14 @@ from hdbridge.files.outputs import Kind, Output, check_outputs
 _ROOT = logging.getLogger("hdbridge")
 
 
+_given: tuple[int, Path | None] = (0, None)
+"""What was asked for: how much on standard error, and the file."""
+
+
 def begin(verbose: int, path: Path | None) -> None:
     """Tell events from now on; InputError where the file cannot be written."""
+    global _given  # noqa: PLW0603 - the handlers are the process's as well
+    _given = verbose, path
     _ROOT.propagate = False
     if verbose:
         people = logging.StreamHandler()
@@ -38,6 +44,15 @@ def begin(verbose: int, path: Path | None) -> None:
 def tell(event: str, **facts: object) -> None:
     """An event of the command line itself."""
     logging.getLogger(__name__).debug(event, facts)
+
+
+def handed_over() -> tuple[int, Path | None]:
+    """What was asked for, to a command that logs in its own way: here nothing is told any more."""
+    for each in tuple(_ROOT.handlers):
+        _ROOT.removeHandler(each)
+        each.close()
+    verbose, path = _given
+    return verbose, path.absolute() if path is not None else None
 
 
 def end(exit_status: int) -> int:

@@ -35,7 +35,7 @@ class LogSettings:
     """Where the processes of the daemon log."""
 
     verbose: int = 0
-    """0: what somebody has to know; 1: what is done; 2: every SDO transfer, too."""
+    """From 1 on every SDO transfer, too."""
     file: Path | None = None
     """Appended to, everything, a JSON object per line."""
 
@@ -79,7 +79,7 @@ def begin_log(settings: LogSettings) -> None:
     to_journal = "JOURNAL_STREAM" in os.environ
     stderr = logging.StreamHandler()
     stderr.setFormatter(_Journal() if to_journal else ForPeople() if sys.stderr.isatty() else ForMachines())
-    stderr.setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(settings.verbose, 2)])
+    stderr.setLevel(logging.DEBUG if settings.verbose else logging.INFO)
     stderr.addFilter(RateLimit())
     _ROOT.addHandler(stderr)
     if settings.file is not None:

@@ -69,6 +69,9 @@ class TcpSettings(_Part):
         None, min_length=1, description="certificate chain for TLS, PEM, relative to this file"
     )
     key: str | None = Field(None, min_length=1, description="its private key, PEM, relative to this file")
+    unencrypted: bool = Field(
+        False, description="whether the token may cross a network in the clear, where there is no certificate"
+    )
 
     @model_validator(mode="after")
     def _pair(self) -> Self:

@@ -35,3 +35,29 @@ class BackOff:
             self._next_s = self._first_s
         delay_s, self._next_s = self._next_s, min(2.0 * self._next_s, self._longest_s)
         return delay_s
+
+
+class Pulse:
+    """Whether a counter goes on, judged by how often one has looked.
+
+    Not by the time: who has stood still himself, with his process group for example, blames nobody else.
+    """
+
+    def __init__(self) -> None:
+        self._last = 0
+        self.misses = 0
+        """Looks in a row without an advance."""
+        self.begun = False
+        """Whether it has ever advanced, since it was started anew."""
+
+    def look(self, value: int) -> bool:
+        """Whether the counter has advanced since the last look."""
+        advanced = value != self._last
+        self._last = value
+        self.misses = 0 if advanced else self.misses + 1
+        self.begun = self.begun or advanced
+        return advanced
+
+    def restart(self, value: int) -> None:
+        """Whoever counts has been started anew, and the counter stands at this."""
+        self._last, self.misses, self.begun = value, 0, False

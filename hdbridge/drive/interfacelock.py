@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
 from hdbridge.errors import BusError, BusInUseError
+from hdbridge.files.expectation import one_line
 
 try:
     import fcntl
@@ -39,12 +40,26 @@ def interface_lock(interface: str, channel: object, folder: Path | None = None) 
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BusInUseError(
-                f"{interface}:{channel}: another hdbridge on this machine masters it (it holds {path}); end "
-                "that one first (--force, in the library shared=True, opens the bus all the same)"
+                f"{interface}:{channel}: another hdbridge on this machine masters it ({_holder(handle)} "
+                f"holds {path}); end that one first (--force, in the library shared=True, opens the bus all "
+                "the same)"
             ) from None
         yield
     finally:
         os.close(handle)
+
+
+def _holder(handle: int) -> str:
+    """Who has locked an open file, as far as this system tells: number and command line of the process."""
+    with suppress(OSError, ValueError):
+        inode = os.fstat(handle).st_ino
+        for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
+            _, kind, _, _, number, place, *_ = line.split()
+            if kind == "FLOCK" and int(place.split(":")[2]) == inode and int(number) > 0:
+                words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
+                command = " ".join(each.decode(errors="replace") for each in words if each)
+                return f"process {number}, '{one_line(command[:80])}',"
+    return "it"
 
 
 def _folder() -> Path:

@@ -1,0 +1,296 @@
+"""The keeper: starts the daemon's two processes, looks after them, ends them in order, and does nothing else.
+
+It holds what has to outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
+
+    a child is        the keeper
+    ----------------  ----------------------------------------------------------------------------------
+    control, dead     starts it again; its axes come up disabled. Too often in a minute: ends everything
+    control, hung     kills it after `Times.hung_s`: the bus is silent, the drives have stopped by themselves
+    service, dead     starts it again, later each time; the loop goes on
+    service, hung     kills it after `Times.service_hung_s`
+
+Where a child cannot even begin (a bus that cannot be opened, a folder that cannot be written), the daemon
+ends with that child's exit status.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import selectors
+import signal
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Final
+
+from hdbridge.daemon.child import Child
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.notify import Notifier
+from hdbridge.daemon.patience import BackOff, Budget, Pulse
+from hdbridge.daemon.start import Start
+from hdbridge.errors import HdbridgeError
+
+_log = logging.getLogger(__name__)
+TICK_S: Final = 0.25
+_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+_ERRORS: Final = range(2, 16)
+"""Exit statuses of an `HdbridgeError`: it has said what is wrong, and a second attempt would say it again."""
+_FIRST_ATTEMPTS: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Programs:
+    """What the children run; tests put others there."""
+
+    control: Sequence[str] = ("-m", "hdbridge.daemon.loop.process")
+    service: Sequence[str] = ("-m", "hdbridge.daemon.service.process")
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """How long the keeper waits for what, seconds."""
+
+    begin_s: float = 60.0
+    """For a child to begin."""
+    hung_s: float = 5.0
+    """For a turn of the control process; the drives have stopped by themselves long before."""
+    service_hung_s: float = 30.0
+    """For the service to show that it lives."""
+    stop_s: float = 30.0
+    """For the control process to bring all axes to rest."""
+    service_stop_s: float = 10.0
+    """For the service to end after that."""
+
+
+class Keeper:
+    """The two processes of one machine, from their start to their end."""
+
+    def __init__(
+        self,
+        start: Start,
+        memory: Memory,
+        listeners: Sequence[socket.socket],
+        notifier: Notifier,
+        programs: Programs = Programs(),
+        times: Times = Times(),
+    ) -> None:
+        self._start, self._memory, self._listeners = start, memory, listeners
+        self._notifier, self._programs, self._times = notifier, programs, times
+        self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
+        self._back_off = BackOff(0.5, 30.0, 60.0)
+        self._turns, self._served = Pulse(), Pulse()
+        self._control: Child | None = None
+        self._service: Child | None = None
+        self._service_due_s: float | None = None
+        self._restarts = {"control": 0, "service": 0}
+        self._ready = False
+        self._status = 0
+        """With which all will end."""
+        self._signals = self._heeded = 0
+        self._stopping_since_s: float | None = None
+        self._service_told_s: float | None = None
+        self._fed_s = 0.0
+        self._selector = selectors.DefaultSelector()
+
+    def run(self) -> int:
+        """Until a signal ends it, or it cannot go on; the exit status."""
+        with ExitStack() as stack:
+            stack.callback(self._selector.close)
+            stack.enter_context(self._deferred_signals())
+            stack.callback(self._end_all)
+            now_s = time.monotonic()
+            self._start_control(now_s)
+            self._start_service(now_s)
+            while self._control is not None or self._service is not None or self._service_due_s is not None:
+                for key, _ in self._selector.select(TICK_S):
+                    if key.data is not None:
+                        key.data()
+                self._turn(time.monotonic())
+        return self._status
+
+    def _turn(self, now_s: float) -> None:
+        self._memory.status.set(Cell.KEEPER_TIME_NS, time.monotonic_ns())
+        self._heed_signals(now_s)
+        if self._control is not None and self._control.ended is not None:
+            self._control_ended(self._control, now_s)
+        if self._service is not None and self._service.ended is not None:
+            self._service_ended(self._service, now_s)
+        if self._stopping_since_s is not None:
+            self._go_on_stopping(now_s)
+            return
+        if self._service_due_s is not None and now_s >= self._service_due_s:
+            self._start_service(now_s)
+        self._look_after(now_s)
+
+    # ------------------------------------------------------------------ children
+
+    def _start_control(self, now_s: float) -> None:
+        self._control = self._started(self._programs.control, "control", (), now_s)
+        self._turns.restart(self._memory.status.loop_count)
+
+    def _start_service(self, now_s: float) -> None:
+        self._service_due_s = None
+        listening = tuple(each.fileno() for each in self._listeners)
+        self._memory.status.set(Cell.SERVICE_TIME_NS, 0)
+        self._service = self._started(self._programs.service, "service", listening, now_s)
+        self._served.restart(0)
+
+    def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
+        fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
+        try:
+            child = Child(program, fd, (self._memory.fd, *listening), now_s)
+        finally:
+            os.close(fd)
+        self._selector.register(child.pidfd, selectors.EVENT_READ)
+        _log.info(f"{name} process started", {"pid": child.pid, "restarts": self._restarts[name]})
+        return child
+
+    def _forget(self, child: Child) -> None:
+        self._selector.unregister(child.pidfd)
+        child.close()
+
+    def _control_ended(self, child: Child, now_s: float) -> None:
+        status, how = child.ended, child.how
+        assert status is not None
+        self._forget(child)
+        self._control = None
+        if self._stopping_since_s is not None:
+            self._status = self._status or max(status, 0)
+            return
+        _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
+        known = status if status in _ERRORS else HdbridgeError.exit_status
+        if status == 0:
+            self._stop(now_s, 0, "the control process was asked to end")
+        elif status in _ERRORS and not self._memory.status.loop_count:
+            self._stop(now_s, known, f"the control process cannot begin ({how})")
+        elif not self._budget.spend(now_s):
+            self._stop(now_s, known, "the control process dies again and again")
+        else:
+            self._restarts["control"] += 1
+            self._start_control(now_s)
+
+    def _service_ended(self, child: Child, now_s: float) -> None:
+        status, how = child.ended, child.how
+        assert status is not None
+        self._forget(child)
+        self._service = None
+        if self._stopping_since_s is not None:
+            return
+        lived_s = now_s - child.started_s
+        _log.error("service process died", {"how": how, "lived_s": round(lived_s, 1)})
+        self._restarts["service"] += 1
+        if not self._ready and (status in _ERRORS or self._restarts["service"] >= _FIRST_ATTEMPTS):
+            known = status if status in _ERRORS else HdbridgeError.exit_status
+            self._stop(now_s, known, f"the service cannot begin ({how})")
+        else:
+            self._service_due_s = now_s + self._back_off.delay_s(lived_s)
+
+    def _look_after(self, now_s: float) -> None:
+        """Say that all is well while it is; kill what hangs."""
+        status = self._memory.status
+        running = self._turns.look(status.loop_count)
+        self._served.look(status.service_time_ns)
+        self._kill_hung(self._control, self._turns, self._times.hung_s)
+        self._kill_hung(self._service, self._served, self._times.service_hung_s)
+        if not self._ready and self._turns.begun and self._served.begun:
+            self._ready = True
+            self._notifier.ready()
+            _log.info("ready", self._facts())
+        if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
+            self._fed_s = now_s
+            self._notifier.alive()
+        restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)
+        axes = ", ".join(axis.name for axis in self._start.machine.axes)
+        words = f"holds {axes}" if self._ready else "begins"
+        self._notifier.status(f"{words}; {restarts}" if restarts else words)
+
+    def _kill_hung(self, child: Child | None, pulse: Pulse, limit_s: float) -> None:
+        if child is not None and pulse.misses * TICK_S >= (limit_s if pulse.begun else self._times.begin_s):
+            _log.error("process hangs", {"pid": child.pid, "for_s": pulse.misses * TICK_S})
+            child.send(signal.SIGKILL)
+
+    def _facts(self) -> dict[str, object]:
+        machine = self._start.machine
+        return {
+            "machine": machine.name,
+            "axes": ", ".join(axis.name for axis in machine.axes),
+            "api": ", ".join(_address(each) for each in self._listeners),
+        }
+
+    # ------------------------------------------------------------------ the end
+
+    def _heed_signals(self, now_s: float) -> None:
+        """The first stops in order, the second at the quick-stop ramp, the third ends whatever still runs."""
+        while self._heeded < self._signals:
+            self._heeded += 1
+            if self._heeded == 1:
+                self._stop(now_s, 0, "asked to")
+            elif self._heeded == 2:
+                self._memory.status.set(Cell.STOP_ASKED, 2)
+            else:
+                self._end_all()
+
+    def _stop(self, now_s: float, status: int, why: str) -> None:
+        """Bring the axes to rest and end; the service goes last, so that it sees and records the end."""
+        if self._stopping_since_s is not None:
+            return
+        self._stopping_since_s, self._status = now_s, status
+        self._service_due_s = None
+        _log.info("stopping", {"why": why})
+        self._notifier.stopping()
+        self._memory.status.set(Cell.STOP_ASKED, 1)
+
+    def _go_on_stopping(self, now_s: float) -> None:
+        assert self._stopping_since_s is not None
+        if self._control is not None:
+            if now_s - self._stopping_since_s > self._times.stop_s:
+                _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
+                self._status = self._status or HdbridgeError.exit_status
+                self._control.send(signal.SIGKILL)
+        elif self._service is not None:
+            if self._service_told_s is None:
+                self._service_told_s = now_s
+                self._service.send(signal.SIGTERM)
+            elif now_s - self._service_told_s > self._times.service_stop_s:
+                _log.error("the service does not end", {"after_s": self._times.service_stop_s})
+                self._service.send(signal.SIGKILL)
+
+    def _end_all(self) -> None:
+        for child in (self._control, self._service):
+            if child is not None:
+                self._forget(child)
+        self._control = self._service = self._service_due_s = None
+
+    @contextmanager
+    def _deferred_signals(self) -> Iterator[None]:
+        """Signals are counted, and wake the keeper up; what was ignored from the start (nohup) stays so."""
+        reader, writer = socket.socketpair()
+        with reader, writer:
+            for each in (reader, writer):
+                each.setblocking(False)
+            woken = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+            self._selector.register(reader, selectors.EVENT_READ, lambda: reader.recv(4096))
+
+            def note(_number: int, _frame: FrameType | None) -> None:
+                self._signals += 1
+
+            before = {
+                number: signal.signal(number, note)
+                for number in _SIGNALS
+                if number is signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN
+            }
+            try:
+                yield
+            finally:
+                for number, handler in before.items():
+                    signal.signal(number, handler)
+                signal.set_wakeup_fd(woken)
+
+
+def _address(listener: socket.socket) -> str:
+    name = listener.getsockname()
+    return name if isinstance(name, str) else f"{name[0]}:{name[1]}"

@@ -1,0 +1,39 @@
+"""Stands in for a child of the keeper: ``control`` counts turns, ``service`` says that it lives.
+
+HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit status with which it ends at once.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.start import Start, begin_child
+
+
+def main(kind: str, *arguments: str) -> int:
+    start = Start.inherited(list(arguments))
+    begin_child(start, f"standin-{kind}")
+    if status := os.environ.get(f"HDBRIDGE_TEST_{kind.upper()}"):
+        return int(status)
+    told = []
+    signal.signal(signal.SIGTERM, lambda *_: told.append("term"))
+    with Memory.attach(start.memory_fd) as memory:
+        status = memory.status
+        status.set(Cell.LOOP_PID if kind == "control" else Cell.SERVICE_PID, os.getpid())
+        print(f"{kind} {os.getpid()} {start.restarts}", flush=True)
+        while not told and not (kind == "control" and status.stop_asked):
+            if kind == "control":
+                status.set(Cell.LOOP_COUNT, status.loop_count + 1)
+            else:
+                status.set(Cell.SERVICE_TIME_NS, time.monotonic_ns())
+            time.sleep(0.02)
+        print(f"{kind} ends", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,176 @@
+"""The keeper with children that stand in for the real ones: who dies, hangs or is told to end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).with_name("standin_keeper.py")
+PATIENCE_S = 30.0
+
+
+class Kept:
+    """A keeper in a process of its own, and what it and its children say."""
+
+    def __init__(self, folder: Path, **environment: str) -> None:
+        self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.manager.bind(str(folder / "notify"))
+        self.manager.settimeout(PATIENCE_S)
+        told = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000", **environment}
+        self.process = subprocess.Popen(
+            [sys.executable, str(PROGRAM)], env={**os.environ, **told},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.said: list[str] = []
+        self.events: list[dict[str, object]] = []
+        self._readers = [
+            threading.Thread(target=self._read_said, daemon=True),
+            threading.Thread(target=self._read_events, daemon=True),
+        ]
+        for each in self._readers:
+            each.start()
+
+    def _read_said(self) -> None:
+        assert self.process.stdout is not None
+        self.said.extend(line.strip() for line in self.process.stdout)
+
+    def _read_events(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.events.append(json.loads(line))
+
+    def until(self, met: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not met():
+            assert time.monotonic() < end, f"{what}: {self.said} {self.events}"
+            time.sleep(0.02)
+
+    def pids(self, kind: str) -> list[int]:
+        """Of all processes of a kind that have begun, oldest first."""
+        found = [line.split() for line in self.said]
+        return [int(words[1]) for words in found if words[0] == kind and words[1] != "ends"]
+
+    def until_begun(self, kind: str, times: int = 1) -> int:
+        self.until(lambda: len(self.pids(kind)) == times, f"{kind} begins {times} times")
+        return self.pids(kind)[-1]
+
+    def until_told(self, line: str) -> None:
+        """The service manager has been told this."""
+        while self.manager.recv(4096).decode() != line:
+            pass
+
+    def until_ended(self) -> int:
+        status = self.process.wait(PATIENCE_S)
+        for each in self._readers:
+            each.join()
+        return status
+
+    def names(self) -> list[object]:
+        return [event["event"] for event in self.events]
+
+
+@pytest.fixture
+def keeper(tmp_path: Path) -> Iterator[Callable[..., Kept]]:
+    made: list[Kept] = []
+
+    def make(**environment: str) -> Kept:
+        made.append(Kept(tmp_path, **environment))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.process.kill()
+        each.until_ended()
+        each.manager.close()
+        assert each.process.stdout is not None
+        assert each.process.stderr is not None
+        each.process.stdout.close()
+        each.process.stderr.close()
+
+
+def gone(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_it_says_when_it_is_ready_and_ends_in_order(
+    keeper: Callable[..., Kept], number: signal.Signals
+) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    kept.process.send_signal(number)
+    kept.until_told("STOPPING=1")
+    assert kept.until_ended() == 0
+    assert kept.said[-2:] == ["control ends", "service ends"]
+    assert [name for name in kept.names() if name in {"ready", "stopping"}] == ["ready", "stopping"]
+
+
+def test_a_service_that_dies_is_started_again_and_the_loop_goes_on(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    os.kill(kept.until_begun("service"), signal.SIGKILL)
+    kept.until_begun("service", times=2)
+    assert len(kept.pids("control")) == 1
+    assert [line.split()[2] for line in kept.said if line.startswith("service")] == ["0", "1"]
+    kept.until_told("STATUS=holds article; service restarted 1 times")
+
+
+def test_a_control_process_that_dies_again_and_again_ends_all(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    for times in range(1, 5):
+        os.kill(kept.until_begun("control", times), signal.SIGKILL)
+    assert kept.until_ended() == 1
+    assert len(kept.pids("control")) == 4
+    assert len(kept.pids("service")) == 1
+    assert kept.names().count("control process died") == 4
+    assert [event["how"] for event in kept.events if event["event"] == "control process died"] == [
+        "ended by SIGKILL"
+    ] * 4
+
+
+def test_a_control_process_that_hangs_is_replaced(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    kept.until_told("WATCHDOG=1")
+    os.kill(kept.until_begun("control"), signal.SIGSTOP)
+    kept.until_begun("control", times=2)
+    assert "process hangs" in kept.names()
+    kept.until_told("STATUS=holds article; control restarted 1 times")
+
+
+def test_a_service_that_hangs_is_replaced(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    os.kill(kept.until_begun("service"), signal.SIGSTOP)
+    kept.until_begun("service", times=2)
+    assert len(kept.pids("control")) == 1
+
+
+def test_the_children_end_with_their_keeper(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    children = kept.pids("control") + kept.pids("service")
+    kept.process.kill()
+    kept.until(lambda: all(gone(pid) for pid in children), "the children end")
+    kept.until(lambda: set(kept.said[-2:]) == {"control ends", "service ends"}, "they end in order")
+
+
+@pytest.mark.parametrize(("kind", "status"), [("CONTROL", 3), ("SERVICE", 2), ("SERVICE", 1)])
+def test_a_child_that_cannot_begin_ends_all(keeper: Callable[..., Kept], kind: str, status: int) -> None:
+    kept = keeper(**{f"HDBRIDGE_TEST_{kind}": str(status)})
+    assert kept.until_ended() == status
+    assert "ready" not in kept.names()
