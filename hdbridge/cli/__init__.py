@@ -50,6 +50,10 @@ PANELS: Final = {
         "pending.",
         "model": "The models of an axis: the active one, one that waits, and every one that there was.",
     },
+    "Day and night": {
+        "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
+        "start of the computer.",
+    },
     "Positioning": {
         "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
         "last.",
@@ -69,7 +73,7 @@ def load(name: str) -> typer.Typer:
     """Import a command: an app with nothing but what its file registers, which checks its outputs first."""
     guarded = import_module(f"{__name__}.outputs").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
-    import_module(f"{__name__}.{name}").register(loaded)
+    import_module(f"{__name__}.{name.replace('-', '_')}").register(loaded)
     groups = (each.typer_instance for each in loaded.registered_groups)
     for each in (loaded, *(group for group in groups if group is not None)):
         for command in each.registered_commands:

@@ -48,6 +48,14 @@ ProfileArgument = Annotated[
         help="A folder with axis.yaml (and model.yaml), an axis file, or a bundled profile: article, demo.",
     ),
 ]
+MachineArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="MACHINE",
+        help="A machine file, its folder, a profile (the machine of that one axis), or one that comes with "
+        "hdbridge: cell, article, demo.",
+    ),
+]
 ModelOption = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file; else the profile's own.")
 ]
