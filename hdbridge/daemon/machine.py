@@ -8,7 +8,7 @@ nothing before the next start.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self, TypeVar
@@ -24,6 +24,7 @@ from hdbridge.daemon.machinefile import (
     MachineFile,
     token_complaint,
 )
+from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import load_eds, plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.errors import InputError
@@ -95,6 +96,7 @@ class Machine:
     api: ApiSettings
     lease_s: float
     limits: LimitSettings
+    recorder: RecorderSettings
 
     @property
     def folder(self) -> Path:
@@ -105,6 +107,21 @@ class Machine:
     def cycle_s(self) -> float:
         """The one cycle, seconds."""
         return self.axes[0].config.drive.cycle_s
+
+    def recorder_folder(self, environment: Mapping[str, str] = os.environ) -> Path:
+        """Where the flight recorder writes: as the machine file says, else in the state folder that the
+        service manager gives, else next to the file, and where that cannot be written in the user's state
+        folder.
+        """
+        if self.recorder.folder is not None:
+            return self.beside(self.recorder.folder)
+        given = environment.get("STATE_DIRECTORY", "").split(":")[0]
+        if given:
+            return Path(given) / "recordings"
+        if os.access(self.folder, os.W_OK) and not self.folder.is_relative_to(bundled_folder("profiles")):
+            return (self.folder / "recordings" / "daemon").absolute()
+        state = environment.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return Path(state) / "hdbridge" / self.name / "recordings"
 
     def beside(self, text: str) -> Path:
         """A path as the machine file has it, relative to that file, made absolute."""
@@ -147,8 +164,9 @@ class Machine:
         _check_load([axis.config for axis in axes], bus, places)
         _check_tcp(file, places)
         return cls(
-            file.name, path.absolute(), tuple(axes), bus, realtime, file.api, file.lease_s, file.limits
-        )
+            file.name, path.absolute(), tuple(axes), bus, realtime,
+            file.api, file.lease_s, file.limits, file.recorder,
+        )  # fmt: skip
 
     def on_bus(self, **changes: str | int | None) -> Self:
         """The same machine on another bus (keys of `BusConfig`)."""

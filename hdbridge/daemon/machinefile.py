@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hdbridge.axis import BusConfig, RealtimeConfig
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
+from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.yamlfile import wrong
 
@@ -121,6 +122,9 @@ class MachineFile(_Part):
         10.0, description="time after which the right to move lapses when its holder does not renew it"
     )
     limits: LimitSettings = Field(default_factory=LimitSettings, description="how much the daemon takes")
+    recorder: RecorderSettings = Field(
+        default_factory=RecorderSettings, description="the flight recorder: where, how much, for how long"
+    )
     adaptation: AdaptationSettings = Field(
         default_factory=AdaptationSettings, description="what follows the load encoder, and how fast"
     )

@@ -1,0 +1,37 @@
+"""Where the flight recorder writes."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hdbridge.daemon.machine import Machine
+
+
+@pytest.fixture
+def profile(tmp_path):
+    folder = tmp_path / "axis"
+    shutil.copytree("profiles/demo", folder)
+    return folder
+
+
+def test_next_to_the_profile_without_a_service_manager(profile):
+    assert Machine.find(str(profile)).recorder_folder({}) == profile / "recordings" / "daemon"
+
+
+def test_in_the_state_folder_of_the_service(profile):
+    folder = Machine.find(str(profile)).recorder_folder({"STATE_DIRECTORY": "/var/lib/hdbridge:/other"})
+    assert folder == Path("/var/lib/hdbridge/recordings")
+
+
+def test_never_among_the_bundled_profiles(tmp_path):
+    folder = Machine.find("demo").recorder_folder({"XDG_STATE_HOME": str(tmp_path)})
+    assert folder == tmp_path / "hdbridge" / "demo" / "recordings"
+
+
+def test_where_the_machine_file_says_it_counts_from_the_file(profile):
+    file = profile / "machine.yaml"
+    text = f"schema: hdbridge.machine/1\nname: cell\naxes: [{{profile: {profile}}}]\nrecorder: {{folder: here}}\n"
+    file.write_text(text)
+    machine = Machine.load(file)
+    assert machine.recorder_folder({"STATE_DIRECTORY": "/var/lib/hdbridge"}) == profile / "here"
