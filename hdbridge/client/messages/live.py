@@ -91,9 +91,8 @@ class Samples(Report):
 class LiveOptions(Request):
     """What a client of the live feed wants; its first message, and again whenever it wants something else."""
 
-    token: str | None = Field(None, max_length=200, description="over TCP, where the header cannot be set")
     every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
-        1, description="one sample in so many cycles; the newest of each group", examples=[10]
+        1, description="one cycle in so many: those whose number it divides", examples=[10]
     )
     axes: list[Name] | None = Field(None, max_length=AXES_MAXIMUM, description="only these; else all")
 
@@ -101,7 +100,6 @@ class LiveOptions(Request):
 class StreamBegin(Request):
     """The first message of a stream."""
 
-    token: str | None = Field(None, max_length=200, description="over TCP, where the header cannot be set")
     lease: str = Field(max_length=200, description="the token of the lease")
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
         0.5, description="without a point for so long the axis stops within its limits"

@@ -80,6 +80,7 @@ class AxisState(Report):
     name: Name
     profile: str = Field(description="folder of its files on the daemon's machine")
     node_id: int = Field(ge=1, le=127)
+    ratio: float = Field(description="turns of the motor for one of the load, with its sign", examples=[50.0])
     state: ControlState
     power: PowerState
     mode: MotionMode

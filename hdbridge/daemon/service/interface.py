@@ -14,7 +14,7 @@ raise an `HdbridgeError` whose text is one line that a person can act on:
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, Self
 
 from hdbridge.client import messages
 from hdbridge.evaluation.stepping import Scheme
@@ -59,6 +59,10 @@ class Batch(NamedTuple):
 
 class StreamPort(Protocol):
     """A stream of set-points that is under way. An asynchronous context manager: it ends with the block."""
+
+    async def __aenter__(self) -> Self: ...
+
+    async def __aexit__(self, *error: object) -> None: ...
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
         """Hand over set-points; waits while the buffer is full. Raises where the stream has ended."""

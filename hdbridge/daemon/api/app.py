@@ -1,0 +1,135 @@
+"""The application: every route over one `Bridge`, errors as problems, a description of itself."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.routing import APIRoute
+from prometheus_client import CONTENT_TYPE_LATEST
+
+from hdbridge import __version__
+from hdbridge.client.messages.problem import CONTENT_TYPE
+from hdbridge.daemon.api import describe, problems
+from hdbridge.daemon.api.metrics import Metrics, exposition
+from hdbridge.daemon.api.routes.axis import axis_routes
+from hdbridge.daemon.api.routes.machine import machine_routes
+from hdbridge.daemon.api.routes.sockets import socket_routes
+from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.page import PAGE, POLICY, page_file
+from hdbridge.daemon.service.interface import Bridge
+
+PREFIX: Final = "/api/v1"
+TAGS: Final = (
+    ("Look", "What the machine does. Everybody may, and nothing of it moves anything."),
+    ("Lease", "The right to move: one client at a time has it, for as long as it uses it."),
+    ("Stop", "Never refused to anybody who may ask at all; no lease is needed."),
+    ("Power", "Enable, disable, reset. These and all below need the lease, in the header `X-Lease`."),
+    ("Move", "Targets are load angles in degrees, held to the axis's limits."),
+    ("Compensate", "Which part of which model is used, and how it follows the load encoder."),
+    ("Jobs", "Procedures that run through the daemon while it holds the bus."),
+    ("Drive", "Objects of the drive's dictionary, by SDO."),
+)
+_ABOUT: Final = (
+    "Load-side targets for the axes of one machine. Angles are degrees at the load unless the name says "
+    "`motor`; errors and corrections are arcseconds at the load. Nothing moves by GET. Errors are "
+    "`application/problem+json` (RFC 9457)."
+)
+
+
+def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
+    """The ASGI application; who may reach it is the listener's matter (`guard.py`)."""
+    app = FastAPI(
+        title="hdbridge",
+        version=__version__,
+        summary="The daemon that holds the drives of one bus",
+        description=_ABOUT,
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+        openapi_tags=[{"name": name, "description": about} for name, about in TAGS],
+        generate_unique_id_function=_operation,
+        redirect_slashes=False,
+    )
+    problems.register(app)
+    for each in (machine_routes(bridge), axis_routes(bridge), socket_routes(bridge)):
+        app.include_router(each, prefix=PREFIX)
+    _add_pages(app, bridge, metrics, traffic)
+    app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
+    return app
+
+
+def _add_pages(app: FastAPI, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
+    @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
+    async def get_description() -> JSONResponse:
+        """The description of the API, OpenAPI 3.1."""
+        return JSONResponse(app.openapi())
+
+    @app.get("/docs", include_in_schema=False)
+    async def get_docs() -> HTMLResponse:
+        """The same for a person."""
+        policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+        return HTMLResponse(describe.page(app.openapi()), headers={"Content-Security-Policy": policy})
+
+    @app.get("/", include_in_schema=False)
+    async def get_page() -> Response:
+        """The live page."""
+        return _static(PAGE)
+
+    @app.get("/page/{name}", include_in_schema=False)
+    async def get_page_file(name: str) -> Response:
+        """What belongs to it."""
+        return _static(name)
+
+    @app.get("/metrics", include_in_schema=False)
+    async def get_metrics() -> Response:
+        """Figures for Prometheus."""
+        return Response(exposition(bridge, metrics, traffic), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/healthz", include_in_schema=False)
+    async def get_health() -> Response:
+        """200 while the control loop turns, else 503."""
+        alive = bridge.state().cycle.alive
+        status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
+        words = "ok\n" if alive else "the control loop does not turn\n"
+        return Response(words, status, media_type="text/plain")
+
+
+def _static(name: str) -> Response:
+    found = page_file(name)
+    if found is None:
+        raise problems.UnknownError(f"the page has no file {name[:80]!a}")
+    content, kind = found
+    return Response(content, media_type=kind, headers={"Content-Security-Policy": POLICY})
+
+
+def _operation(route: APIRoute) -> str:
+    return route.name
+
+
+def _schema(app: FastAPI) -> dict[str, Any]:
+    """OpenAPI, with errors under the media type that they have, and how a client shows who it is."""
+    if app.openapi_schema is None:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=app.summary,
+            description=app.description,
+            routes=app.routes,
+            tags=app.openapi_tags,
+        )
+        for path in schema["paths"].values():
+            for operation in path.values():
+                for status, response in operation["responses"].items():
+                    if int(status) >= HTTPStatus.BAD_REQUEST and "content" in response:
+                        (content,) = response["content"].values()
+                        response["content"] = {CONTENT_TYPE: content}
+        schema["components"]["securitySchemes"] = {
+            "token": {"type": "http", "scheme": "bearer", "description": "Over TCP only."}
+        }
+        schema["security"] = [{}, {"token": []}]
+        app.openapi_schema = schema
+    return app.openapi_schema

@@ -1,0 +1,154 @@
+"""The documented page of the API, made from its own OpenAPI description, without script or network."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from functools import cache
+from importlib.resources import files
+from typing import Any, Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+Schema = dict[str, Any]
+_METHODS: Final = ("get", "post", "put", "delete")
+_BOUNDS: Final = (
+    ("exclusiveMinimum", "above {}"),
+    ("minimum", "from {}"),
+    ("exclusiveMaximum", "below {}"),
+    ("maximum", "to {}"),
+    ("maxLength", "at most {} characters"),
+    ("maxItems", "at most {} entries"),
+    ("maxProperties", "at most {} entries"),
+)
+
+
+def page(schema: Schema) -> str:
+    """One HTML page: every operation under its tag, its parameters, body, an example, its errors."""
+    sections = [
+        (tag, [each for each in _operations(schema) if each["tag"] == tag["name"]]) for tag in schema["tags"]
+    ]
+    return str(_template().render(info=schema["info"], sections=sections, style=_style()))
+
+
+@cache
+def _template() -> Any:
+    # Everything is escaped: names and words of the description are text.
+    environment = Environment(
+        loader=PackageLoader("hdbridge.daemon.api"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("docs.html.j2")
+
+
+@cache
+def _style() -> str:
+    return files("hdbridge.report").joinpath("assets/page.css").read_text(encoding="utf-8")
+
+
+def _operations(schema: Schema) -> list[Schema]:
+    found = []
+    for path, methods in schema["paths"].items():
+        for method in _METHODS:
+            if method in methods:
+                found.append(_operation(schema, path, method.upper(), methods[method]))
+    return found
+
+
+def _operation(schema: Schema, path: str, method: str, given: Schema) -> Schema:
+    body = given.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema")
+    model = _resolved(schema, body) if body else None
+    example = _example(model) if model else None
+    parameters = given.get("parameters", [])
+    leased = any(each["name"] == "X-Lease" for each in parameters)
+    answer = next(each for status, each in given["responses"].items() if status < "300")
+    return {
+        "tag": given["tags"][0],
+        "id": given["operationId"],
+        "method": method,
+        "path": path,
+        "about": given.get("description", given["summary"]),
+        "leased": leased,
+        "parameters": [
+            _field(schema, each["name"], {**each["schema"], "description": each.get("description", "")})
+            for each in parameters
+            if each["name"] != "X-Lease"
+        ],
+        "fields": [
+            _field(schema, name, each, required=name in model.get("required", ()))
+            for name, each in (model or {}).get("properties", {}).items()
+        ]
+        if model
+        else [],
+        "answer": _type(answer.get("content", {}).get("application/json", {}).get("schema", {})),
+        "errors": [
+            (status, each["description"]) for status, each in given["responses"].items() if status >= "400"
+        ],
+        "curl": _curl(method, path, example, leased=leased),
+    }
+
+
+def _field(schema: Schema, name: str, given: Schema, *, required: bool = True) -> Schema:
+    bounds = []
+    for each in (given, *given.get("anyOf", ())):
+        resolved = _resolved(schema, each)
+        bounds += [words.format(f"{resolved[key]:g}") for key, words in _BOUNDS if key in resolved]
+    default = "" if required or given.get("default") is None else json.dumps(given["default"])
+    return {
+        "name": name,
+        "type": _type(given),
+        "bounds": ", ".join(bounds),
+        "default": default,
+        "required": required,
+        "about": given.get("description", ""),
+    }
+
+
+def _type(given: Schema) -> str:
+    if "$ref" in given:
+        return str(given["$ref"]).rpartition("/")[2]
+    if "anyOf" in given:
+        return " or ".join(_type(each) for each in given["anyOf"] if each.get("type") != "null")
+    if "enum" in given:
+        return " | ".join(map(str, given["enum"]))
+    if given.get("type") == "array":
+        return f"list of {_type(given.get('items', {}))}"
+    if given.get("type") == "object" and "additionalProperties" in given:
+        values = given["additionalProperties"]
+        return f"{_type(values)} by name" if isinstance(values, dict) else "object"
+    return str(given.get("const", given.get("type", "any")))
+
+
+def _resolved(schema: Schema, given: Schema) -> Schema:
+    if "$ref" not in given:
+        return given
+    found: Schema = schema["components"]["schemas"][str(given["$ref"]).rpartition("/")[2]]
+    return found
+
+
+def _example(model: Schema) -> Any:
+    """What the fields' own examples make together; those that may be left out are."""
+    if "examples" in model:
+        return model["examples"][0]
+    required = model.get("required", ())
+    properties = model.get("properties", {})
+    shown = {name: each for name, each in properties.items() if name in required} or properties
+    return {
+        name: each["examples"][0] if "examples" in each else each.get("default")
+        for name, each in shown.items()
+        if "examples" in each or "default" in each
+    }
+
+
+def _curl(method: str, path: str, example: Any, *, leased: bool) -> str:
+    words = ["curl", "--unix-socket", "$HDBRIDGE_SOCKET"]
+    words += ["-X", method] if method != "GET" else []
+    words += ["-H", '"X-Lease: $LEASE"'] if leased else []
+    if example is not None:
+        words += ["--json", shlex.quote(json.dumps(example))]
+    words.append("http://localhost" + path.replace("{", "").replace("}", "").replace("axis", "AXIS", 1)
+                 if "{axis}" in path else f"http://localhost{path}")  # fmt: skip
+    return " ".join(words)

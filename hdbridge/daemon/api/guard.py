@@ -1,0 +1,201 @@
+"""What stands before the application on each listener: nothing that breaks its policy reaches a route.
+
+Host and origin, token, rate, requests under way, size and depth of a body, time to send it. Stopping is
+exempt from the rate and the number of requests under way: it is never refused to a client that may speak.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from hdbridge.client.messages.problem import CONTENT_TYPE, Problem
+from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, Rate, too_deep
+from hdbridge.daemon.api.problems import refusal
+from hdbridge.daemon.api.traffic import Traffic
+
+BODY_S: Final = 10.0
+"""Time in which a body has to be there."""
+REQUESTS_MAXIMUM: Final = 64
+WEBSOCKETS_MAXIMUM: Final = 32
+RATE_PER_S: Final = 200.0
+RATE_BURST: Final = 400.0
+STOPS: Final = ("/stop", "/quick-stop")
+_HEADERS: Final = {
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+    b"cache-control": b"no-store",
+    b"content-security-policy": b"default-src 'none'; frame-ancestors 'none'",
+}
+_PATH_LOGGED: Final = 200
+_log = logging.getLogger(__name__)
+
+
+class Guard:
+    """An ASGI application around another one. ``now`` is a monotonic clock in seconds."""
+
+    def __init__(
+        self, app: ASGIApp, policy: Policy, traffic: Traffic, now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._app = app
+        self._policy = policy
+        self._traffic = traffic
+        self._rate = Rate(RATE_PER_S, RATE_BURST, now)
+        self._now = now
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request, one WebSocket, or the application's own start and end."""
+        if scope["type"] == "http":
+            await self._http(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await self._websocket(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
+        began = self._now()
+        status = 0
+
+        async def sending(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                present = {name.lower() for name, _ in message["headers"]}
+                more = [each for each in _HEADERS.items() if each[0] not in present]
+                message = {**message, "headers": [*message["headers"], *more]}
+            await send(message)
+
+        problem = self._refused(scope)
+        body = b""
+        if problem is None:
+            body, problem = await _read(scope, receive)
+        try:
+            if problem is not None:
+                await _answer(problem, sending, "http.response")
+            else:
+                with self._traffic.under_way("http"):
+                    await self._app(scope, _replayed(body, receive), sending)
+        finally:
+            self._traffic.count(scope["method"], status)
+            looks = scope["method"] in {"GET", "HEAD"} and status < 400
+            about = {**_about(scope), "status": status, "ms": round(1e3 * (self._now() - began), 1)}
+            _log.log(logging.DEBUG if looks else logging.INFO, "request", about)
+
+    async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        problem = self._refused(scope)
+        if problem is None:
+            _log.info("websocket", _about(scope))
+            with self._traffic.under_way("websocket"):
+                await self._app(scope, receive, send)
+            _log.info("websocket ended", _about(scope))
+            return
+        _log.info("websocket", {**_about(scope), "status": problem.status})
+        self._traffic.count("GET", problem.status)
+        await receive()  # websocket.connect
+        await _answer(problem, send, "websocket.http.response")
+
+    def _refused(self, scope: Scope) -> Problem | None:
+        """Why this is not let through."""
+        policy, headers = self._policy, _headers(scope)
+        host = headers.get("host", "")
+        scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], str(scope["scheme"]))
+        if not policy.knows_host(host):
+            return refusal(
+                421, f"{host[:100]!a} is no name of this machine; expected an address, localhost, or one of "
+                "api.tcp.names in the machine file",
+            )  # fmt: skip
+        if not policy.knows_origin(headers.get("origin"), host, scheme):
+            return refusal(403, "asked by a page from elsewhere; expected none, or the daemon's own page")
+        shown = headers.get("authorization"), headers.get("sec-websocket-protocol")
+        if policy.needs_token(scope["path"]) and not policy.admits(*shown):
+            return refusal(
+                401, "the token is missing or wrong; expected the header Authorization: Bearer TOKEN (a "
+                "browser's WebSocket: the subprotocol bearer.TOKEN)",
+            )  # fmt: skip
+        if scope["path"].endswith(STOPS):
+            return None
+        if not self._rate.admits(_peer(scope)):
+            return refusal(429, f"more than {RATE_PER_S:g} requests a second; send set-points by a stream")
+        kind, most = ("http", REQUESTS_MAXIMUM) if scope["type"] == "http" else (
+            "websocket", WEBSOCKETS_MAXIMUM
+        )  # fmt: skip
+        if self._traffic.open[kind] >= most:
+            return refusal(503, f"{most} of them are under way; close some, or try again later")
+        return None
+
+
+async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
+    """The whole body, or why it is not taken."""
+    length = _headers(scope).get("content-length", "0")
+    too_large = refusal(413, f"the body is larger than {BODY_MAXIMUM >> 10} KiB; send less at a time")
+    if not length.isascii() or not length.isdigit() or int(length[:20]) > BODY_MAXIMUM:
+        return b"", too_large
+    parts, size = [], 0
+    try:
+        async with asyncio.timeout(BODY_S):
+            while True:
+                message = await receive()
+                if message["type"] == "http.disconnect":
+                    return b"", refusal(400, "the client went away before its request was complete")
+                parts.append(message.get("body", b""))
+                size += len(parts[-1])
+                if size > BODY_MAXIMUM:
+                    return b"", too_large
+                if not message.get("more_body", False):
+                    break
+    except TimeoutError:
+        return b"", refusal(408, f"the body was not there within {BODY_S:g} s")
+    body = b"".join(parts)
+    if too_deep(body):
+        return b"", refusal(400, f"the body nests deeper than {DEPTH_MAXIMUM} levels", "InputError")
+    return body, None
+
+
+def _replayed(body: bytes, receive: Receive) -> Receive:
+    """A body that was read already, and then what comes after it."""
+    first: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return first.pop() if first else await receive()
+
+    return replay
+
+
+async def _answer(problem: Problem, send: Send, kind: str) -> None:
+    content = json.dumps(problem.model_dump(exclude_none=True, exclude_defaults=True)).encode()
+    headers = [(b"content-type", CONTENT_TYPE.encode()), (b"content-length", str(len(content)).encode())]
+    if problem.status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    await send({"type": f"{kind}.start", "status": problem.status, "headers": headers})
+    await send({"type": f"{kind}.body", "body": content})
+
+
+def _headers(scope: Scope) -> dict[str, str]:
+    """Of a header that comes twice all values, joined: two hosts are no host."""
+    found: dict[str, str] = {}
+    for name, value in scope["headers"]:
+        key = name.decode("latin-1").lower()
+        text = value.decode("latin-1")
+        found[key] = f"{found[key]}, {text}" if key in found else text
+    return found
+
+
+def _peer(scope: Scope) -> str:
+    return str((scope.get("client") or ("unknown",))[0])
+
+
+def _about(scope: Scope) -> dict[str, Any]:
+    """Who and what, for the log: never a header, and nothing behind a question mark."""
+    client = scope.get("client") or ("unknown", 0)
+    path = scope.get("raw_path") or scope["path"].encode()
+    return {
+        "peer": f"{client[0]}:{client[1]}",
+        "method": scope.get("method", "WEBSOCKET"),
+        "path": path.decode("ascii", "backslashreplace").partition("?")[0][:_PATH_LOGGED],
+    }

@@ -1,0 +1,87 @@
+"""Every error of the API as ``application/problem+json`` (RFC 9457), and never a stack trace."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+
+from hdbridge.client.messages.problem import CONTENT_TYPE, TYPE_PREFIX, Problem
+from hdbridge.errors import HdbridgeError, InputError
+
+COMPLAINTS_MAXIMUM = 20
+_log = logging.getLogger(__name__)
+
+
+class UnknownError(InputError):
+    """What the path names is not there."""
+
+
+def refusal(status: int, detail: str, kind: str = "DaemonError", hint: str | None = None) -> Problem:
+    """A problem that is not an exception of the house."""
+    title = HTTPStatus(status).phrase
+    return Problem(type=f"{TYPE_PREFIX}{kind}", title=title, status=status, detail=detail, hint=hint)
+
+
+def answer(problem: Problem) -> Response:
+    """The response that a problem is."""
+    content = problem.model_dump_json(exclude_none=True)
+    headers = {"WWW-Authenticate": "Bearer"} if problem.status == HTTPStatus.UNAUTHORIZED else None
+    return Response(content, problem.status, headers, CONTENT_TYPE)
+
+
+def register(app: FastAPI) -> None:
+    """Have the application answer its errors so."""
+    app.add_exception_handler(HdbridgeError, _of_the_house)
+    app.add_exception_handler(RequestValidationError, _not_valid)
+    app.add_exception_handler(HTTPException, _of_http)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+async def _of_the_house(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HdbridgeError)
+    problem = Problem.of(error, request.path_params.get("axis"))
+    if isinstance(error, UnknownError):
+        problem = refusal(404, str(error), "InputError")
+    return answer(problem)
+
+
+async def _not_valid(request: Request, error: Exception) -> Response:
+    """What does not suit the schema: each complaint with its key; what was found is not repeated."""
+    assert isinstance(error, RequestValidationError)
+    complaints = []
+    for each in error.errors()[:COMPLAINTS_MAXIMUM]:
+        where = ".".join(str(part) for part in each["loc"] if part != "body")
+        complaints.append(_printable(f"{where or 'the body'}: {each['msg']}"))
+    malformed = any(each["type"] == "json_invalid" for each in error.errors())
+    status = HTTPStatus.BAD_REQUEST if malformed else HTTPStatus.UNPROCESSABLE_ENTITY
+    problem = refusal(status, "the request is not valid: nothing was done", "InputError")
+    problem = problem.model_copy(update={"errors": complaints, "axis": request.path_params.get("axis")})
+    return answer(problem)
+
+
+async def _of_http(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    kind = "InputError" if error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR else "HdbridgeError"
+    response = answer(refusal(error.status_code, _printable(str(error.detail)), kind))
+    response.headers.update(error.headers or {})
+    return response
+
+
+async def _unexpected(request: Request, error: Exception) -> Response:
+    """An error in hdbridge: told in the log, not to the client."""
+    _log.error("failed", {"method": request.method, "path": request.url.path, "error": repr(error)})
+    return answer(
+        refusal(
+            500, "an error in hdbridge, told in the daemon's log; whether it was done is not known",
+            "HdbridgeError", "look at the state before going on",
+        )
+    )  # fmt: skip
+
+
+def _printable(text: str) -> str:
+    """Half a character pair, which JSON may bring, is in no UTF-8."""
+    return text.encode("utf-8", "backslashreplace").decode()[:400]

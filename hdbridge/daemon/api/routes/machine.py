@@ -1,0 +1,153 @@
+"""The machine as a whole: state, events, lease, all axes at once, jobs, remarks."""
+
+from __future__ import annotations
+
+import pwd
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+
+from hdbridge.client import messages
+from hdbridge.daemon.api.problems import UnknownError
+from hdbridge.daemon.api.routes.parts import (
+    LOOKING,
+    MOVING,
+    STOPPING,
+    AxisName,
+    Holder,
+    kept,
+    port,
+    refusals,
+)
+from hdbridge.daemon.service.interface import Bridge
+
+
+def machine_routes(bridge: Bridge) -> APIRouter:
+    """Every route that is of no single axis, and the jobs."""
+    routes = APIRouter()
+    _add_looking(routes, bridge)
+    _add_lease(routes, bridge)
+    _add_motion(routes, bridge)
+    _add_jobs(routes, bridge)
+    return routes
+
+
+def _add_looking(routes: APIRouter, bridge: Bridge) -> None:
+    @routes.get("/state", tags=["Look"])
+    async def get_state() -> messages.MachineState:
+        """Tell everything about the machine and its axes at the newest cycle."""
+        return bridge.state()
+
+    @routes.get("/events", tags=["Look"], responses=refusals((422,)))
+    async def get_events(
+        since: Annotated[
+            int, Query(ge=0, le=2**53, description="number of the newest event that is known already")
+        ] = 0,
+    ) -> messages.Events:
+        """Tell what happened since an event; 0 for all that is kept."""
+        return bridge.events(since)
+
+    @routes.post("/mark", tags=["Look"], responses=refusals((400, 422)))
+    async def mark(mark: messages.Mark) -> messages.Events:
+        """Write a remark into the flight recorder at the present cycle. Needs no lease."""
+        before = bridge.events(0).newest
+        bridge.mark(mark.text)
+        return bridge.events(before)
+
+
+def _add_lease(routes: APIRouter, bridge: Bridge) -> None:
+    def state() -> messages.LeaseState:
+        return bridge.state().lease
+
+    @routes.get("/lease", tags=["Lease"])
+    async def get_lease() -> messages.LeaseState:
+        """Tell who has the right to move."""
+        return state()
+
+    @routes.post("/lease", tags=["Lease"], status_code=201, responses=refusals((400, 422, 423)))
+    async def take_lease(wanted: messages.LeaseRequest, request: Request) -> messages.LeaseGrant:
+        """Take the right to move. It lasts while it is used, or renewed; 423 says who has it."""
+        client = wanted.client.strip() or _who(request)
+        token = bridge.lease.take(client, force=wanted.force)
+        return messages.LeaseGrant(token=token, client=client, timeout_s=bridge.lease.timeout_s)
+
+    @routes.put("/lease", tags=["Lease"], responses=refusals((422, 423)))
+    async def renew_lease(holder: Holder = "") -> messages.LeaseState:
+        """Keep the right to move although nothing is moved now."""
+        bridge.lease.renew(holder)
+        return state()
+
+    @routes.delete("/lease", tags=["Lease"], responses=refusals((422, 423)))
+    async def release_lease(holder: Holder = "") -> messages.LeaseState:
+        """Give the right to move back. Jog, stream and queue end in a stop; a move goes to its end."""
+        bridge.lease.release(holder)
+        return state()
+
+
+def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
+    @routes.post("/quick-stop", tags=["Stop"], responses=refusals((409, 502, 503)))
+    async def quick_stop_all() -> messages.MachineState:
+        """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
+        await bridge.quick_stop()
+        return bridge.state()
+
+    @routes.post("/stop", tags=["Stop"], responses=refusals(tuple(each for each in STOPPING if each != 404)))
+    async def stop_all() -> messages.MachineState:
+        """Brake every axis to rest within its limits; they stay enabled. Needs no lease."""
+        for each in bridge.axes.values():
+            await each.stop()
+        return bridge.state()
+
+    @routes.post("/coordinated", tags=["Move"], responses=refusals(MOVING))
+    async def coordinated(
+        moves: messages.Coordinated, request: Request, holder: Holder = ""
+    ) -> messages.MachineState:
+        """Move several axes so that all begin and end together."""
+        for name in moves.targets_deg:
+            port(bridge, name)
+        motion = bridge.coordinated(holder, moves.targets_deg, moves.speed, moves.wait)
+        await kept(bridge, holder, request, motion)
+        return bridge.state()
+
+
+def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
+    def job(id_: str) -> messages.Job:
+        for each in bridge.jobs():
+            if each.id == id_:
+                return each
+        raise UnknownError(f"there is no job {id_[:80]!a}; see GET /api/v1/jobs")
+
+    @routes.get("/jobs", tags=["Jobs"])
+    async def get_jobs() -> list[messages.Job]:
+        """List the procedures that run or ran since the service began, newest last."""
+        return bridge.jobs()
+
+    @routes.get("/jobs/{job_id}", tags=["Jobs"], responses=refusals(LOOKING))
+    async def get_job(job_id: str) -> messages.Job:
+        """Tell how far a procedure is, and its result."""
+        return job(job_id)
+
+    @routes.delete("/jobs/{job_id}", tags=["Jobs"], responses=refusals(MOVING))
+    async def cancel_job(job_id: str, holder: Holder = "") -> messages.Job:
+        """Stop a procedure's axis in order; what it has measured is kept."""
+        job(job_id)
+        await bridge.cancel_job(holder, job_id)
+        return job(job_id)
+
+    @routes.post("/axes/{axis}/jobs", tags=["Jobs"], status_code=201, responses=refusals(MOVING))
+    async def start_job(axis: AxisName, wanted: messages.JobRequest, holder: Holder = "") -> messages.Job:
+        """Start a procedure on an axis: step, calibrate or improve. It answers at once."""
+        return await port(bridge, axis).job(holder, wanted.kind, wanted.options)
+
+
+def _who(request: Request) -> str:
+    """Who asks, where it gives no name: over a Unix socket the kernel knows."""
+    peer, number = request.client or ("a client", 0)
+    if not peer.startswith("uid="):
+        return f"{peer}:{number}"
+    uid = int(peer.removeprefix("uid="))
+    try:
+        user = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        user = f"user {uid}"
+    return f"{user}, process {number}"

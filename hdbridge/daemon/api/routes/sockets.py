@@ -1,0 +1,157 @@
+"""The two WebSockets: samples as they come, and streamed set-points.
+
+A client that is slow costs nothing: of samples it gets the newest and is told how many it lost; of set-points
+no more are taken than the buffer has room for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import Final, TypeVar
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from pydantic import BaseModel, ValidationError
+
+from hdbridge.client.messages import LiveOptions, StreamAnswer, StreamBegin, StreamPoints
+from hdbridge.daemon.api.columns import columns
+from hdbridge.daemon.api.policy import SUBPROTOCOL
+from hdbridge.daemon.api.routes.parts import port
+from hdbridge.daemon.service.interface import Bridge, StreamPoint
+from hdbridge.errors import HdbridgeError, InputError
+
+M = TypeVar("M", bound=BaseModel)
+BATCH_S: Final = 0.05
+SEND_S: Final = 30.0
+"""A client that has not read for so long is gone."""
+BEGIN_S: Final = 10.0
+"""Time in which a stream says what it wants."""
+_REASON_MAXIMUM: Final = 120
+"""Bytes of the reason that a WebSocket is closed with: 123 by RFC 6455."""
+_NOT_VALID: Final = 1008
+_NEWEST: Final = 2**62
+"""Later than any event."""
+_NORMAL: Final = 1000
+
+
+def socket_routes(bridge: Bridge) -> APIRouter:
+    """``/live`` and ``/axes/{axis}/stream``."""
+    routes = APIRouter()
+
+    @routes.websocket("/live")
+    async def live(websocket: WebSocket) -> None:
+        """Samples in batches; the client may say which at any time (`LiveOptions`)."""
+        await _accept(websocket)
+        feed = _Feed(bridge, websocket)
+        sides = asyncio.ensure_future(feed.listen()), asyncio.ensure_future(feed.tell())
+        await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
+        for each in sides:
+            each.cancel()
+        # Closed only when nothing is being sent any more.
+        for ended in await asyncio.gather(*sides, return_exceptions=True):
+            if isinstance(ended, InputError):
+                await _close(websocket, str(ended))
+            elif isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect | TimeoutError):
+                raise ended
+
+    @routes.websocket("/axes/{axis}/stream")
+    async def stream(websocket: WebSocket, axis: str) -> None:
+        """Set-points: `StreamBegin`, then `StreamPoints`; each is answered (`StreamAnswer`)."""
+        await _accept(websocket)
+        with suppress(WebSocketDisconnect):
+            try:
+                await _stream(bridge, websocket, axis)
+            except (HdbridgeError, TimeoutError) as problem:
+                reason = str(problem) or f"nothing came within {BEGIN_S:g} s; expected StreamBegin"
+                await _send(websocket, StreamAnswer(accepted=0, detail=reason))
+                await _close(websocket, reason)
+
+    return routes
+
+
+class _Feed:
+    """One client of the samples."""
+
+    def __init__(self, bridge: Bridge, websocket: WebSocket) -> None:
+        self._bridge = bridge
+        self._websocket = websocket
+        self._options = LiveOptions()
+
+    async def listen(self) -> None:
+        """Take what the client wants, until it goes; InputError where that cannot be had."""
+        while True:
+            options = await _receive(self._websocket, LiveOptions)
+            for each in options.axes or ():
+                port(self._bridge, each)
+            self._options = options
+
+    async def tell(self) -> None:
+        """Send batches; while one is on its way the subscription keeps only the newest samples."""
+        names = list(self._bridge.axes)
+        lost, known = 0, self._bridge.events(_NEWEST).newest
+        async for batch in self._bridge.subscribe():
+            lost += batch.lost
+            options = self._options
+            happened = self._bridge.events(known)
+            known = max(known, happened.newest)
+            told = columns(
+                batch.samples,
+                names,
+                every=options.every,
+                wanted=options.axes,
+                events=happened.events,
+                lost=lost,
+            )
+            if told.time_s or told.events:
+                await _send(self._websocket, told)
+                lost = 0
+            await asyncio.sleep(BATCH_S)  # what comes meanwhile is one batch: fewer, larger messages
+
+
+async def _stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
+    async with asyncio.timeout(BEGIN_S):
+        begin = await _receive(websocket, StreamBegin)
+    stream = await port(bridge, axis).stream(begin.lease, begin.timeout_s)
+    async with stream:
+        await _send(websocket, StreamAnswer(accepted=0))
+        while True:
+            given = await _receive(websocket, StreamPoints)
+            bridge.lease.renew(begin.lease)
+            if given.points:
+                await stream.put([
+                    StreamPoint(each.time_s, each.position_deg, each.velocity_deg_s) for each in given.points
+                ])  # fmt: skip
+            if given.end:
+                await stream.end()
+            await _send(websocket, StreamAnswer(accepted=len(given.points)))
+            if given.end:
+                await websocket.close(_NORMAL)
+                return
+
+
+async def _accept(websocket: WebSocket) -> None:
+    offered = websocket.scope.get("subprotocols", [])
+    await websocket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
+
+
+async def _receive(websocket: WebSocket, kind: type[M]) -> M:
+    """The next message; InputError where it is none of the kind."""
+    try:
+        text = await websocket.receive_text()
+    except KeyError:
+        raise InputError(f"found bytes; expected {kind.__name__} as JSON text") from None
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as problem:
+        first = problem.errors(include_input=False, include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the message"
+        raise InputError(f"{kind.__name__}: {where}: {first['msg']}") from None
+
+
+async def _send(websocket: WebSocket, message: BaseModel) -> None:
+    async with asyncio.timeout(SEND_S):
+        await websocket.send_text(message.model_dump_json())
+
+
+async def _close(websocket: WebSocket, reason: str) -> None:
+    await websocket.close(_NOT_VALID, reason.encode()[:_REASON_MAXIMUM].decode(errors="ignore"))

@@ -1,0 +1,182 @@
+"""The server under the application: uvicorn on sockets that are open already, one guard for each.
+
+uvicorn's own part is bounded here: connections, time to send a request's head, size of a message, time that a
+WebSocket may be silent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, cast
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from hdbridge.daemon.api.app import create_app
+from hdbridge.daemon.api.guard import Guard
+from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.api.policy import BODY_MAXIMUM, Policy
+from hdbridge.daemon.api.sockets import BACKLOG, peer_of
+from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.service.interface import Bridge
+
+CONNECTIONS_MAXIMUM: Final = 256
+HEAD_S: Final = 10.0
+"""Time in which the head of a request has to be there."""
+HEAD_BYTES: Final = 16 << 10
+IDLE_S: Final = 30
+"""A connection without a request is closed after so long."""
+PING_S: Final = 20.0
+ENDING_S: Final = 2
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """A listening socket and who may ask there."""
+
+    socket: socket.socket
+    policy: Policy
+    certificate: Path | None = None
+    """Chain for TLS, PEM."""
+    key: Path | None = None
+
+
+class ApiServer:
+    """Serves a `Bridge` until `stop`."""
+
+    def __init__(self, bridge: Bridge, listeners: Sequence[Listener], metrics: Metrics | None = None) -> None:
+        self.traffic = Traffic()
+        self._listeners = listeners
+        app = create_app(bridge, metrics or Metrics(), self.traffic)
+        self._servers = [_Server(_config(app, each, self.traffic)) for each in listeners]
+
+    @property
+    def started(self) -> bool:
+        """Whether every listener is served."""
+        return all(each.started for each in self._servers)
+
+    async def run(self) -> None:
+        """Serve until `stop`, or until the task is cancelled; open requests get a moment to end."""
+        # At DEBUG the server's libraries log headers: the token would be among them.
+        for name in ("uvicorn", "uvicorn.error", "websockets"):
+            logging.getLogger(name).setLevel(logging.WARNING)
+        logging.getLogger("uvicorn.error").addFilter(_worth_telling)
+        async with asyncio.TaskGroup() as group:
+            for server, listener in zip(self._servers, self._listeners, strict=True):
+                group.create_task(server.serve(sockets=[listener.socket]))
+
+    def stop(self) -> None:
+        """End soon; may be called from a signal handler or another thread."""
+        for each in self._servers:
+            each.should_exit = True
+
+
+class _Server(uvicorn.Server):
+    """Leaves the process's signals alone: those are the service's."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End; what clients have left open by then is cut."""
+        await super().shutdown(sockets)
+        for each in tuple(self.server_state.connections):
+            each.transport.abort()
+
+
+class _Connection(H11Protocol):
+    """Knows its peer by the kernel's word, and does not wait for ever for a request."""
+
+    _watch: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.client = _client(transport) or self.client
+        self._watch = self.loop.call_later(HEAD_S, self._check)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        super().connection_lost(exc)
+
+    def _check(self) -> None:
+        """Close what has sent no whole head in all the time, or does not take what it was sent."""
+        if self.transport.get_protocol() is not self:  # a WebSocket by now: its pings decide
+            return
+        if self.transport.is_closing():
+            self.transport.abort()
+            return
+        idle = self.cycle is None or self.cycle.response_complete
+        if idle and (self.cycle is None or self.conn.trailing_data[0]):
+            self.transport.close()
+        self._watch = self.loop.call_later(HEAD_S, self._check)
+
+
+class _WebSocket(WebSocketsSansIOProtocol):
+    """The same for a WebSocket, whose pings find out who is gone."""
+
+    _watch: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.client = _client(transport) or self.client
+        self._watch = self.loop.call_later(HEAD_S, self._check)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        super().connection_lost(exc)
+
+    def _check(self) -> None:
+        """What is closed and still does not take what it was sent never will."""
+        if self.transport.is_closing():
+            self.transport.abort()
+        else:
+            self._watch = self.loop.call_later(HEAD_S, self._check)
+
+
+def _worth_telling(record: logging.LogRecord) -> bool:
+    """Not what the server takes for an error of the application: a WebSocket that was refused."""
+    return "without completing handshake" not in record.getMessage()
+
+
+def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:
+    connected = transport.get_extra_info("socket")
+    peer = peer_of(connected) if connected is not None else None
+    if peer is None:
+        return None
+    return f"uid={peer.uid}", peer.pid
+
+
+def _config(app: Any, listener: Listener, traffic: Traffic) -> uvicorn.Config:
+    return uvicorn.Config(
+        Guard(app, listener.policy, traffic),
+        http=_Connection,
+        ws=cast(Any, _WebSocket),
+        loop="asyncio",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        backlog=BACKLOG,
+        limit_concurrency=CONNECTIONS_MAXIMUM,
+        timeout_keep_alive=IDLE_S,
+        timeout_graceful_shutdown=ENDING_S,
+        h11_max_incomplete_event_size=HEAD_BYTES,
+        ws_max_size=BODY_MAXIMUM,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PING_S,
+        ws_per_message_deflate=False,
+        ssl_certfile=listener.certificate,
+        ssl_keyfile=listener.key,
+    )

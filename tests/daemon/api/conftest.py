@@ -1,0 +1,29 @@
+"""A machine of two axes, served."""
+
+import pytest
+from support.api import served
+from support.fake_bridge import FakeBridge
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """One server for all tests of a file: each begins with a machine as it comes up."""
+    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
+        yield place
+
+
+@pytest.fixture
+def api(place):
+    """The machine as it comes up, nobody holding the lease."""
+    place.bridge.__init__()
+    return place
+
+
+@pytest.fixture
+def leased(api):
+    """A client over the Unix socket that holds the lease, the first axis enabled."""
+    token = api.bridge.lease.take("the tests")
+    with api.over_socket(**{"X-Lease": token}) as client:
+        client.post("/axes/joint-1/enable").raise_for_status()
+        api.bridge.moved.clear()
+        yield client

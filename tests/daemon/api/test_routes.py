@@ -1,0 +1,257 @@
+"""What each route asks of the machine, and how it answers."""
+
+import json
+
+import pytest
+
+from hdbridge.client import messages
+
+
+def test_the_state_is_the_machine_as_it_stands(leased):
+    state = messages.MachineState.model_validate_json(leased.get("/state").content)
+    assert [each.name for each in state.axes] == ["joint-1", "joint-2"]
+    assert state.axes[0].state is messages.ControlState.ENABLED
+    assert state.lease.client == "the tests"
+
+
+def test_a_move_waits_and_tells_where_the_axis_is(leased, api):
+    answer = leased.post("/axes/joint-1/move", json={"target_deg": 30, "velocity_deg_s": 20.0})
+    state = messages.AxisState.model_validate_json(answer.content)
+    assert state.load_target_deg == 30.0
+    assert api.bridge.moved == [("joint-1", "move", 30.0, 20.0)]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "asked"),
+    [
+        ("POST", "disable", None, ("disable",)),
+        ("POST", "reset", None, ("reset",)),
+        ("POST", "home", {"method": 37}, ("home", 37)),
+        ("POST", "jog", {"velocity_deg_s": -5, "timeout_s": 1}, ("jog", -5.0, 1.0)),
+        ("POST", "queue", {"points": [{"target_deg": 1}, {"target_deg": 2}]}, ("queue", 2)),
+        ("DELETE", "queue", None, ("clear queue",)),
+        ("POST", "compensate", {"scheme": "both"}, ("compensate", "both")),
+        ("POST", "model", {"version": 4}, ("model", 4)),
+        ("POST", "model", {"version": "pending"}, ("model", "pending")),
+        ("POST", "load-loop", {"on": True}, ("load loop", True)),
+        ("POST", "adaptation", {"mode": "observe"}, ("adapt", "observe")),
+        ("DELETE", "adaptation", None, ("adaptation back",)),
+        ("POST", "jobs", {"kind": "step", "options": {"count": 60}}, ("job", "step", {"count": 60})),
+        ("PUT", "objects/6041h", {"value": "1"}, ("write", "6041h", "1")),
+    ],
+)
+def test_what_moves_reaches_the_machine_with_the_lease_and_never_without(
+    api, leased, method, path, body, asked
+):
+    """The same request: with the lease it is done once; without, or with another token, nothing is."""
+    url = f"/axes/joint-1/{path}"
+    with api.over_socket() as stranger:
+        refused = [
+            stranger.request(method, url, json=body, headers=headers)
+            for headers in ({}, {"X-Lease": "mZ3sWJx0b0lq"}, {"X-Lease": ""})
+        ]
+    assert [each.status_code for each in refused] == [423, 423, 423]
+    assert "the tests" in refused[0].json()["detail"]
+    assert api.bridge.moved == []
+    done = leased.request(method, url, json=body)
+    assert done.status_code in {200, 201}, done.text
+    assert api.bridge.moved == [("joint-1", *asked)]
+
+
+@pytest.mark.parametrize(
+    ("path", "stopped"),
+    [
+        ("/axes/joint-2/stop", [("joint-2", "stop")]),
+        ("/axes/joint-2/quick-stop", [("joint-2", "quick-stop")]),
+        ("/stop", [("joint-1", "stop"), ("joint-2", "stop")]),
+        ("/quick-stop", [("joint-1", "quick-stop"), ("joint-2", "quick-stop")]),
+    ],
+)
+def test_everybody_may_stop(api, leased, path, stopped):
+    with api.over_socket() as stranger:
+        assert stranger.post(path).status_code == 200
+    assert api.bridge.stopped == stopped
+
+
+def test_a_coordinated_move_takes_every_axis_or_none(api, leased):
+    targets = {"joint-1": 10.0, "joint-2": 20.0}
+    refused = leased.post("/coordinated", json={"targets_deg": targets})
+    assert refused.status_code == 409
+    assert "joint-2" in refused.json()["detail"]
+    assert api.bridge.moved == []
+    leased.post("/axes/joint-2/enable")
+    assert leased.post("/coordinated", json={"targets_deg": targets, "speed": 0.5}).status_code == 200
+    assert [each.target_deg for each in api.bridge.axes.values()] == [10.0, 20.0]
+
+
+def test_nothing_is_moved_by_looking(api, leased):
+    schema = leased.get("/openapi.json").json()
+    for path, methods in schema["paths"].items():
+        if "get" in methods:
+            leased.get(path.removeprefix("/api/v1").format(axis="joint-1", name="6041h", job_id="step-1"))
+    assert api.bridge.moved == []
+    assert api.bridge.stopped == []
+
+
+def test_the_lease_is_taken_renewed_and_given_back(api):
+    bridge = api.bridge
+    bridge.now_s = 0.0
+    with api.over_socket() as client, api.over_socket() as other:
+        grant = messages.LeaseGrant.model_validate_json(
+            client.post("/lease", json={"client": "cell controller"}).content
+        )
+        mine = {"X-Lease": grant.token}
+        held = other.post("/lease", json={"client": "another"})
+        assert held.status_code == 423
+        assert "cell controller" in held.json()["detail"]
+        bridge.now_s = 9.0
+        assert client.put("/lease", headers=mine).json()["held"]
+        bridge.now_s = 18.0
+        assert client.post("/axes/joint-1/enable", headers=mine).status_code == 200, "using it renews it"
+        bridge.now_s = 27.0
+        assert client.delete("/lease", headers=mine).json()["held"] is False
+        assert other.post("/lease", json={"client": "another"}).status_code == 201
+        taken = client.post("/lease", json={"client": "cell controller", "force": True})
+        assert taken.status_code == 201
+        assert taken.json()["token"] != grant.token
+
+
+def test_a_lease_that_ran_out_moves_nothing(api):
+    bridge = api.bridge
+    bridge.now_s = 0.0
+    token = bridge.lease.take("sleeper")
+    bridge.now_s = bridge.lease.timeout_s
+    with api.over_socket(**{"X-Lease": token}) as client:
+        assert client.post("/axes/joint-1/enable").status_code == 423
+    assert bridge.moved == []
+
+
+def test_the_kernel_says_who_takes_the_lease_without_a_name(api):
+    with api.over_socket() as client:
+        assert "process" in client.post("/lease", json={}).json()["client"]
+
+
+def test_a_move_that_is_waited_for_keeps_the_lease(api):
+    """It would run out before the axis is there."""
+    bridge = api.bridge
+    bridge.lease = type(bridge.lease)(0.3, bridge.lease._now)
+    token = bridge.lease.take("patience")
+    bridge.axes["joint-1"].moving_s = 1.0
+    with api.over_socket(**{"X-Lease": token}) as client:
+        client.post("/axes/joint-1/enable").raise_for_status()
+        assert client.post("/axes/joint-1/move", json={"target_deg": 5}).status_code == 200
+        assert bridge.lease.ended() == ()
+
+
+def test_jobs_are_listed_looked_at_and_cancelled(api, leased):
+    job = leased.post("/axes/joint-1/jobs", json={"kind": "calibrate"}).json()
+    assert [each["id"] for each in leased.get("/jobs").json()] == [job["id"]]
+    assert leased.get(f"/jobs/{job['id']}").json()["state"] == "running"
+    with api.over_socket() as stranger:
+        assert stranger.delete(f"/jobs/{job['id']}").status_code == 423
+    assert leased.delete(f"/jobs/{job['id']}").json()["state"] == "cancelled"
+    assert leased.get("/jobs/step-99").status_code == 404
+
+
+def test_an_object_is_read_without_a_lease(api):
+    with api.over_socket() as client:
+        read = client.get("/axes/joint-1/objects/6041h").json()
+        assert (read["index"], read["value"], read["type"]) == (0x6041, 0x1237, "uint16")
+        assert client.get("/axes/joint-1/objects/9999h").status_code == 422
+
+
+def test_a_mark_is_an_event_and_events_are_told_since_one(api):
+    with api.over_socket() as client:
+        for text in ("first", "second"):
+            told = client.post("/mark", json={"text": text}).json()
+        assert [each["text"] for each in told["events"]] == ["second"]
+        assert [each["text"] for each in client.get("/events").json()["events"]] == ["first", "second"]
+        assert client.get("/events", params={"since": 2}).json()["events"] == []
+
+
+def test_an_axis_that_there_is_not_is_named_with_those_that_there_are(leased):
+    answer = leased.get("/axes/joint-9")
+    assert answer.status_code == 404
+    assert "joint-1, joint-2" in answer.json()["detail"]
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    ("content", "status", "words"),
+    [
+        (b"{", 400, "JSON"),
+        (b"", 422, "required"),
+        (b'{"target_deg": NaN}', 422, "target_deg"),
+        (b'{"target_deg": 1e999}', 422, "target_deg"),
+        (b'{"target_deg": -Infinity}', 422, "target_deg"),
+        (b'{"target_deg": "30"}', 422, "target_deg"),
+        (b'{"target_deg": 30, "taget_deg": 3}', 422, "taget_deg"),
+        (b'{"target_deg": 30, "\\ud800": 3}', 422, "unicode"),
+        (b'{"target_deg": 30, "wait": 1}', 422, "wait"),
+        (b'{"target_deg": 181}', 422, "180"),
+        (b"[" * 100 + b"]" * 100, 400, "nests"),
+        (b'{"target_deg": 1' + b"0" * 5000 + b"}", 400, ""),
+        (b'{"target_deg": 30}' + b" " * (256 << 10), 413, "KiB"),
+    ],
+)
+def test_a_body_that_is_wrong_moves_nothing_and_is_told_why(api, leased, content, status, words):
+    answer = leased.post("/axes/joint-1/move", content=content, headers={"Content-Type": "application/json"})
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = messages.Problem.model_validate_json(answer.content)
+    assert words in " ".join([problem.detail, *problem.errors])
+    assert api.bridge.moved == []
+
+
+def test_an_error_in_hdbridge_is_a_problem_without_its_insides(api, leased, monkeypatch):
+    def broken() -> None:
+        raise ZeroDivisionError("secret")
+
+    monkeypatch.setattr(api.bridge, "state", broken)
+    answer = leased.get("/state")
+    assert answer.status_code == 500
+    assert "secret" not in answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_health_is_that_of_the_loop(api):
+    with api.over_tcp(token=None) as client:
+        url = str(client.base_url).replace("api/v1/", "healthz")
+        assert client.get(url).status_code == 200
+        api.bridge.alive = False
+        assert client.get(url).status_code == 503
+
+
+def test_the_page_of_the_api_has_every_operation_and_fetches_nothing(leased):
+    schema = leased.get("/openapi.json").json()
+    page = leased.get("http://hdbridge/docs")
+    assert page.status_code == 200
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    for path, methods in schema["paths"].items():
+        for operation in methods.values():
+            assert operation["description"], path
+            assert f'id="{operation["operationId"]}"' in page.text
+    assert "https:" not in page.text
+    assert "<script" not in page.text
+
+
+def test_every_operation_says_what_it_refuses_as_a_problem(leased):
+    schema = leased.get("/openapi.json").json()
+    kinds = {
+        kind
+        for methods in schema["paths"].values()
+        for operation in methods.values()
+        for status, response in operation["responses"].items()
+        if status >= "400"
+        for kind in response["content"]
+    }
+    assert kinds == {"application/problem+json"}
+    assert "HTTPValidationError" not in json.dumps(schema)
+
+
+def test_the_live_page_is_served_with_its_own_policy(leased):
+    page = leased.get("http://hdbridge/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "script-src 'self'" in page.headers["content-security-policy"]
+    assert leased.get("http://hdbridge/page/main.js").status_code == 200
+    assert leased.get("http://hdbridge/page/..%2f__init__.py").status_code == 404

@@ -1,0 +1,275 @@
+"""Who may ask what: sockets, token, host and origin, sizes, rates, the log."""
+
+import grp
+import logging
+import os
+import socket
+import stat
+import struct
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.api import TOKEN
+
+from hdbridge.daemon.api.policy import DEPTH_MAXIMUM, Policy, Rate, too_deep
+from hdbridge.daemon.api.sockets import check_exposure, peer_of, tcp_socket, unix_socket
+from hdbridge.errors import DaemonError, InputError
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
+def test_the_socket_is_open_to_owner_and_group_and_to_nobody_else(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        with unix_socket(tmp_path / "cell.sock"):
+            assert stat.S_IMODE((tmp_path / "cell.sock").stat().st_mode) == 0o660
+    finally:
+        os.umask(before)
+
+
+def test_the_mode_is_still_that_when_it_is_served(api):
+    """The server would make it writable for everybody if it bound it itself."""
+    assert stat.S_IMODE(api.socket.stat().st_mode) == 0o660
+    with api.over_socket() as client:
+        assert client.get("/state").status_code == 200
+    assert stat.S_IMODE(api.socket.stat().st_mode) == 0o660
+
+
+def test_a_socket_that_nobody_listens_at_is_replaced_and_another_is_not(tmp_path):
+    path = tmp_path / "cell.sock"
+    with unix_socket(path), pytest.raises(DaemonError, match="another daemon"):
+        unix_socket(path)
+    assert path.exists()
+    with unix_socket(path):
+        pass
+    path.unlink()
+    path.write_text("precious")
+    with pytest.raises(InputError, match="not a socket"):
+        unix_socket(path)
+    assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("path", "words"), [("x" * 120, "longer than"), ("absent/cell.sock", "folder must exist")]
+)
+def test_a_path_that_no_socket_can_have_is_refused_in_one_line(tmp_path, path, words):
+    with pytest.raises(InputError, match=words):
+        unix_socket(tmp_path / path)
+
+
+def test_a_group_that_there_is_not_is_refused_and_one_that_there_is_owns_it(tmp_path):
+    path = tmp_path / "cell.sock"
+    with pytest.raises(InputError, match="no group 'nobodys'"):
+        unix_socket(path, group="nobodys")
+    own = grp.getgrgid(os.getgid())
+    with unix_socket(path, group=own.gr_name):
+        assert path.stat().st_gid == own.gr_gid
+
+
+def test_the_kernel_tells_who_is_at_the_other_end():
+    one, other = socket.socketpair()
+    with one, other:
+        peer = peer_of(one)
+    assert peer is not None
+    assert (peer.pid, peer.uid) == (os.getpid(), os.getuid())
+
+
+def test_a_port_that_is_taken_is_said(api):
+    with pytest.raises(DaemonError, match="another process"):
+        tcp_socket("127.0.0.1", api.port)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "cell.example"])
+def test_the_network_needs_tls_or_an_explicit_word(host):
+    with pytest.raises(InputError, match="without TLS"):
+        check_exposure(host, tls=False, unencrypted=False)
+    check_exposure(host, tls=True, unencrypted=False)
+    check_exposure(host, tls=False, unencrypted=True)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.8.8.8"])
+def test_this_machine_alone_needs_none(host):
+    check_exposure(host, tls=False, unencrypted=False)
+
+
+@pytest.mark.parametrize(
+    "token", ["", "short", "with spaces in the middle", "x" * 201, "line\nbreak-long-enough"]
+)
+def test_a_token_that_can_be_guessed_or_cannot_be_sent_is_refused(token):
+    with pytest.raises(InputError, match="token of the API"):
+        Policy(token=token)
+
+
+@pytest.mark.parametrize(
+    "authorization",
+    [None, "", "Bearer", "Bearer wrong", f"Basic {TOKEN}", TOKEN, f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}"],
+)
+def test_over_tcp_nothing_is_shown_or_done_without_the_token(api, authorization):
+    headers = {} if authorization is None else {"Authorization": authorization}
+    with api.over_tcp(token=None, **headers) as client:
+        paths = {
+            path: [each.upper() for each in methods] for path, methods in client_schema(api)["paths"].items()
+        }
+        for path, methods in {**paths, "/metrics": ["GET"], "/api/v1/openapi.json": ["GET"]}.items():
+            url = str(client.base_url).replace("/api/v1/", path.format(axis="joint-1", name="x", job_id="y"))
+            for method in methods:
+                answer = client.request(method, url, json={"target_deg": 1.0})
+                assert answer.status_code == 401, (method, path)
+                assert answer.headers["www-authenticate"] == "Bearer"
+    assert api.bridge.moved == []
+    assert api.bridge.stopped == []
+
+
+def client_schema(api):
+    with api.over_socket() as client:
+        return client.get("/openapi.json").json()
+
+
+def test_with_the_token_and_the_lease_it_moves_and_with_the_token_alone_it_does_not(api):
+    with api.over_tcp() as client:
+        assert client.get("/state").status_code == 200
+        assert client.post("/axes/joint-1/enable").status_code == 423
+        lease = client.post("/lease", json={"client": "over tcp"}).json()["token"]
+        assert client.post("/axes/joint-1/enable", headers={"X-Lease": lease}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "evil.example:8402", "localhost.evil.example", "127.0.0.1.nip.io", "", "localhost@evil",
+     "127.0.0.1, evil.example", "[::1", "hdbridge:x"],
+)  # fmt: skip
+@pytest.mark.parametrize("over", ["over_tcp", "over_socket"])
+def test_a_name_that_is_not_this_machines_is_refused(api, host, over):
+    """A page whose name was pointed at this machine asks with that name."""
+    with getattr(api, over)(Host=host) as client:
+        assert client.post("/stop").status_code == 421
+    assert api.bridge.stopped == []
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1:8402", "[::1]:8402", "192.168.1.5", "hdbridge"])
+def test_an_address_and_a_name_of_this_machine_are_known(host):
+    assert Policy().knows_host(host)
+    assert Policy(names=frozenset({"cell.example"})).knows_host("Cell.Example:8402")
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://evil.example", "http://localhost:1", "null", "http://127.0.0.1", "", "file://"]
+)
+def test_a_page_from_elsewhere_can_do_nothing(api, origin):
+    lease = api.bridge.lease.take("page")
+    with api.over_tcp(Origin=origin, **{"X-Lease": lease}) as client:
+        assert client.post("/axes/joint-1/enable").status_code == 403
+        assert client.post("/quick-stop").status_code == 403
+        assert client.get("/state").status_code == 403
+    assert api.bridge.moved == []
+
+
+def test_the_daemons_own_page_may_ask(api):
+    with api.over_tcp(Origin=f"http://127.0.0.1:{api.port}") as client:
+        assert client.get("/state").status_code == 200
+        assert "access-control-allow-origin" not in client.get("/state").headers
+
+
+def test_a_form_of_another_page_is_not_taken_for_json(api):
+    """Without an Origin, as an old browser sends it: the type alone gives it away."""
+    lease = api.bridge.lease.take("form")
+    with api.over_socket(**{"X-Lease": lease}) as client:
+        client.post("/axes/joint-1/enable")
+        for kind in ("text/plain", "application/x-www-form-urlencoded"):
+            answer = client.post(
+                "/axes/joint-1/move", content=b'{"target_deg": 3}', headers={"Content-Type": kind}
+            )
+            assert answer.status_code == 422
+    assert api.bridge.moved == [("joint-1", "enable")]
+
+
+def test_neither_token_nor_lease_gets_into_the_log(api, caplog, capfd):
+    caplog.set_level(logging.DEBUG)
+    with api.over_tcp() as client:
+        lease = client.post("/lease", json={"client": "quiet"}).json()["token"]
+        client.post("/axes/joint-1/enable", headers={"X-Lease": lease})
+        client.get("/state", params={"token": TOKEN})
+        client.get("/lease")
+    with httpx.Client(trust_env=False) as bad:
+        bad.get(f"http://127.0.0.1:{api.port}/api/v1/state", headers={"Authorization": f"Bearer {TOKEN}x"})
+    own = [each for each in caplog.records if each.name.startswith(("hdbridge", "uvicorn", "websockets"))]
+    logged = "\n".join(f"{each.getMessage()} {each.args} {each.__dict__}" for each in own)
+    logged += "".join(capfd.readouterr())
+    assert "enable" in logged, "what moves is logged, with who asked"
+    assert f"{lease}" not in logged
+    assert TOKEN not in logged
+
+
+def test_who_asks_over_the_unix_socket_is_logged(api, caplog):
+    caplog.set_level(logging.INFO)
+    with api.over_socket() as client:
+        client.post("/stop")
+        client.post("/stop")  # logged after it was answered: the first one is by now
+    about = next(each.args for each in caplog.records if each.args and "path" in each.args)
+    assert about["peer"] == f"uid={os.getuid()}:{os.getpid()}"
+    assert about["status"] == 200
+
+
+def test_a_length_that_is_none_and_a_body_that_does_not_end_are_refused(api):
+    def chunks():
+        for _ in range(40):
+            yield b" " * 16384
+
+    with api.over_socket() as client:
+        answer = client.post("/axes/joint-1/move", content=chunks())
+        assert answer.status_code == 413
+
+
+@given(st.integers(min_value=1, max_value=60), st.sampled_from([b"[", b'{"a":', b'{"]":[', b'["[[[",']))
+def test_depth_is_counted_outside_of_texts_only(depth, opening):
+    levels = depth * {b"[": 1, b'{"a":': 1, b'{"]":[': 2, b'["[[[",': 1}[opening]
+    assert too_deep(opening * depth) == (levels > DEPTH_MAXIMUM)
+
+
+def test_each_client_has_a_rate_of_its_own():
+    rate = Rate(10.0, 5.0, lambda: 0.0)
+    assert [rate.admits("a") for _ in range(6)] == [True] * 5 + [False]
+    assert rate.admits("b")
+
+
+def test_the_rate_recovers_with_time_and_remembers_a_bounded_number():
+    now = 0.0
+    rate = Rate(10.0, 5.0, lambda: now, clients=3)
+    for _ in range(5):
+        assert rate.admits("a")
+    assert not rate.admits("a")
+    now = 0.11
+    assert rate.admits("a")
+    assert not rate.admits("a")
+    for each in "bcd":
+        rate.admits(each)
+    assert rate.admits("a"), "forgotten by then"
+
+
+def test_over_the_limit_only_stopping_goes_on(api, monkeypatch):
+    monkeypatch.setattr(Rate, "admits", lambda self, client: False)
+    with api.over_socket() as client:
+        assert client.get("/state").status_code == 429
+        assert client.post("/stop").status_code == 200
+        assert client.post("/axes/joint-1/quick-stop").status_code == 200
+
+
+def test_too_many_requests_under_way_leave_room_for_a_stop(api):
+    api.server.traffic.open["http"] += 64
+    try:
+        with api.over_socket() as client:
+            assert client.get("/state").status_code == 503
+            assert client.post("/quick-stop").status_code == 200
+    finally:
+        api.server.traffic.open["http"] -= 64
+
+
+def test_a_client_that_goes_away_in_its_request_costs_nothing(api):
+    """Reset in the middle of a body; the next one is served."""
+    with socket.create_connection(("127.0.0.1", api.port)) as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        raw.sendall(b"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\nhalf")
+    with api.over_socket() as client:
+        assert client.get("/state").status_code == 200
+    assert api.bridge.stopped == []

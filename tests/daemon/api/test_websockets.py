@@ -1,0 +1,275 @@
+"""The two WebSockets: samples for watchers, set-points from the holder of the lease."""
+
+import json
+import logging
+import socket
+import time
+from contextlib import ExitStack
+
+import pytest
+from support.api import TOKEN
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect, unix_connect
+
+from hdbridge.client import messages
+
+
+def live(api, **options):
+    # A full queue of this client would keep it from closing.
+    return unix_connect(str(api.socket), "ws://hdbridge/api/v1/live", max_queue=None, **options)
+
+
+def stream(api, axis="joint-1"):
+    return unix_connect(str(api.socket), f"ws://hdbridge/api/v1/axes/{axis}/stream")
+
+
+def batch(connection) -> messages.Samples:
+    return messages.Samples.model_validate_json(connection.recv(timeout=30))
+
+
+def told(connection) -> messages.StreamAnswer:
+    return messages.StreamAnswer.model_validate_json(connection.recv(timeout=30))
+
+
+def read_on(connection) -> None:
+    """Until it is closed."""
+    while True:
+        connection.recv(timeout=30)
+
+
+def until(condition) -> None:
+    for _ in range(3000):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it did not come about")
+
+
+def test_samples_come_in_columns_and_what_is_not_a_number_is_null(api):
+    with live(api) as connection:
+        samples = batch(connection)
+    assert len(samples.time_s) == len(samples.cycle) == len(samples.axes["joint-2"].weight)
+    axis = samples.axes["joint-1"]
+    assert axis.error_arcsec[0] == pytest.approx(1.0)
+    assert axis.reading0[0] is None
+    assert axis.state[0] == "enabled"
+
+
+def test_a_client_chooses_axes_and_how_many_samples(api):
+    with live(api) as connection:
+        connection.send(messages.LiveOptions(every=10, axes=["joint-2"]).model_dump_json())
+        until(lambda: set(batch(connection).axes) == {"joint-2"})
+        cycles = [cycle for _ in range(5) for cycle in batch(connection).cycle]
+    assert len(cycles) >= 5
+    assert all(each % 10 == 0 for each in cycles)
+
+
+def test_events_come_with_the_samples_but_not_those_of_before(api):
+    api.bridge.mark("before")
+    with live(api) as connection:
+        batch(connection)
+        api.bridge.mark("while it watches")
+        seen = []
+        until(lambda: seen.extend(batch(connection).events) or seen)
+    assert [each.text for each in seen] == ["while it watches"]
+
+
+@pytest.mark.parametrize(
+    "wrong", ["{", "[]", '{"every": 0}', '{"every": NaN}', '{"axes": ["joint-9"]}', '{"evry": 3}', b"bytes"]
+)
+def test_what_is_no_wish_ends_the_connection_and_says_why(api, wrong):
+    with live(api) as connection:
+        connection.send(wrong)
+        with pytest.raises(ConnectionClosed) as closed:
+            read_on(connection)
+    assert closed.value.rcvd.code == 1008
+    assert closed.value.rcvd.reason
+
+
+def test_a_client_that_does_not_read_loses_samples_and_nobody_else_does(api):
+    """It reads nothing until thousands of cycles have gone by: the newest come then, the rest is counted."""
+    api.bridge.rows = 40
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.connect(str(api.socket))
+        # Small buffers, so that what is under way is little.
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with (
+            unix_connect(None, "ws://hdbridge/api/v1/live", sock=raw, max_queue=1) as sleeper,
+            live(api) as reader,
+        ):
+            begun = api.bridge.sent_cycles
+            last = batch(reader).cycle[-1]
+            lost_by_reader = 0
+            while api.bridge.sent_cycles < begun + 20_000:
+                samples = batch(reader)
+                lost_by_reader += samples.lost
+                assert samples.cycle[0] == last + 1 + samples.lost or samples.lost
+                last = samples.cycle[-1]
+            seen = lost = 0
+            while lost == 0:
+                samples = batch(sleeper)
+                seen += len(samples.cycle)
+                lost += samples.lost
+    assert lost > seen
+    assert lost_by_reader < lost
+
+
+def test_watchers_go_and_come_and_leave_nothing_behind(api):
+    for _ in range(5):
+        with ExitStack() as open_now:
+            for _ in range(6):
+                batch(open_now.enter_context(live(api)))
+            assert api.server.traffic.open["websocket"] == 6
+        until(lambda: api.server.traffic.open["websocket"] == 0)
+
+
+def test_only_so_many_may_watch_and_the_next_is_told(api):
+    with ExitStack() as open_now:
+        for _ in range(32):
+            open_now.enter_context(live(api))
+        with pytest.raises(InvalidStatus) as refused, live(api):
+            pass
+    assert refused.value.response.status_code == 503
+
+
+def over_tcp(api, **options):
+    return connect(f"ws://127.0.0.1:{api.port}/api/v1/live", proxy=None, **options)
+
+
+@pytest.mark.parametrize(
+    "subprotocols", [None, ["hdbridge.v1"], ["hdbridge.v1", "bearer.wrong-token-of-old"]]
+)
+def test_over_tcp_nobody_watches_without_the_token(api, subprotocols):
+    with pytest.raises(InvalidStatus) as refused, over_tcp(api, subprotocols=subprotocols):
+        pass
+    assert refused.value.response.status_code == 401
+    assert json.loads(refused.value.response.body)["title"] == "Unauthorized"
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        {"subprotocols": ["hdbridge.v1", f"bearer.{TOKEN}"]},
+        {"additional_headers": {"Authorization": f"Bearer {TOKEN}"}},
+    ],
+)
+def test_a_browser_shows_the_token_as_a_subprotocol_which_is_not_sent_back(api, shown, caplog):
+    caplog.set_level(logging.DEBUG)
+    with over_tcp(api, origin=f"http://127.0.0.1:{api.port}", **shown) as connection:
+        assert batch(connection).cycle
+        assert connection.subprotocol in {None, "hdbridge.v1"}
+        assert TOKEN not in str(connection.response.headers)
+    server = [each for each in caplog.records if not each.name.startswith("websockets.client")]
+    assert TOKEN not in "\n".join(f"{each.getMessage()} {each.args}" for each in server)
+
+
+def test_a_page_from_elsewhere_does_not_watch(api):
+    shown = {"Authorization": f"Bearer {TOKEN}"}
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        over_tcp(api, origin="https://evil.example", additional_headers=shown),
+    ):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+@pytest.fixture
+def lease(api):
+    """Held, with the first axis enabled."""
+    token = api.bridge.lease.take("stream")
+    api.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
+    return token
+
+
+def begin(connection, lease) -> None:
+    connection.send(json.dumps({"lease": lease, "timeout_s": 0.2}))
+
+
+def points(*positions_deg: float, end: bool = False) -> str:
+    return messages.StreamPoints(
+        points=[
+            messages.StreamPoint(time_s=0.01 * number, position_deg=each, velocity_deg_s=0.0)
+            for number, each in enumerate(positions_deg)
+        ],
+        end=end,
+    ).model_dump_json()
+
+
+def test_points_of_a_stream_are_taken_and_answered(api, lease):
+    with stream(api) as connection:
+        begin(connection, lease)
+        assert told(connection).accepted == 0
+        connection.send(points(0.0, 0.1, 0.2))
+        assert told(connection).accepted == 3
+        connection.send(points(0.3, end=True))
+        assert told(connection).accepted == 1
+        with pytest.raises(ConnectionClosed) as closed:
+            connection.recv(timeout=30)
+    assert closed.value.rcvd.code == 1000
+    (given,) = api.bridge.streams
+    assert [each.position_deg for each in given.points] == [0.0, 0.1, 0.2, 0.3]
+    assert given.ended
+    assert api.bridge.moved == [("joint-1", "stream", 0.2)]
+
+
+@pytest.mark.parametrize(
+    "first",
+    ['{"lease": "mZ3s"}', '{"lease": ""}', "{}", "{", '{"lease": "mZ3s", "timeout_s": 60}', '{"points": []}'],
+)
+def test_nobody_streams_without_the_lease(api, lease, first):
+    with stream(api) as connection:
+        connection.send(first)
+        answer = told(connection)
+        assert answer.accepted == 0
+        assert answer.detail
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=30)
+    assert api.bridge.streams == []
+    assert api.bridge.moved == []
+
+
+def test_an_axis_that_is_not_enabled_or_not_there_is_told(api, lease):
+    for axis, words in (("joint-2", "enable it first"), ("joint-9", "joint-1, joint-2")):
+        with stream(api, axis) as connection:
+            begin(connection, lease)
+            assert words in told(connection).detail
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        points(181.0),
+        '{"points": [{"time_s": 0, "position_deg": NaN, "velocity_deg_s": 0}]}',
+        '{"points": [{"time_s": -1, "position_deg": 0, "velocity_deg_s": 0}]}',
+        '{"points": 3}',
+    ],
+)
+def test_a_wrong_point_ends_the_stream_and_says_why(api, lease, wrong):
+    with stream(api) as connection:
+        begin(connection, lease)
+        told(connection)
+        connection.send(wrong)
+        assert told(connection).detail
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=30)
+    (given,) = api.bridge.streams
+    until(lambda: given.ended)
+    assert given.points == []
+
+
+def test_the_lease_that_another_client_took_ends_the_stream(api, lease):
+    with stream(api) as connection:
+        begin(connection, lease)
+        told(connection)
+        api.bridge.lease.take("another", force=True)
+        connection.send(points(0.0))
+        assert "another" in told(connection).detail
+
+
+def test_a_streaming_client_that_dies_ends_its_stream(api, lease):
+    with stream(api) as connection:
+        begin(connection, lease)
+        told(connection)
+        connection.socket.shutdown(socket.SHUT_RDWR)
+        (given,) = api.bridge.streams
+        until(lambda: given.ended)

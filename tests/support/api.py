@@ -1,0 +1,61 @@
+"""The API as clients meet it: served by uvicorn in a thread, over a Unix socket and TCP."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+from hdbridge.daemon.api.policy import Policy
+from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
+from support.fake_bridge import FakeBridge
+
+TOKEN = "a-token-that-nobody-guesses"
+
+
+@dataclass(frozen=True)
+class Served:
+    """Where the API is."""
+
+    bridge: FakeBridge
+    socket: Path
+    port: int
+    server: ApiServer
+
+    def over_socket(self, **headers: str) -> httpx.Client:
+        transport = httpx.HTTPTransport(uds=str(self.socket))
+        return httpx.Client(transport=transport, base_url="http://hdbridge/api/v1", headers=headers)
+
+    def over_tcp(self, token: str | None = TOKEN, **headers: str) -> httpx.Client:
+        if token is not None:
+            headers["Authorization"] = f"Bearer {token}"
+        return httpx.Client(base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=headers, trust_env=False)
+
+
+@contextmanager
+def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
+    """Serve a machine until the end of the block."""
+    tcp = tcp_socket("127.0.0.1", 0)
+    port = tcp.getsockname()[1]
+    path = folder / "cell.sock"
+    server = ApiServer(bridge, [Listener(unix_socket(path), Policy()), Listener(tcp, Policy(token=TOKEN))])
+    thread = threading.Thread(target=lambda: asyncio.run(server.run()), daemon=True)
+    thread.start()
+    try:
+        until = time.monotonic() + 60
+        while not server.started:
+            assert thread.is_alive(), "the server has ended"
+            assert time.monotonic() < until, "the server has not begun"
+            time.sleep(0.005)
+        yield Served(bridge, path, port, server)
+    finally:
+        server.stop()
+        thread.join(30)
+        assert not thread.is_alive(), "the server has not ended"

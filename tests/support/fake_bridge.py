@@ -1,0 +1,307 @@
+"""A machine without drives behind the API: it keeps what was asked of it, and holds nothing to be moved.
+
+The lease is the real one, so who may move is decided as in the daemon; targets are held to the axis's limits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from hdbridge.client import messages
+from hdbridge.daemon.memory import sample_dtype
+from hdbridge.daemon.service.interface import Batch, StreamPoint, WayPoint
+from hdbridge.daemon.service.lease import Lease
+from hdbridge.drive.objects import IntegerType
+from hdbridge.drive.values import Object, Value
+from hdbridge.errors import InputError, RefusedError
+from hdbridge.evaluation.stepping import Scheme
+
+BEGAN = datetime(2025, 1, 31, 12, 0, tzinfo=UTC)
+LIMITS = messages.Limits(
+    position_min_deg=-180, position_max_deg=180, velocity_deg_s=60, acceleration_deg_s2=300, jerk_deg_s3=3000
+)
+STATUSWORD = Object(0x6041, 0, "Statusword", 6, IntegerType("uint16"))
+
+
+class FakeAxis:
+    """One axis that is wherever it was sent to."""
+
+    def __init__(self, bridge: FakeBridge, name: str) -> None:
+        self._bridge = bridge
+        self.name = name
+        self.at = messages.ControlState.DISABLED
+        self.target_deg = 0.0
+        self.scheme = messages.Scheme.NONE
+        self.model: messages.ModelInUse | None = None
+        self.queued: list[WayPoint] = []
+        self.moving_s = 0.0
+        """Time that a move takes."""
+
+    def state(self) -> messages.AxisState:
+        fault = None
+        if self.at is messages.ControlState.QUICK_STOPPED:
+            fault = messages.Fault(name="LOST_TPDO", text="a TPDO is missing", hint="check the cable")
+        on = self.at is messages.ControlState.ENABLED
+        return messages.AxisState(
+            name=self.name, profile=f"profiles/{self.name}", node_id=1, ratio=50.0, state=self.at,
+            power=messages.PowerState.OPERATION_ENABLED if on else messages.PowerState.SWITCH_ON_DISABLED,
+            mode=messages.MotionMode.HOLD, at_rest=True, load_target_deg=self.target_deg,
+            velocity_deg_s=0.0, motor_position_deg=50 * self.target_deg,
+            load_position_deg=self.target_deg + 1 / 3600, error_arcsec=1.0, scheme=self.scheme,
+            compensating=self.scheme is not messages.Scheme.NONE, memory_known=True, limits=LIMITS,
+            fault=fault, model=self.model, load_loop=messages.LoadLoopState(configured=True),
+            adaptation=messages.AdaptationState(), queued=len(self.queued),
+        )  # fmt: skip
+
+    def _moved(self, holder: str, what: str, *given: Any) -> None:
+        self._bridge.lease.check(holder)
+        self._bridge.moved.append((self.name, what, *given))
+
+    def _enabled(self) -> None:
+        if self.at is not messages.ControlState.ENABLED:
+            raise RefusedError(f"axis '{self.name}' is {self.at.value}; enable it first")
+
+    def _within(self, target_deg: float) -> None:
+        if not -180 <= target_deg <= 180:
+            raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
+
+    async def enable(self, holder: str) -> None:
+        self._moved(holder, "enable")
+        self.at = messages.ControlState.ENABLED
+
+    async def disable(self, holder: str) -> None:
+        self._moved(holder, "disable")
+        self.at = messages.ControlState.DISABLED
+
+    async def quick_stop(self) -> None:
+        self._bridge.stopped.append((self.name, "quick-stop"))
+        self.at = messages.ControlState.QUICK_STOPPED
+
+    async def stop(self) -> None:
+        self._bridge.stopped.append((self.name, "stop"))
+
+    async def reset(self, holder: str) -> None:
+        self._moved(holder, "reset")
+        self.at = messages.ControlState.DISABLED
+
+    async def home(self, holder: str, method: int, *given: Any, **more: Any) -> float:
+        self._moved(holder, "home", method)
+        return 0.0
+
+    async def move(
+        self,
+        holder: str,
+        target_deg: float,
+        velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+        wait: bool = True,
+    ) -> None:
+        self._bridge.lease.check(holder)
+        self._enabled()
+        self._within(target_deg)
+        self._moved(holder, "move", target_deg, velocity_deg_s)
+        if wait:
+            await asyncio.sleep(self.moving_s)
+        self.target_deg = target_deg
+
+    async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
+        self._bridge.lease.check(holder)
+        self._enabled()
+        self._moved(holder, "jog", velocity_deg_s, timeout_s)
+
+    async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
+        self._bridge.lease.check(holder)
+        self._enabled()
+        for each in points:
+            self._within(each.target_deg)
+        self._moved(holder, "queue", len(points))
+        self.queued += points
+        return len(self.queued)
+
+    async def clear_queue(self, holder: str) -> int:
+        self._moved(holder, "clear queue")
+        forgotten = len(self.queued)
+        self.queued.clear()
+        return forgotten
+
+    async def stream(self, holder: str, timeout_s: float = 0.5) -> FakeStream:
+        self._bridge.lease.check(holder)
+        self._enabled()
+        self._moved(holder, "stream", timeout_s)
+        return FakeStream(self)
+
+    async def compensate(self, holder: str, scheme: Scheme) -> None:
+        self._moved(holder, "compensate", scheme.value)
+        self.scheme = messages.Scheme(scheme.value)
+
+    async def activate_model(self, holder: str, version: int | str) -> None:
+        self._moved(holder, "model", version)
+        self.model = messages.ModelInUse(version=4, file="history/0004.yaml", date=BEGAN, age_s=3600.0)
+
+    async def sdo_read(self, object_: str) -> tuple[Object, Value]:
+        if object_ not in {"6041h", "Statusword"}:
+            raise InputError(f"{object_}: no such object in the EDS; expected a number or a name")
+        return STATUSWORD, 0x1237
+
+    async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
+        self._bridge.lease.check(holder)
+        found, _ = await self.sdo_read(object_)
+        self._moved(holder, "write", object_, value)
+        return found
+
+    async def job(
+        self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
+    ) -> messages.Job:
+        self._moved(holder, "job", kind.value, dict(options or {}))
+        job = messages.Job(
+            id=f"{kind.value}-{len(self._bridge.ran) + 1}", kind=kind, axis=self.name,
+            state=messages.JobState.RUNNING, started=BEGAN,
+        )  # fmt: skip
+        self._bridge.ran.append(job)
+        return job
+
+
+class FakeStream:
+    """Keeps what it is given; refuses a point that leaves the limits."""
+
+    def __init__(self, axis: FakeAxis) -> None:
+        self._axis = axis
+        self.points: list[StreamPoint] = []
+        self.ended = False
+        axis._bridge.streams.append(self)
+
+    async def __aenter__(self) -> FakeStream:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        self.ended = True
+
+    async def put(self, points: Sequence[StreamPoint]) -> None:
+        for each in points:
+            self._axis._within(each.position_deg)
+            self.points.append(each)
+
+    async def end(self) -> None:
+        self._axis.target_deg = self.points[-1].position_deg
+
+    @property
+    def buffered_s(self) -> float:
+        return 0.0
+
+
+class FakeBridge:
+    """A machine of some axes. ``moved`` is everything that needed the lease, ``stopped`` what did not."""
+
+    def __init__(self, *names: str, lease_s: float = 10.0) -> None:
+        self.now_s: float | None = None
+        """The lease's clock, where a test holds it; else the machine's."""
+        self.lease = Lease(lease_s, lambda: time.monotonic() if self.now_s is None else self.now_s)
+        self.axes = {name: FakeAxis(self, name) for name in names or ("joint-1", "joint-2")}
+        self.moved: list[tuple[Any, ...]] = []
+        self.stopped: list[tuple[str, str]] = []
+        self.streams: list[FakeStream] = []
+        self.ran: list[messages.Job] = []
+        self.told: list[messages.Event] = []
+        self.alive = True
+        self.batch_s = 0.005
+        self.rows = 5
+        self.sent_cycles = 0
+        """Cycles that were offered to subscribers."""
+
+    def state(self) -> messages.MachineState:
+        holder = self.lease.holder
+        return messages.MachineState(
+            name="cell", version="0.1.0", started=BEGAN, simulated=True,
+            axes=[each.state() for each in self.axes.values()],
+            bus=messages.BusState(interface="virtual", channel="hdbridge", up=True, load=0.31),
+            cycle=messages.CycleState(period_s=0.004, cycle=1234, alive=self.alive, late_us=12.0),
+            lease=messages.LeaseState(
+                held=holder is not None, client=holder and holder.client, timeout_s=self.lease.timeout_s
+            ),
+            recorder=messages.RecorderState(on=False), jobs=self.ran,
+        )  # fmt: skip
+
+    def events(self, since: int = 0) -> messages.Events:
+        newest = self.told[-1].sequence if self.told else 0
+        return messages.Events(events=[each for each in self.told if each.sequence > since], newest=newest)
+
+    def jobs(self) -> list[messages.Job]:
+        return self.ran
+
+    async def quick_stop(self) -> None:
+        for each in self.axes.values():
+            await each.quick_stop()
+
+    async def coordinated(
+        self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
+    ) -> None:
+        self.lease.check(holder)
+        for name, target_deg in moves.items():
+            self.axes[name]._enabled()
+            self.axes[name]._within(target_deg)
+        for name, target_deg in moves.items():
+            await self.axes[name].move(holder, target_deg, wait=wait)
+
+    async def subscribe(self, most: int = 512) -> AsyncIterator[Batch]:
+        """Batches for ever; of what was not fetched in time the newest ``most`` rows, the rest is lost."""
+        queue: asyncio.Queue[None] = asyncio.Queue(1)
+        waiting: list[int] = []
+        cycle = lost = 0
+
+        async def produce() -> None:
+            nonlocal cycle, lost
+            while True:
+                waiting.extend(range(cycle + 1, cycle + self.rows + 1))
+                cycle += self.rows
+                self.sent_cycles = max(cycle, self.sent_cycles)
+                lost += max(0, len(waiting) - most)
+                del waiting[:-most]
+                if queue.empty():
+                    queue.put_nowait(None)
+                await asyncio.sleep(self.batch_s)
+
+        producing = asyncio.ensure_future(produce())
+        try:
+            while True:
+                await queue.get()
+                batch = Batch(self.samples(waiting), (), lost)
+                waiting.clear()
+                lost = 0
+                yield batch
+        finally:
+            producing.cancel()
+
+    def samples(self, cycles: Sequence[int]) -> Any:
+        found = np.zeros(len(cycles), sample_dtype(len(self.axes)))
+        found["cycle"] = cycles
+        found["time_ns"] = found["cycle"] * 4_000_000
+        found["axes"]["load_position_deg"] = 1 / 3600
+        found["axes"]["reading0"] = np.nan
+        found["axes"]["state"] = 3
+        return found
+
+    async def cancel_job(self, holder: str, job_id: str) -> None:
+        self.lease.check(holder)
+        cancelled = {"state": messages.JobState.CANCELLED}
+        self.ran = [each.model_copy(update=cancelled) if each.id == job_id else each for each in self.ran]
+
+    def mark(self, text: str) -> None:
+        number = len(self.told) + 1
+        self.told.append(
+            messages.Event(sequence=number, kind=messages.EventKind.NOTE, date=BEGAN, cycle=1234, text=text)
+        )
+
+    async def load_loop(self, holder: str, axis: str, on: bool) -> None:
+        self.axes[axis]._moved(holder, "load loop", on)
+
+    async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
+        self.axes[axis]._moved(holder, "adapt", mode.value)
+
+    async def adaptation_back(self, holder: str, axis: str) -> None:
+        self.axes[axis]._moved(holder, "adaptation back")
