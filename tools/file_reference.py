@@ -1,4 +1,5 @@
-"""Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files.
+"""Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
+and that of faults (docs/daemon.md) from the table that judges them.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   say whether they are up to date (exit status 1 if not)
@@ -19,6 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import MachineFile
+from hdbridge.drive.supervision import TABLE, Reaction
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.model.file import ModelFile
 from hdbridge.model.store import LogFile
@@ -34,10 +36,16 @@ from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = (DOCS / "files.md", DOCS / "calibration.md")
+PAGES = (DOCS / "files.md", DOCS / "calibration.md", DOCS / "daemon.md")
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
+REACTION_WORDS = {
+    Reaction.GO: "go on, count",
+    Reaction.FREEZE: "freeze",
+    Reaction.QUICK_STOP: "quick stop",
+    Reaction.LATCH: "latch",
+}
 ENTRIES: tuple[type[BaseModel], ...] = (
     StandstillEntry,
     SweepEntry,
@@ -75,6 +83,15 @@ def procedure_table() -> str:
     return "\n".join(lines) + "\n"
 
 
+def fault_table() -> str:
+    """What each fault leads to, and what a person does about it."""
+    lines = ["| fault | at once | again in the next cycles | what to do |", "|---|---|---|---|"]
+    for row in TABLE:
+        later = REACTION_WORDS[row.then] if row.then is not row.first else ""
+        lines.append(f"| {row.fault.value} | {REACTION_WORDS[row.first]} | {later} | {row.hint} |")
+    return "\n".join(lines) + "\n"
+
+
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
     "machine": lambda: key_table(MachineFile),
@@ -82,6 +99,7 @@ BLOCKS: Mapping[str, Any] = {
     "columns": column_table,
     "recording": lambda: key_table(RecordingFile),
     "history": lambda: key_table(LogFile),
+    "faults": fault_table,
     "plan": lambda: key_table(Plan),
     "procedures": procedure_table,
 }

@@ -51,6 +51,7 @@ PANELS: Final = {
         "model": "The models of an axis: the active one, one that waits, and every one that there was.",
     },
     "Day and night": {
+        "run": "Hold the drives of a machine, day and night, and take load angles from clients.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
         "start of the computer.",
     },

@@ -6,6 +6,7 @@ it together with the profiles that it names.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -20,6 +21,7 @@ from hdbridge.files.yamlfile import wrong
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 """What names a machine; its socket and its service are called so, too."""
+_TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 
 
 class _Part(BaseModel):
@@ -62,6 +64,9 @@ class TcpSettings(_Part):
 
     host: str = Field("127.0.0.1", min_length=1, description="address to listen at")
     port: int = Field(8402, ge=1, le=65_535, description="port to listen at")
+    names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
+        (), description="names by which clients reach this machine; addresses and localhost need none"
+    )
     token_file: str = Field(
         min_length=1,
         description="file with the token that clients show, of mode 600, relative to this file",
@@ -142,8 +147,9 @@ def token_complaint(path: Path) -> str | None:
         return f"{path}: cannot be read: {reason}; expected a file with the token in one line"
     if mode & 0o077:
         return f"{path} can be read by others (mode {mode & 0o777:o}); expected mode 600: chmod 600 {path}"
-    if len(content) < 16 or not content.isprintable() or " " in content:
+    if not _TOKEN.fullmatch(content):
         return (
-            f"{path}: found {len(content)} characters; expected a token of 16 or more: openssl rand -hex 16"
+            f"{path}: expected a token of 16 to 200 letters, digits, '-', '.', '_' or '~'; make one: "
+            f"openssl rand -hex 16 > {path}"
         )
     return None

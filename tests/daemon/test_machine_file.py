@@ -173,7 +173,7 @@ def test_the_token_is_nobody_elses_to_read(folder: Path) -> None:
     assert tcp is not None
     assert (tcp.host, tcp.port) == ("127.0.0.1", 8402)
     token.write_text("short", encoding="ascii")
-    assert "expected a token of 16 or more" in refused(folder, text)
+    assert "expected a token of 16 to 200" in refused(folder, text)
 
 
 def test_what_a_person_may_call_a_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

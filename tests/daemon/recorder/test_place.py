@@ -31,7 +31,7 @@ def test_never_among_the_bundled_profiles(tmp_path):
 
 def test_where_the_machine_file_says_it_counts_from_the_file(profile):
     file = profile / "machine.yaml"
-    text = f"schema: hdbridge.machine/1\nname: cell\naxes: [{{profile: {profile}}}]\nrecorder: {{folder: here}}\n"
-    file.write_text(text)
+    head = "schema: hdbridge.machine/1\nname: cell\n"
+    file.write_text(f"{head}axes: [{{profile: {profile}}}]\nrecorder: {{folder: here}}\n")
     machine = Machine.load(file)
     assert machine.recorder_folder({"STATE_DIRECTORY": "/var/lib/hdbridge"}) == profile / "here"

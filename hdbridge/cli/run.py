@@ -1,0 +1,100 @@
+"""``hdbridge run``: the daemon."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hdbridge.cli import eventlog
+from hdbridge.cli.options import (
+    ChannelOption,
+    ForceOption,
+    InterfaceOption,
+    MachineArgument,
+    SeedOption,
+    check_bus_options,
+)
+from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machine import Machine
+    from hdbridge.daemon.start import Simulation
+
+_EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
+"""What the extra ``daemon`` brings."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("run")(run)
+
+
+def run(
+    machine: MachineArgument,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Hold simulated drives in place of the bus.")
+    ] = False,
+    speed: Annotated[
+        float, typer.Option("--speed", min=0.01, max=1000.0, help="With --simulate: this fast, at most.")
+    ] = 1.0,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--truth", metavar="TRUTH.yaml", help="What the simulated axes are like, once for each in order."
+        ),
+    ] = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Hold the drives of a machine, day and night, and take load angles from clients.
+
+    It opens the bus and an API (`hdbridge ctl`, the page, `hdbridge.client`), and moves nothing by itself:
+    a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end it (exit status 0);
+    a second one stops them at the quick-stop ramp.
+
+    Exit status: 0 ended in order, 1 a process of it died again and again, 2 bad input, 3 the bus cannot be
+    opened or has another master, 7 another daemon has the API's address. A fault of a drive ends nothing: it
+    is told to clients, and latched.
+    """
+    check_bus_options(interface, channel, simulate=simulate)
+    if lacking := [name for name in _EXTRA if find_spec(name) is None]:
+        raise InputError(f"the daemon needs {', '.join(lacking)}: python -m pip install 'hdbridge[daemon]'")
+    from hdbridge.daemon.hold import hold
+    from hdbridge.daemon.logs import LogSettings
+    from hdbridge.daemon.machine import Machine
+
+    held = Machine.find(machine)
+    changes = {name: given for name, given in (("interface", interface), ("channel", channel)) if given}
+    held = held.on_bus(**changes) if changes else held
+    simulation = _simulation(held, truth or [], seed, speed) if simulate else None
+    if simulation is None:
+        _check_real(held, truth or [], speed)
+    raise typer.Exit(hold(held, simulation, force=force, log=LogSettings(*eventlog.handed_over())))
+
+
+def _simulation(machine: Machine, truths: list[Path], seed: int, speed: float) -> Simulation:
+    from hdbridge.daemon.start import Simulation
+    from hdbridge.sim.truth import Truth
+
+    if truths and len(truths) != len(machine.axes):
+        names = ", ".join(axis.name for axis in machine.axes)
+        raise InputError(f"--truth stands {len(truths)} times; expected once for each of the axes {names}")
+    paths = tuple(path.absolute() for path in truths) or tuple(axis.profile.truth for axis in machine.axes)
+    for path in paths:
+        Truth.load(path)
+    return Simulation(paths, seed, speed)
+
+
+def _check_real(machine: Machine, truths: list[Path], speed: float) -> None:
+    if truths or speed != 1.0:
+        raise InputError("--truth and --speed are for simulated axes: give --simulate with them")
+    if machine.bus.interface == "virtual":
+        raise InputError(
+            f"{machine.path}: the bus 'virtual' reaches nothing outside this process; expected the interface "
+            "of the bus (socketcan), or give --simulate, which puts simulated drives there"
+        )
