@@ -20,6 +20,7 @@ Pure: no clock, no bus.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
@@ -33,6 +34,8 @@ _STEEPEST_FALL = 0.9
 _SAFE = 0.9
 """Of that, what is used where the choice is ours."""
 _NOWHERE = Moment()
+_TURNS = 32
+"""Reversals of the issued path that are kept for a model that takes over."""
 LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
 """The channels that come from sensors of their own."""
 
@@ -70,8 +73,8 @@ class Inverse:
     """The model's inverse, coming from the state that `advance` has left."""
 
     __slots__ = (
-        "_before_deg", "_error", "_fall", "_motor_deg", "_peeked", "_rise", "_slope", "_standing",
-        "_stateful", "_timeless", "_tracker", "faded", "needs",
+        "_before_deg", "_error", "_fall", "_forward", "_known", "_motor_deg", "_peeked", "_rise", "_slope",
+        "_standing", "_stateful", "_timeless", "_tracker", "_turns", "faded", "memory_deg", "needs",
     )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
@@ -107,6 +110,37 @@ class Inverse:
         self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
         """The channels that the effects need."""
         self._timeless = not self.needs
+        self.memory_deg = self._tracker.memory_deg
+        """Motor angle that, run in one direction, makes the state independent of where it began."""
+        self._forward: bool | None = None
+        """Direction of the last motion."""
+        self._known = not self.memory_deg
+        """Whether a run that is over was longer than the memory."""
+        self._turns = deque([0.0], _TURNS)
+        """Where the path that was issued began, and where it has reversed since."""
+
+    @property
+    def error_arcsec(self) -> float:
+        """The model's error where the motor was last sent."""
+        return self._error
+
+    @property
+    def path_deg(self) -> list[float]:
+        """Where the path that was issued began and reversed, and where it is, motor degrees."""
+        return [*self._turns, self._motor_deg]
+
+    @property
+    def memory_known(self) -> bool:
+        """Whether that path has run farther in one direction than the model remembers."""
+        return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
+
+    def begin(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
+        """The motor stands here, and how it came to is not known."""
+        self.advance(motor_deg, moment)
+        self._forward = None
+        self._known = not self.memory_deg
+        self._turns.clear()
+        self._turns.append(motor_deg)
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """The command is issued: move the state on; returns the model's error there, arcsec."""
@@ -123,12 +157,22 @@ class Inverse:
         self._peeked = None
         step = motor_deg - self._motor_deg
         if step:
+            forward = step > 0.0
+            if forward is not self._forward:
+                self._turn(forward)
             self._rise = (error - self._error) / step
             self._before_deg = self._motor_deg
         self._motor_deg = motor_deg
         self._error = error
         self._standing = self._timeless
         return error
+
+    def _turn(self, forward: bool) -> None:
+        """From where it stands the path goes the other way."""
+        if self._forward is not None:
+            self._known = self.memory_known
+            self._turns.append(self._motor_deg)
+        self._forward = forward
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
         """Motor angle in degrees that puts the load at ``load_deg``; the state does not change.
@@ -255,6 +299,33 @@ class Compensation:
         return self._correction
 
     @property
+    def predicted_arcsec(self) -> float:
+        """The model's error where the motor was last sent, arcsec at the load, whatever the weight."""
+        return self._inverse.error_arcsec
+
+    @property
+    def memory_known(self) -> bool:
+        """Whether the state is that of the issued path alone: since `reset` it has run, in one direction,
+        farther than the model remembers. True for a model that remembers no path.
+        """
+        return self._inverse.memory_known
+
+    @property
+    def maximum_arcsec(self) -> float:
+        """Cap on the correction."""
+        return self._maximum
+
+    @property
+    def step_arcsec(self) -> float:
+        """By how much the correction may change in one cycle."""
+        return self._slew_step
+
+    @property
+    def ramp_step(self) -> float:
+        """By how much a weight changes in one cycle."""
+        return self._weight_step
+
+    @property
     def weight(self) -> float:
         """The ramp's weight: 0 off, 1 fully on."""
         return self._weight
@@ -277,18 +348,11 @@ class Compensation:
         self._weight = self._correction = 0.0
         for each in self._inverse.faded:
             each.weight = float(each.needs <= self._known)
-        self._inverse.advance(motor_deg, moment)
+        self._inverse.begin(motor_deg, moment)
 
     def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Motor target in degrees for this cycle's load target; the model's state moves on with it."""
-        weight = self._weight
-        if weight != self._target:
-            step = self._weight_step
-            weight += min(max(self._target - weight, -step), step)
-            self._weight = weight
-        if self._fading:
-            self._fade()
-        motor = self._inverse.solve(load_deg, moment, weight)
+        motor = self._solved(load_deg, moment)
         wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
         slew, last, most = self._slew_step, self._correction, self._maximum
         if not (last - slew <= wanted <= last + slew and -most <= wanted <= most):
@@ -299,6 +363,43 @@ class Compensation:
         self._correction = wanted
         self._inverse.advance(motor, moment)
         return motor
+
+    def _solved(self, load_deg: float, moment: Moment) -> float:
+        """One cycle's ramps, and the motor angle that is wanted then."""
+        weight = self._weight
+        if weight != self._target:
+            step = self._weight_step
+            weight += min(max(self._target - weight, -step), step)
+            self._weight = weight
+        if self._fading:
+            self._fade()
+        return self._inverse.solve(load_deg, moment, weight)
+
+    def wanted(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        """The correction that `command` would go towards, arcsec, within the cap; its ramps move on.
+
+        For two that share one motor (`switchover.Correction`): what becomes of it is told by `issued`.
+        """
+        most = self._maximum
+        wanted = ARCSEC_PER_DEG * (load_deg - self._solved(load_deg, moment) / self._ratio)
+        return min(max(wanted, -most), most)
+
+    def issued(self, motor_deg: float, correction_arcsec: float, moment: Moment = _NOWHERE) -> None:
+        """This was sent to the motor, with this correction in it: the model's state moves on."""
+        self._correction = correction_arcsec
+        self._inverse.advance(motor_deg, moment)
+
+    def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
+        """Begin where another one is, on the path that it has issued: for one that was just made.
+
+        What has memory of the path is in the state that this path gives it, as far back as that is kept.
+        """
+        self._known, self._fading = other._known, bool(self._inverse.faded)
+        begin, *rest = other._inverse.path_deg
+        self.reset(begin, moment)
+        for motor_deg in rest:
+            self._inverse.advance(motor_deg, moment)
+        self._weight, self._target, self._correction = other._weight, other._target, other._correction
 
     def _fade(self) -> None:
         """One cycle nearer to what is known of the channels."""

@@ -138,6 +138,11 @@ class _Tracker(Tracker):
         self._friction = 0.01 * effect.friction_percent_per_k
         self._warmth = WarmthState(effect)
 
+    @property
+    def memory_deg(self) -> float:
+        """The loop's."""
+        return self._loop.memory_deg
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         friction = self._friction * self._loop.peek(motor_deg, moment)
         return self._warmth.at(moment) * (self._ripple_at(motor_deg, moment) + friction)

@@ -103,6 +103,11 @@ class _Tracker(Tracker):
         self._height = height
         self._stop = play
 
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle that crosses the gap."""
+        return self._stop.memory_deg
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         return self._height * self._stop.at(motor_deg)
 

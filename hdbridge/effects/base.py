@@ -233,6 +233,14 @@ class Tracker(ABC):
 
     __slots__ = ()
 
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle that, run in one direction, makes the state independent of where it began.
+
+        0 where the path is not remembered at all. Memory of time (creep, warmth) does not count.
+        """
+        return 0.0
+
     @abstractmethod
     def peek(self, motor_deg: float, moment: Moment) -> float:
         """Error in arcsec at the load if the motor moved straight to ``motor_deg``; changes nothing."""

@@ -161,6 +161,11 @@ class _HysteresisTracker(Tracker):
         self._branch_angle = 0.0
         self._branch_value = self._value
 
+    @property
+    def memory_deg(self) -> float:
+        """From side to side it takes the width."""
+        return self._width
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         return self._offset * self._at(motor_deg)
 

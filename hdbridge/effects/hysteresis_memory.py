@@ -227,6 +227,11 @@ class _MemoryTracker(Tracker):
         self._angle: float | None = None
         self._memory = _Memory(width, exponent, 0.0, start.value, steepest)
 
+    @property
+    def memory_deg(self) -> float:
+        """From side to side it takes the width; then all inner loops are forgotten."""
+        return self._width
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         last = self._angle
         if last is None or motor_deg == last:

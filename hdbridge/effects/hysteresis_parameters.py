@@ -110,6 +110,11 @@ class _Tracker(Tracker):
         self._new = new
         self._old = old
 
+    @property
+    def memory_deg(self) -> float:
+        """The longer of the two loops'."""
+        return max(self._new.memory_deg, self._old.memory_deg)
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         return self._new.peek(motor_deg, moment) - self._old.peek(motor_deg, moment)
 

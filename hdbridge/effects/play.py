@@ -40,6 +40,11 @@ class Stop:
         self._value = float(start.value)
         self._angle: float | None = None
 
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle from stop to stop."""
+        return 2.0 / self._gain
+
     def at(self, motor_deg: float) -> float:
         """Value after going straight to ``motor_deg``; changes nothing."""
         if self._angle is None:

@@ -101,6 +101,11 @@ class _Tracker(Tracker):
         self._reference = effect.reference_deg_s
         self._limit = effect.limit_deg_s
 
+    @property
+    def memory_deg(self) -> float:
+        """The loop's."""
+        return self._loop.memory_deg
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         return self._rate(moment) * self._loop.peek(motor_deg, moment)
 

@@ -136,6 +136,11 @@ class _Tracker(Tracker):
         self._distance = 0.0
         self._angle: float | None = None
 
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle of a full crossing at the limit's height; the distance run is taken from the file."""
+        return max(2.0 / self._gain, 2.0 * abs(self._half(self._limit)) / self._fall)
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         _, half, value = self._at(motor_deg)
         return half * value

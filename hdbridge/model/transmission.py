@@ -132,6 +132,11 @@ class ModelTracker(Tracker):
     def __init__(self, trackers: list[Tracker]) -> None:
         self._trackers = trackers
 
+    @property
+    def memory_deg(self) -> float:
+        """The longest of its effects'."""
+        return max((each.memory_deg for each in self._trackers), default=0.0)
+
     def peek(self, motor_deg: float, moment: Moment) -> float:
         """Sum of the effects at ``motor_deg``, arcsec; changes nothing."""
         total = 0.0

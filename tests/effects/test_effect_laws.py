@@ -170,6 +170,36 @@ def test_memory_of_a_tracker_does_not_grow(name):
     assert sizes[-1] <= max(sizes[:600])
 
 
+@law
+@given(
+    data=st.data(),
+    excursions=st.lists(st.floats(-60, 60), max_size=4),
+    steps=st.lists(st.floats(-20, 20), max_size=12),
+    sign=st.sampled_from([-1.0, 1.0]),
+    gentle=st.booleans(),
+)
+def test_after_its_memory_a_tracker_has_forgotten_where_it_began(name, data, excursions, steps, sign, gentle):
+    """Two of different pasts agree once both have run so far in one direction."""
+    effect = data.draw(EXAMPLES[name])
+    trackers = [
+        (effect.gentle_tracker(start, 30.0) if gentle else None) or effect.tracker(start) for start in Start
+    ]
+    now = Moment(0.0, direction=1)
+    for number, tracker in enumerate(trackers):
+        tracker.advance(0.0, now)
+        if number and name != "wear":  # that one counts the distance
+            for angle in excursions:
+                tracker.advance(number * angle, now)
+            tracker.advance(0.0, now)
+    angle = 0.0
+    run = trackers[0].memory_deg * (1.0 + 1e-9)
+    for number, step in enumerate([sign * run, *steps]):
+        angle += step
+        now = Moment(0.01 * number, motor_speed_deg_s=100.0 * step, direction=1)
+        first, *others = (tracker.advance(angle, now) for tracker in trackers)
+        assert others == pytest.approx([first] * len(others), rel=1e-6, abs=1e-6)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_candidate_is_within_physical_bounds_and_fits_the_gear(name):
     effect = CATALOGUE[name].candidate(80.0, BASE)

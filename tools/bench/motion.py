@@ -1,23 +1,32 @@
-"""What a set-point costs, and a correction: medians in microseconds, and ratios to a plain python loop.
+"""What a set-point and a correction cost: medians in microseconds, and ratios to a plain Python loop.
 
     python tools/bench/motion.py [--json FILE]
 
-`unit` is a loop of 100 float multiplications on this machine; the ratios to it are what compares between
-machines.
+The unit is a loop of 100 float multiplications on this machine: the ratios to it compare between machines.
+In the corrections' figures the axis moves; `changing` is a cycle in which two models are at work.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import pickle
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.control.loadloop import LoadLoop
+from hdbridge.control.switchover import Correction
+from hdbridge.effects import Moment
+from hdbridge.model import TransmissionModel
 from hdbridge.motion import SetPoint
 from hdbridge.procedures.moves import MotionLimits
 
+PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 LIMITS = MotionLimits(-3600.0, 3600.0, 60.0, 200.0, 4000.0)
 PERIOD_S = 0.004
 
@@ -81,16 +90,65 @@ def set_points() -> dict[str, float]:
     }
 
 
+def corrections() -> dict[str, float]:
+    """What a cycle of the compensation costs, alone and behind a `Correction`, and the slow loop's."""
+    model = TransmissionModel.load(PROFILES / "article" / "model.yaml")
+    moment = Moment()
+    # So slow a ramp that the change lasts as long as it is measured.
+    slow = CompensationLimits(ramp_s=1e6)
+
+    def made() -> Compensation:
+        compensation = Compensation(model, slow, PERIOD_S)
+        compensation.reset(0.0)
+        return compensation
+
+    changing = Correction(made())
+    changing.change(made())
+    load = [0.0, 0.0, 0.0]
+    alone, behind = made(), Correction(made())
+
+    def cycle(place: int, its: Compensation | Correction) -> Callable[[], object]:
+        def run() -> None:
+            load[place] += 1e-3
+            its.command(load[place], moment)
+
+        return run
+
+    loop = LoadLoop(1.0, 40.0, 100.0, PERIOD_S)
+    # In turns, so that a machine that slows down does so for both.
+    alone_us, behind_us = [], []
+    for _ in range(9):
+        alone_us.append(median_us(cycle(0, alone), count=1000))
+        behind_us.append(median_us(cycle(1, behind), count=1000))
+    return {
+        "compensation, alone": statistics.median(alone_us),
+        "correction, unchanging": statistics.median(behind_us),
+        "correction, changing": median_us(cycle(2, changing)),
+        "load loop, at rest": median_us(lambda: loop.step(1.0, False)),
+    }
+
+
+def pickles() -> dict[str, float]:
+    """What the loop pays to take a compensation that the service has made, per bundled model."""
+    taken = {}
+    for path in sorted(PROFILES.rglob("model.yaml")):
+        axis = AxisConfig.load(path.with_name("axis.yaml"))
+        sent = pickle.dumps(compensation_for(axis, TransmissionModel.load(path)), pickle.HIGHEST_PROTOCOL)
+        name = f"pickle.loads, {path.parent.name} ({len(sent)} bytes)"
+        taken[name] = median_us(lambda sent=sent: pickle.loads(sent), count=500)
+    return taken
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     yardstick = median_us(unit)
-    figures = set_points()
-    print(f"{'':32} {'us':>8} {'units':>8}   (unit: {yardstick:.2f} us)")
+    figures = {**set_points(), **corrections(), **pickles()}
+    print(f"{'':40} {'us':>8} {'units':>8}   (unit: {yardstick:.2f} us)")
     for name, taken in figures.items():
-        print(f"{name:32} {taken:8.2f} {taken / yardstick:8.2f}")
+        print(f"{name:40} {taken:8.2f} {taken / yardstick:8.2f}")
     if given.json:
         given.json.write_text(json.dumps({"unit_us": yardstick, "us": figures}, indent=2) + "\n")
 

@@ -1,0 +1,169 @@
+"""Another model in motion, without a step: what the control cycle asks in place of one `Compensation`.
+
+While a change is under way both models follow the angle that is issued, and the correction goes from what
+the old one wants to what the new one wants: by a weight that rises over the ramp's time, within the slew
+limit and the caps. The new one begins on the path that was issued last, so that its hysteresis is in the
+state which that path gives it.
+
+A scheme (none, synchronous, hysteresis, both) is a model with other effects: switching it is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from hdbridge.control.compensation import Compensation
+from hdbridge.effects import Channel, Moment
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.units import ARCSEC_PER_DEG
+
+_NOWHERE = Moment()
+
+
+class Correction:
+    """A compensation that can be exchanged for another; it has the same face.
+
+    ``command`` and ``hold`` are those of the compensation itself while nothing is changing, so they cost
+    nothing more. They are others during a change: look them up in each cycle.
+    """
+
+    __slots__ = ("_limited", "_new", "_now", "_weight", "command", "hold")
+
+    command: Callable[[float, Moment], float]
+    """`Compensation.command`: motor target in degrees for this cycle's load target."""
+    hold: Callable[[float, Moment], float]
+    """`Compensation.hold`: the same with the correction frozen; a change waits."""
+
+    def __init__(self, first: Compensation) -> None:
+        self._now = first
+        self._new: Compensation | None = None
+        self._weight = 0.0
+        """The new one's, during a change."""
+        self._limited = 0
+        self.command, self.hold = first.command, first.hold
+
+    @property
+    def model(self) -> TransmissionModel:
+        """The model that is at work, or is about to be."""
+        return (self._new or self._now).model
+
+    @property
+    def changing(self) -> bool:
+        """Whether a change is under way."""
+        return self._new is not None
+
+    @property
+    def needs(self) -> frozenset[Channel]:
+        """The channels that it needs a `Moment` with; more during a change."""
+        return self._now.needs if self._new is None else self._now.needs | self._new.needs
+
+    @property
+    def correction_arcsec(self) -> float:
+        """The correction at work, arcsec at the load."""
+        return self._now.correction_arcsec
+
+    @property
+    def predicted_arcsec(self) -> float:
+        """The model's error where the motor was last sent, arcsec, whatever the weight.
+
+        In a change it goes over from the one's to the other's.
+        """
+        now = self._now.predicted_arcsec
+        return now if self._new is None else now + self._weight * (self._new.predicted_arcsec - now)
+
+    @property
+    def memory_known(self) -> bool:
+        """Whether the state is that of the issued path alone (`Compensation.memory_known`)."""
+        return self._now.memory_known and (self._new is None or self._new.memory_known)
+
+    @property
+    def weight(self) -> float:
+        """The ramp's weight: 0 off, 1 fully on."""
+        return self._now.weight
+
+    @property
+    def limited(self) -> int:
+        """Cycles in which a cap or the slew limit was at work."""
+        return self._limited + self._now.limited
+
+    def change(self, new: Compensation) -> None:
+        """From the next command on go over to another one, just made; `changing` says until when.
+
+        InputError, and nothing changes: for another gear ratio, and while a change is under way.
+        """
+        if self._new is not None:
+            raise InputError("a change of the model is under way: wait until it is done")
+        if not math.isclose(new.model.ratio, self._now.model.ratio, rel_tol=1e-9):
+            raise InputError(
+                f"a model of a gear with ratio {new.model.ratio:g}; this axis runs with "
+                f"{self._now.model.ratio:g}: use a model of this gear"
+            )
+        self._new = new
+        self._weight = 0.0
+        self.command = self._first_blended
+
+    def know(self, channels: frozenset[Channel]) -> None:
+        """`Compensation.know`."""
+        for each in self._all():
+            each.know(channels)
+
+    def engage(self) -> None:
+        """Fade the correction in from the next command on."""
+        for each in self._all():
+            each.engage()
+
+    def disengage(self) -> None:
+        """Fade the correction out from the next command on."""
+        for each in self._all():
+            each.disengage()
+
+    def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
+        """The motor stands here and nothing is being corrected; a change under way is done with."""
+        if self._new is not None:
+            self._new.take_over(self._now, moment)
+            self._done(self._new)
+        self._now.reset(motor_deg, moment)
+
+    def _all(self) -> tuple[Compensation, ...]:
+        return (self._now,) if self._new is None else (self._now, self._new)
+
+    def _first_blended(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        """The first of a change: only now there is a moment to begin with."""
+        assert self._new is not None
+        self._new.take_over(self._now, moment)
+        self.command, self.hold = self._blended, self._held
+        return self._blended(load_deg, moment)
+
+    def _blended(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        old, new = self._now, self._new
+        assert new is not None
+        weight = self._weight = min(self._weight + new.ramp_step, 1.0)
+        last, slew = old.correction_arcsec, min(old.step_arcsec, new.step_arcsec)
+        before, after = old.wanted(load_deg, moment), new.wanted(load_deg, moment)
+        wanted = before + weight * (after - before)
+        correction = min(max(wanted, last - slew), last + slew)
+        if correction != wanted:
+            self._limited += 1
+        motor_deg = old.model.ratio * (load_deg - correction / ARCSEC_PER_DEG)
+        self._issue(motor_deg, correction, moment)
+        if weight == 1.0 and abs(correction) <= new.maximum_arcsec:
+            self._done(new)
+        return motor_deg
+
+    def _held(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        correction = self._now.correction_arcsec
+        motor_deg = self._now.model.ratio * (load_deg - correction / ARCSEC_PER_DEG)
+        self._issue(motor_deg, correction, moment)
+        return motor_deg
+
+    def _issue(self, motor_deg: float, correction_arcsec: float, moment: Moment) -> None:
+        for each in self._all():
+            each.issued(motor_deg, correction_arcsec, moment)
+
+    def _done(self, new: Compensation) -> None:
+        self._limited += self._now.limited
+        self._now, self._new = new, None
+        self._weight = 0.0
+        self.command, self.hold = new.command, new.hold
