@@ -4,6 +4,13 @@ const ROOT = "/api/v1";
 const TOKEN_KEY = "hdbridge.token";
 let leaseToken = null;
 
+// An address that a person is given may end in #token=...: what follows the # never leaves the browser.
+const given = /^#token=([A-Za-z0-9._~-]+)$/.exec(location.hash);
+if (given) {
+  sessionStorage.setItem(TOKEN_KEY, given[1]);
+  history.replaceState(null, "", location.pathname);
+}
+
 export class Problem extends Error {
   constructor(status, body) {
     super(body.detail || body.title || `status ${status}`);

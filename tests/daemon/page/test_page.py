@@ -1,0 +1,197 @@
+"""The live page as a person has it: in a browser, over TCP with a token."""
+
+import json
+import math
+from urllib.parse import urlsplit
+
+import pytest
+from support.api import TOKEN, served
+from support.browser import browser
+from support.fake_bridge import FakeBridge
+
+from hdbridge.client.messages import Event, EventKind
+from hdbridge.daemon.page import page_file, page_files
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    with served(FakeBridge(), tmp_path_factory.mktemp("page")) as place:
+        yield place
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with browser() as page:
+        yield page
+
+
+@pytest.fixture
+def bridge(place):
+    place.bridge.__init__()
+    return place.bridge
+
+
+@pytest.fixture
+def page(place, bridge, chromium):
+    """The page, live."""
+    chromium.complaints.clear()
+    chromium.requested.clear()
+    show(chromium, place)
+    return chromium
+
+
+def show(chromium, place, **window):
+    chromium.open("about:blank")
+    chromium.open(f"http://127.0.0.1:{place.port}/#token={TOKEN}", **window)
+    chromium.until("document.querySelector('#connection').className === 'live'")
+
+
+def asked(bridge, what):
+    return [each for each in bridge.moved if each[1] == what]
+
+
+def take_control(page):
+    page.click("#lease")
+    page.until("!document.querySelector('#controls').disabled")
+
+
+def test_the_page_shows_the_axis_live_and_loads_nothing_from_elsewhere(place, page):
+    page.until("document.querySelector('#load').innerText === '0.0003'")
+    assert page.text("#machine") == "cell"
+    assert page.text("#bus-load") == "31"
+    assert page.text("#connection").startswith("live")
+    assert (
+        page.evaluate("location.href") == f"http://127.0.0.1:{place.port}/"
+    )  # the token has left the address
+    assert {urlsplit(each).netloc for each in page.requested} == {f"127.0.0.1:{place.port}"}
+    assert not any(TOKEN in each for each in page.requested)
+    assert page.complaints == []
+
+
+def test_nothing_moves_before_control_was_taken(bridge, page):
+    assert page.evaluate("document.querySelector('#controls').disabled")
+    page.press("ArrowRight", hold_s=0.2)
+    for button in ("#enable", "#move", "#jog-up"):
+        page.click(button)
+    assert bridge.moved == []
+    take_control(page)
+    page.click("#enable")
+    page.until("document.querySelector('#state').innerText === 'enabled'")
+    page.evaluate("document.querySelector('#move-to').value = '30.5'")
+    page.click("#move")
+    page.until("document.querySelector('#notice').hidden")
+    page.until("document.querySelector('#controls').disabled === false")
+    assert asked(bridge, "move") == [("joint-1", "move", 30.5, None)]
+    page.click("#lease")
+    page.until("document.querySelector('#controls').disabled")
+    assert bridge.lease.holder is None
+
+
+def test_a_refusal_is_told_in_the_daemons_own_words(bridge, page):
+    take_control(page)
+    page.evaluate("document.querySelector('#move-to').value = '10'")
+    page.click("#move")
+    page.until("!document.querySelector('#notice').hidden")
+    assert page.text("#notice") == "axis 'joint-1' is disabled; enable it first"
+    assert asked(bridge, "move") == []
+
+
+def test_a_jog_lasts_as_long_as_the_key_is_pressed_and_ends_in_a_stop(bridge, page):
+    take_control(page)
+    page.click("#enable")
+    page.until("document.querySelector('#state').innerText === 'enabled'")
+    page.press("ArrowLeft", hold_s=0.5)
+    page.until("true")
+    jogs = asked(bridge, "jog")
+    assert jogs
+    assert {(each[2], each[3]) for each in jogs} == {(-5.0, 0.4)}
+    assert ("joint-1", "stop") in bridge.stopped
+
+
+def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
+    page.press("Escape")
+    page.until("!document.querySelector('#fault').hidden")
+    assert ("joint-2", "quick-stop") in bridge.stopped
+    assert "a TPDO is missing" in page.text("#fault")
+    assert "check the cable" in page.text("#fault")
+    assert page.evaluate("document.querySelector('#reset').disabled")
+    take_control(page)
+    page.click("#reset")
+    page.until("document.querySelector('#fault').hidden")
+    assert asked(bridge, "reset") == [("joint-1", "reset")]
+
+
+def test_another_clients_control_is_shown(bridge, page):
+    bridge.lease.take("cell controller")
+    page.until("document.querySelector('#holder').innerText === 'cell controller has control'")
+
+
+def test_the_other_axis_is_one_key_away(bridge, page):
+    page.press("2")
+    page.until("document.querySelector('#axes [aria-selected=true]').innerText === 'joint-2'")
+    take_control(page)
+    page.click("#enable")
+    page.until("document.querySelector('#state').innerText === 'enabled'")
+    assert asked(bridge, "enable") == [("joint-2", "enable")]
+
+
+def test_events_that_were_and_that_come_are_listed(place, bridge, chromium):
+    bridge.told.append(event(1, "the first"))
+    show(chromium, place)
+    chromium.until("document.querySelector('#events').innerText.includes('the first')")
+    bridge.told.append(event(2, "<b>the second</b>"))
+    chromium.until("document.querySelector('#events').innerText.includes('<b>the second</b>')")
+    assert chromium.evaluate("document.querySelectorAll('#events li').length") == 2
+
+
+def event(number, text):
+    return Event(sequence=number, kind=EventKind.NOTE, date="2025-01-31T12:00:00Z", text=text)
+
+
+def test_without_its_token_the_page_asks_for_it(place, bridge, chromium):
+    chromium.open("about:blank")
+    chromium.open(f"http://127.0.0.1:{place.port}/")
+    chromium.evaluate("sessionStorage.clear(), location.reload()")
+    chromium.until("document.querySelector('#token-form')?.hidden === false")
+    chromium.evaluate(f"document.querySelector('#token').value = {json.dumps(TOKEN)}")
+    chromium.evaluate("document.querySelector('#token-form').requestSubmit()")
+    chromium.until("document.querySelector('#connection').className === 'live'")
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_telephone_shows_it_whole_with_the_stop_in_reach(place, bridge, chromium, dark):
+    show(chromium, place, width=360, height=740, dark=dark)
+    assert chromium.evaluate("document.documentElement.scrollWidth") <= 360
+    button = chromium.evaluate(
+        "JSON.stringify(document.querySelector('#quick-stop').getBoundingClientRect())"
+    )
+    assert 370 < json.loads(button)["top"] < json.loads(button)["bottom"] <= 740
+    ground = chromium.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert ground == ("rgb(20, 24, 28)" if dark else "rgb(255, 255, 255)")
+
+
+def test_orders_are_found_where_the_turn_was_covered_and_not_claimed_where_not(page):
+    wave = [
+        8 * math.cos(math.radians(2 * each + 20)) + 3 * math.sin(math.radians(5 * each))
+        for each in range(3600)
+    ]
+    found = page.evaluate(f"""import('/page/harmonics.js').then(({{ Means, orders }}) => {{
+        const means = new Means(), half = new Means();
+        {json.dumps(wave)}.forEach((value, deg) => {{
+            means.add(deg, deg / 50, value);
+            if (deg % 360 < 180) half.add(deg, deg / 50, value);
+        }});
+        return {{ whole: orders(means.overMotor(), 6), half: orders(half.overMotor(), 6) }};
+    }})""")
+    assert found["half"] is None
+    assert found["whole"] == pytest.approx([0, 8, 0, 0, 3, 0], abs=0.02)
+
+
+def test_every_file_that_the_page_names_is_served():
+    named = {
+        name
+        for name in page_files()
+        if name.encode() in page_files()["index.html"][0] + page_files()["main.js"][0]
+    }
+    assert {"main.js", "uplot.js", "uplot.css", "live.css", "icon.svg", "controls.js"} <= named
+    assert page_file("../__init__.py") is None
