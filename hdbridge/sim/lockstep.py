@@ -231,12 +231,12 @@ class SimulatedAxis:
 
 @contextmanager
 def simulated_benches(
-    axes: Sequence[SimulatedAxis], channel: str | None = None, start_s: float = 0.0
+    axes: Sequence[SimulatedAxis], channel: str | None = None, clock: VirtualClock | None = None
 ) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[SimulatedDrive, ...]]]:
     """Several simulated axes on one bus and one clock, and the master's bus to them; as `lockstep_bench`.
 
-    The same axes give the same frames, whatever the others do: each has its own noise. The clock begins at
-    ``start_s``. InputError where two have the same node id.
+    The same axes give the same frames, whatever the others do: each has its own noise. ``clock`` is by
+    default one that begins at zero. InputError where two have the same node id.
     """
     node_ids = [axis.node_id for axis in axes]
     twice = next((node_id for node_id in node_ids if node_ids.count(node_id) > 1), None)
@@ -244,7 +244,7 @@ def simulated_benches(
         raise InputError(f"two simulated drives are node {twice}; give each a node id of its own")
     private = channel is None
     channel = channel or f"hdbridge-{uuid4()}"
-    clock = VirtualClock(start_s)
+    clock = clock if clock is not None else VirtualClock()
     with ExitStack() as stack:
         for serial, axis in enumerate(axes, start=1):
             known = axis.truth if isinstance(axis.truth, Truth) else Truth.load(Path(axis.truth))

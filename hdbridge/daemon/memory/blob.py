@@ -17,6 +17,11 @@ class Blob:
         self._offset, _, self._room = layout.blob
         self._cells = region.cells(self._offset - 2 * LINE, 3)  # number, length, crc
 
+    @property
+    def number(self) -> int:
+        """Of what is there; 0 where nothing is, negative while it is being stored."""
+        return int(self._cells[0])
+
     def put(self, data: bytes) -> int:
         """Store ``data``; its number, for the command that tells the loop of it. InputError if too large."""
         if len(data) > self._room:

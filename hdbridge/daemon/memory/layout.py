@@ -80,7 +80,7 @@ class CommandKind(IntEnum):
     QUICK_STOP = 7
     """Axis -1: all."""
     RESET = 8
-    """Release the latch. i is 1 when the drive was booted and verified again."""
+    """Release the latch, and switch power off. i is 1 when the drive was booted and verified again."""
     MOVE = 9
     """a target deg, b velocity deg/s or NaN, c acceleration deg/s2 or NaN."""
     JOG = 10

@@ -62,9 +62,9 @@ class Status:
         return int(self._cells[Cell.SERVICE_PID * _STRIDE])
 
     @property
-    def stop_asked(self) -> bool:
-        """Somebody wants the loop to stop all axes in order and to end."""
-        return bool(self._cells[Cell.STOP_ASKED * _STRIDE])
+    def stop_asked(self) -> int:
+        """Somebody wants the loop to end: 1 after it has stopped all axes in order, 2 after a quick stop."""
+        return int(self._cells[Cell.STOP_ASKED * _STRIDE])
 
     def set(self, cell: Cell, value: int) -> None:
         """Write a cell; each has one writer (``STOP_ASKED``: anybody, and never back)."""

@@ -1,0 +1,289 @@
+"""The control loop of one machine, one period a turn. It knows no process: clock, bus and memory come in.
+
+    commands - knots - [wait - SYNC - TPDOs - judge - targets - RPDOs - service's frame] - states - sample
+
+What is in brackets is `BusCycle.exchange`. So whatever takes long, such as planning a move or loading another
+compensation, is done when the RPDOs of one period have gone, and before the wait for the next.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.daemon.loop.axisloop import AxisLoop, AxisSetup
+from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
+from hdbridge.daemon.loop.states import AxisState, label
+from hdbridge.daemon.memory import Cell, Command, CommandKind, EventKind, Memory
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.states import State
+from hdbridge.errors import BusError, HdbridgeError, InputError
+
+COMMANDS_A_TURN: Final = 8
+REOPEN_EVERY_S: Final = 0.5
+"""How often an interface that is down is tried again."""
+REFUSALS_A_SECOND: Final = 10
+"""Refused frames of the relay that are told."""
+ENDING_TIMEOUT_S: Final = 10.0
+"""By then the process ends whether or not the drives have confirmed that power is off."""
+_ALL: Final = -1
+_AT_REST: Final = frozenset({AxisState.UNVERIFIED, AxisState.DISABLED, AxisState.LATCHED})
+_OFF: Final = frozenset({State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON, State.UNKNOWN})
+
+
+class Controller:
+    """All axes of one bus, driven by what comes through the shared memory."""
+
+    def __init__(
+        self,
+        cycle: BusCycle,
+        setups: Sequence[AxisSetup],
+        memory: Memory,
+        reopen: Callable[[], Link | None] = lambda: None,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """``reopen`` opens the interface anew after a failure: a link, or None where it is still down.
+
+        ``monotonic_ns`` is the clock that the other processes watch this one by. InputError where the axes do
+        not go together on one bus, or the memory is for others.
+        """
+        if memory.axes != len(setups):
+            raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
+        self.cycle = cycle
+        self.memory = memory
+        self.axes = tuple(
+            AxisLoop(index, setup, memory.knots[index], memory.blobs, self._tell)
+            for index, setup in enumerate(setups)
+        )
+        for axis in self.axes:
+            cycle.join(axis.cycle)
+        self.ended = False
+        """All axes are without power, as `end` has asked for: no more turns."""
+
+        self._reopen = reopen
+        self._monotonic_ns = monotonic_ns
+        self._axis_of_node = {
+            node: axis
+            for axis in self.axes
+            for node in nodes_of(axis.config.drive.node_id, axis.config.load_encoder.source.node)
+        }
+        self._wanted = incoming_ids(self._axis_of_node)
+        self._down = False
+        self._reopen_in = 0
+        self._refusals = 0
+        self._ending = self._at_once = False
+        self._ending_left = 0
+        self._released: set[int] = set()
+        self._turns = memory.status.loop_count
+        cycle.on_frame = self._pass_in
+        cycle.outgoing = self._pass_out
+        # What waits was meant for another loop, and another state of the axes.
+        memory.commands.clear()
+        memory.outgoing.clear()
+        for knots in memory.knots:
+            knots.clear()
+
+    # ---------------------------------------------------------------- a turn
+
+    def turn(self) -> None:
+        """One period. Raises nothing of the bus or of the service."""
+        cycle, axes = self.cycle, self.axes
+        self._take_commands()
+        for axis in axes:
+            axis.before()
+        cycle.exchange()
+        if cycle.down is not None or self._down:
+            self._bus_down()
+        for axis in axes:
+            if axis.after():
+                self._stop_group(axis)
+        if self._ending:
+            self._go_on_ending()
+        self._sample()
+
+    def _sample(self) -> None:
+        cycle = self.cycle
+        values: list[float] = []
+        for axis in self.axes:
+            values += axis.sample()
+        woke_s = cycle.woke_s
+        self.memory.samples.write(
+            cycle.count,
+            round(1e9 * woke_s),
+            1e6 * cycle.late_s,
+            1e6 * (cycle.clock.now() - woke_s),
+            cycle.bus_load,
+            cycle.skipped & 0xFFFF_FFFF,
+            values,
+        )
+        self._turns += 1
+        status = self.memory.status
+        status.set(Cell.LOOP_COUNT, self._turns)
+        status.set(Cell.LOOP_TIME_NS, self._monotonic_ns())
+
+    def _tell(
+        self,
+        axis: int,
+        kind: EventKind,
+        id: int = 0,  # noqa: A002
+        code: int = 0,
+        text: str = "",
+    ) -> None:
+        cycle = self.cycle
+        self.memory.events.tell(cycle.count, round(1e9 * cycle.woke_s), axis, kind, id, code, text)
+
+    # ---------------------------------------------------------------- commands
+
+    def _take_commands(self) -> None:
+        take = self.memory.commands.take
+        for _ in range(COMMANDS_A_TURN):
+            command = take()
+            if command is None:
+                break
+            self._command(command)
+
+    def _command(self, command: Command) -> None:
+        try:
+            kind = CommandKind(command.kind)
+            if kind is CommandKind.ENDING:
+                self._tell(_ALL, EventKind.DONE, command.id)
+                self.end()
+            elif kind is CommandKind.STREAM_BEGIN:
+                self._begin_stream(command)
+            elif command.axis == _ALL and kind in (CommandKind.QUICK_STOP, CommandKind.STOP):
+                for axis in self.axes:
+                    axis.command(command._replace(id=0))
+                self._tell(_ALL, EventKind.DONE, command.id)
+            elif self._ending and kind not in (CommandKind.QUICK_STOP, CommandKind.STOP):
+                raise InputError(f"{label(kind)}: the daemon is ending")
+            else:
+                self._axis(command.axis).command(command)
+        except (HdbridgeError, ValueError) as error:
+            self._tell(command.axis, EventKind.REFUSED, command.id, command.kind, str(error))
+
+    def _axis(self, index: int) -> AxisLoop:
+        if not 0 <= index < len(self.axes):
+            raise InputError(f"there is no axis {index}; expected 0 to {len(self.axes) - 1}")
+        return self.axes[index]
+
+    def _begin_stream(self, command: Command) -> None:
+        """All axes of the mask, or none."""
+        mask = command.i or 1 << self._axis(command.axis).index
+        if mask >> len(self.axes):
+            raise InputError(f"a stream of axes {mask:b}b; there are only {len(self.axes)}")
+        members = [axis for axis in self.axes if mask >> axis.index & 1]
+        for axis in members:
+            axis.check(CommandKind.STREAM_BEGIN)
+            if not axis.set_point.at_rest:
+                raise InputError(f"{axis.config.name}: a stream begins at rest: stop the axis first")
+        group = frozenset(axis.index for axis in members) if len(members) > 1 else frozenset()
+        for axis in members:
+            axis.begin_stream(command, group)
+        self._tell(command.axis, EventKind.DONE, command.id)
+
+    def _stop_group(self, stopped: AxisLoop) -> None:
+        """The axes that move together with one that was stopped brake in order."""
+        for index in stopped.group:
+            axis = self.axes[index]
+            if axis is not stopped and axis.group == stopped.group:
+                axis.stop()
+                axis.group = frozenset()
+        stopped.group = frozenset()
+
+    # ---------------------------------------------------------------- the service's frames
+
+    def _pass_in(self, frame: Frame) -> None:
+        if frame.can_id in self._wanted:
+            self.memory.incoming.put(round(1e9 * frame.time_s), frame.can_id, frame.data)
+
+    def _pass_out(self) -> tuple[int, bytes] | None:
+        frame = self.memory.outgoing.take()
+        if frame is None:
+            return None
+        _, can_id, data = frame
+        states = {node: axis.state for node, axis in self._axis_of_node.items()}
+        refusal = why_refused(can_id, data, states)
+        if refusal is None:
+            return can_id, data
+        self._refuse_frame(refusal)
+        return None
+
+    def _refuse_frame(self, why: str) -> None:
+        second = round(1.0 / self.cycle.period_s)
+        if self.cycle.count - self._refusals > second // REFUSALS_A_SECOND:
+            self._refusals = self.cycle.count
+            self._tell(_ALL, EventKind.REFUSED, 0, 0, why)
+
+    # ---------------------------------------------------------------- the bus
+
+    def _bus_down(self) -> None:
+        """The interface failed in this turn, or before and has not come back yet."""
+        cycle = self.cycle
+        if cycle.down is None:
+            self._down = False
+            self._tell(_ALL, EventKind.BUS_UP)
+            return
+        if not self._down:
+            self._down = True
+            self._reopen_in = 0
+            self._tell(_ALL, EventKind.BUS_DOWN, text=cycle.down)
+            self.memory.outgoing.clear()
+            for axis in self.axes:
+                axis.verification_lost()
+        self._reopen_in -= 1
+        if self._reopen_in <= 0:
+            self._reopen_in = round(REOPEN_EVERY_S / cycle.period_s)
+            self._try_to_reopen()
+
+    def _try_to_reopen(self) -> None:
+        # No axis speaks while the bus is down, so nothing waits for the time that this takes.
+        try:
+            link = self._reopen()
+        except BusError:
+            return
+        if link is not None:
+            self.cycle.relink(link)
+
+    # ---------------------------------------------------------------- the end
+
+    def end(self, *, at_once: bool = False) -> None:
+        """Stop all axes and switch power off; `ended` says when that is done. Once is enough.
+
+        In order, or ``at_once`` by a quick stop, which may also come after the first.
+        """
+        if at_once and not self._at_once:
+            self._at_once = True
+            for axis in self.axes:
+                self._order(axis, CommandKind.QUICK_STOP)
+        if self._ending:
+            return
+        self._ending = True
+        self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
+        self._tell(_ALL, EventKind.ENDING)
+        for axis in self.axes:
+            # The service cannot bring a lent axis to rest any more; the loop's quick stop overrules it.
+            lent = axis.state is AxisState.LENT
+            self._order(axis, CommandKind.QUICK_STOP if lent else CommandKind.DISABLE)
+
+    def _order(self, axis: AxisLoop, kind: CommandKind) -> None:
+        if axis.state not in _AT_REST:
+            axis.command(Command(0, kind, axis.index, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
+
+    def _go_on_ending(self) -> None:
+        self._ending_left -= 1
+        moving = False
+        for axis in self.axes:
+            if axis.state in _AT_REST:
+                continue
+            power = axis.image.power
+            if axis.state is AxisState.QUICK_STOPPED and not axis.cycle.riding:
+                if power.state in _OFF:
+                    continue
+                if axis.index not in self._released and power.state is not State.OPERATION_ENABLED:
+                    # Out of the latch leads the way to no power; nobody is left to give another order.
+                    self._released.add(axis.index)
+                    self._order(axis, CommandKind.RESET)
+            moving = True
+        self.ended = not moving or self._ending_left <= 0

@@ -1,0 +1,127 @@
+"""The control process: ``python -m hdbridge.daemon.loop.process FD``, started by the keeper.
+
+It has one thread, one bus and the shared memory. It opens no files, logs nothing and does no SDO of its own.
+All that takes memory is made before the first turn.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from types import FrameType
+from typing import Final
+
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.control.realtime import prepare_realtime
+from hdbridge.daemon.loop.axisloop import AxisSetup
+from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.interface import Interface, listen
+from hdbridge.daemon.machine import Axis, Machine
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.start import Simulation, Start, begin_child
+from hdbridge.drive.link import Link
+from hdbridge.errors import HdbridgeError
+from hdbridge.evaluation.stepping import Scheme
+
+AT_ONCE: Final = 2
+"""``STOP_ASKED`` for an end by quick stop."""
+SIMULATED_BITRATE_BPS: Final = 1_000_000
+
+
+def main(arguments: list[str]) -> int:
+    """Run until told to end; the exit status."""
+    try:
+        start = Start.inherited(arguments)
+        begin_child(start, "hdbridge-loop")
+        run(start)
+    except HdbridgeError as error:
+        print(f"hdbridge: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+def run(start: Start) -> None:
+    """Turn the loop of a machine until SIGTERM, ``STOP_ASKED`` or an ENDING command has brought it to rest.
+
+    Raises `BusError` where the bus cannot be opened, `BusInUseError` where another master is heard on it, and
+    `InputError` where a model cannot be read.
+    """
+    machine = start.machine
+    terminated = False
+
+    def terminate(_: int, __: FrameType | None) -> None:
+        nonlocal terminated
+        terminated = True
+
+    signal.signal(signal.SIGTERM, terminate)
+    setups = [setup_of(axis) for axis in machine.axes]
+    realtime = machine.realtime
+    with Memory.attach(start.memory_fd) as memory, _bus(start) as (link, clock, interface):
+        cycle = BusCycle(link, clock, machine.cycle_s, bitrate_bps=_bitrate(start))
+        reopen = interface.reopen if interface is not None else lambda: None
+        controller = Controller(cycle, setups, memory, reopen)
+        status = memory.status
+        status.set(Cell.LOOP_PID, os.getpid())
+        # A simulation that is late does not sleep: it would keep everything else from its processor.
+        real = interface is not None
+        with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext():
+            while not controller.ended:
+                if terminated or status.stop_asked:
+                    controller.end(at_once=status.stop_asked >= AT_ONCE)
+                controller.turn()
+
+
+def setup_of(axis: Axis) -> AxisSetup:
+    """What an axis begins with: its active model, as far as its scheme uses it."""
+    scheme = axis.compensation
+    return AxisSetup(
+        axis.config,
+        compensation_for(axis.config, scheme.of(axis.model())),
+        compensating=scheme is not Scheme.NONE,
+        load_loop=axis.load_loop,
+    )
+
+
+def _bitrate(start: Start) -> int | None:
+    return SIMULATED_BITRATE_BPS if start.simulation is not None else start.machine.bus.bitrate_bps
+
+
+@contextmanager
+def _bus(start: Start) -> Iterator[tuple[Link, Clock, Interface | None]]:
+    """The bus, its clock, and who opens it again; None for simulated drives, which are in this process."""
+    machine = start.machine
+    if start.simulation is not None:
+        with _simulated(machine, start.simulation) as (link, clock):
+            yield link, clock, None
+        return
+    clock = MonotonicClock()
+    with Interface(machine.bus, clock) as interface:
+        link = interface.open()
+        if not start.force:
+            listen(link, tuple(axis.config for axis in machine.axes))
+        yield link, clock, interface
+
+
+@contextmanager
+def _simulated(machine: Machine, simulation: Simulation) -> Iterator[tuple[Link, Clock]]:
+    # Loaded here: who masters a real drive needs no simulated one.
+    from hdbridge.sim.lockstep import SimulatedAxis, simulated_benches  # noqa: PLC0415
+    from hdbridge.sim.paced import PacedClock  # noqa: PLC0415
+
+    axes = [
+        SimulatedAxis(truth, axis.config.eds_path, axis.config.drive.node_id, simulation.seed + place)
+        for place, (axis, truth) in enumerate(zip(machine.axes, simulation.truths, strict=True))
+    ]
+    clock = PacedClock(time.monotonic(), simulation.speed)
+    with simulated_benches(axes, clock=clock) as (bus, _, _):
+        yield Link(bus, clock), clock
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,149 @@
+"""The states of an axis in the control loop, as a table.
+
+What may live here: the states, the rows, and what follows from the rows alone: what is accepted where, why
+not, the diagram. No bus, no clock, no drive. The drive has power states of its own (`hdbridge.drive.states`);
+these say what the loop may do with the axis. What is not in the table is refused and changes nothing.
+
+No row leads to ENABLING but that of an ENABLE command, and none to ENABLED but from ENABLING: so nothing
+enables an axis by itself, and nothing does after a stop before the latch was released.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+from typing import Final, NamedTuple
+
+from hdbridge.daemon.memory.layout import CommandKind
+
+
+class AxisState(IntEnum):
+    """The numbers are part of the shared memory: add, never renumber."""
+
+    UNVERIFIED = 0
+    """Nothing is known of the drive: no RPDO; TPDOs are taken if they come."""
+    DISABLED = 1
+    """Verified; the RPDO goes, with the actual position as target and power off."""
+    ENABLING = 2
+    """On the way to 'operation enabled', standing still."""
+    ENABLED = 3
+    """The set-point is followed."""
+    STOPPING = 4
+    """Braking in order, then power off."""
+    LENT = 5
+    """The service moves the drive by SDO: no RPDO."""
+    QUICK_STOPPED = 6
+    """A quick stop is latched; its RPDO goes on."""
+    LATCHED = 7
+    """The drive has to be verified again: no RPDO."""
+
+
+class Happening(Enum):
+    """What leads to another state without a command."""
+
+    POWERED = "operation is enabled and the channels are known"
+    POWER_OFF = "power is off"
+    OVERDUE = "the drive takes too long"
+    STOP_LATCHED = "the supervision stops the axis"
+    VERIFICATION_LOST = "a node restarted or the bus is down"
+
+
+Cause = CommandKind | Happening
+
+
+class Transition(NamedTuple):
+    """One row: in ``source``, ``cause`` leads to ``target``, which may be the same state."""
+
+    source: AxisState
+    cause: Cause
+    target: AxisState
+
+
+_S, _C, _H = AxisState, CommandKind, Happening
+_SPEAKING: Final = (_S.DISABLED, _S.ENABLING, _S.ENABLED, _S.STOPPING)
+
+TRANSITIONS: Final[tuple[Transition, ...]] = (
+    Transition(_S.UNVERIFIED, _C.VERIFIED, _S.DISABLED),
+    Transition(_S.UNVERIFIED, _C.RELEASE, _S.UNVERIFIED),
+    Transition(_S.UNVERIFIED, _C.RESET, _S.UNVERIFIED),
+    Transition(_S.DISABLED, _C.VERIFIED, _S.DISABLED),
+    Transition(_S.DISABLED, _C.RELEASE, _S.UNVERIFIED),
+    Transition(_S.DISABLED, _C.LEND, _S.LENT),
+    Transition(_S.DISABLED, _C.ENABLE, _S.ENABLING),
+    Transition(_S.DISABLED, _C.DISABLE, _S.DISABLED),
+    Transition(_S.DISABLED, _C.RESET, _S.DISABLED),
+    Transition(_S.DISABLED, _C.DRIVE_FAULT_RESET, _S.DISABLED),
+    Transition(_S.LENT, _C.UNLEND, _S.DISABLED),
+    Transition(_S.LENT, _C.RELEASE, _S.UNVERIFIED),
+    Transition(_S.LENT, _C.QUICK_STOP, _S.QUICK_STOPPED),
+    Transition(_S.ENABLING, _H.POWERED, _S.ENABLED),
+    Transition(_S.ENABLING, _H.OVERDUE, _S.STOPPING),
+    Transition(_S.ENABLING, _C.DISABLE, _S.STOPPING),
+    Transition(_S.ENABLING, _C.QUICK_STOP, _S.QUICK_STOPPED),
+    *(Transition(_S.ENABLED, kind, _S.ENABLED) for kind in (_C.MOVE, _C.JOG, _C.STREAM_BEGIN, _C.STREAM_END)),
+    Transition(_S.ENABLED, _C.DISABLE, _S.STOPPING),
+    Transition(_S.ENABLED, _C.QUICK_STOP, _S.QUICK_STOPPED),
+    Transition(_S.STOPPING, _C.DISABLE, _S.STOPPING),
+    Transition(_S.STOPPING, _C.QUICK_STOP, _S.QUICK_STOPPED),
+    Transition(_S.STOPPING, _H.POWER_OFF, _S.DISABLED),
+    Transition(_S.STOPPING, _H.OVERDUE, _S.QUICK_STOPPED),
+    Transition(_S.QUICK_STOPPED, _C.RESET, _S.STOPPING),
+    Transition(_S.LATCHED, _C.RESET, _S.UNVERIFIED),
+    # To stop is never refused, where nothing moves either.
+    *(Transition(state, _C.STOP, state) for state in _S),
+    *(
+        Transition(state, _C.QUICK_STOP, state)
+        for state in (_S.UNVERIFIED, _S.DISABLED, _S.QUICK_STOPPED, _S.LATCHED)
+    ),
+    # What compensates is the service's choice at any time.
+    *(Transition(state, kind, state) for state in _S for kind in (_C.COMPENSATE, _C.CHANGE, _C.LOAD_LOOP)),
+    *(Transition(state, _H.STOP_LATCHED, _S.QUICK_STOPPED) for state in _SPEAKING),
+    *(
+        Transition(state, _H.VERIFICATION_LOST, _S.LATCHED)
+        for state in (*_SPEAKING, _S.LENT, _S.QUICK_STOPPED)
+    ),
+)
+"""Every row; a command that has none in a state is refused there."""
+
+_TARGETS: Final = {(row.source, row.cause): row.target for row in TRANSITIONS}
+
+_WAY_OUT: Final = {
+    _S.UNVERIFIED: "the drive has to be booted and verified first",
+    _S.DISABLED: "enable it first",
+    _S.ENABLING: "wait until it is enabled, or disable it",
+    _S.ENABLED: "disable it first",
+    _S.STOPPING: "wait until it is disabled",
+    _S.LENT: "wait until the service has given it back",
+    _S.QUICK_STOPPED: "remove the cause, then reset it",
+    _S.LATCHED: "remove the cause, verify the drive again, then reset it",
+}
+"""What a person does where a command is refused."""
+
+
+def target_of(state: AxisState, cause: Cause) -> AxisState | None:
+    """Where ``cause`` leads in ``state``; None: it is refused, or means nothing there."""
+    return _TARGETS.get((state, cause))
+
+
+def refusal(state: AxisState, kind: CommandKind) -> str:
+    """Why a command is refused in a state, in words."""
+    return f"{label(kind)} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
+
+
+def label(name: AxisState | CommandKind) -> str:
+    """``quick stopped``."""
+    return name.name.lower().replace("_", " ")
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram, without the rows that change nothing."""
+    lines = ["stateDiagram-v2", f"    [*] --> {AxisState.UNVERIFIED.name}"]
+    causes: dict[tuple[AxisState, AxisState], list[str]] = {}
+    for row in TRANSITIONS:
+        if row.source is not row.target:
+            words = row.cause.value if isinstance(row.cause, Happening) else row.cause.name
+            causes.setdefault((row.source, row.target), []).append(str(words))
+    lines += [
+        f"    {source.name} --> {target.name}: {', '.join(words)}"
+        for (source, target), words in causes.items()
+    ]
+    return "\n".join(lines)

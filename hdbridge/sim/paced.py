@@ -1,0 +1,47 @@
+"""A virtual clock that does not run ahead of real time: for simulated drives that somebody looks at.
+
+Where the machine is late, virtual time is late with it: nothing is skipped, and what was lost is not made up
+for in a rush. So a machine that stalls is no fault of a simulated bus.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Final
+
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import VirtualClock
+
+FORGIVEN_S: Final = 0.1
+"""Real time that is made up for; where more was lost, the pace begins anew."""
+
+
+class PacedClock(VirtualClock):
+    """A `VirtualClock` whose time passes at most ``speed`` times as fast as real time."""
+
+    def __init__(
+        self,
+        start_s: float = 0.0,
+        speed: float = 1.0,
+        real_s: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """``real_s`` and ``sleep`` are the machine's own clock. InputError for a speed that is none."""
+        if not (math.isfinite(speed) and speed > 0.0):
+            raise InputError(f"a simulation at {speed!r} times real time; expected a finite number above 0")
+        super().__init__(start_s)
+        self._speed = speed
+        self._real_s, self._sleep = real_s, sleep
+        self._anchor_s, self._anchor_real_s = start_s, real_s()
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Advance to ``deadline_s``, and there no sooner than real time."""
+        due_s = self._anchor_real_s + (deadline_s - self._anchor_s) / self._speed
+        wait_s = due_s - self._real_s()
+        if wait_s > 0.0:
+            self._sleep(wait_s)
+        elif wait_s < -FORGIVEN_S:
+            self._anchor_s, self._anchor_real_s = deadline_s, self._real_s()
+        super().sleep_until(deadline_s)

@@ -1,0 +1,502 @@
+"""An axis from unknown to moving and back, by commands through the memory and frames on the bus."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
+
+from hdbridge.control.bench import compensation_for
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
+from hdbridge.drive.states import State
+from hdbridge.model import TransmissionModel
+from hdbridge.motion import MotionMode
+
+S, K, E = AxisState, CommandKind, EventKind
+
+
+def record(daemon: SteppedDaemon, axis: int = 0) -> np.ndarray:
+    """The axis's samples since this was last called."""
+    samples, lost = daemon.samples.read()
+    assert lost == 0
+    return samples["axes"][:, axis]
+
+
+def rpdos(daemon: SteppedDaemon, node: int = 1) -> list[tuple[int, int]]:
+    """Controlwords and targets that are sent from now on."""
+    found: list[tuple[int, int]] = []
+
+    def spy(can_id: int, data: bytes) -> None:
+        if can_id == 0x200 + node:
+            found.append(struct.unpack("<Hi", data))
+
+    daemon.bus.spy = spy
+    return found
+
+
+def test_nothing_is_sent_to_a_drive_that_is_not_verified(daemon: SteppedDaemon) -> None:
+    sent = rpdos(daemon)
+    daemon.run(0.5)
+    assert sent == []
+    assert daemon.states == [S.UNVERIFIED]
+    for kind in (K.ENABLE, K.LEND, K.MOVE, K.DISABLE):
+        answer = daemon.order(kind)
+        assert answer.kind is E.REFUSED
+        assert "has to be booted and verified first" in answer.text
+    assert sent == []
+
+
+def test_a_verified_axis_is_idle_with_its_place_as_target(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    sent = rpdos(daemon)
+    daemon.run(0.2)
+    assert daemon.states == [S.DISABLED]
+    place = daemon.nodes[0].firmware.motion.machine.motor_counts
+    assert all(word == 0 and abs(target - place) <= 2 for word, target in sent)
+    assert len(sent) == 50
+
+
+def test_enabling_moves_nothing_and_a_move_arrives(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    sent = rpdos(daemon)
+    daemon.enable()
+    daemon.run(1.0)
+    # But for the compensation, which is faded in.
+    assert max(abs(target - sent[0][1]) for _, target in sent) < 8000 * 50 * 300 / 3600 / 360
+    record(daemon)
+    id_ = daemon.move(12.5)
+    daemon.until(lambda: daemon.ended(id_))
+    daemon.run(0.2)
+    moved = record(daemon)
+    assert moved["load_target_deg"][-1] == 12.5
+    assert abs(moved["load_position_deg"][-1] - 12.5) < 0.005
+    assert set(moved["state"]) == {S.ENABLED}
+    assert {MotionMode.HOLD, MotionMode.GOTO} == set(moved["mode"])
+    assert (moved["velocity_deg_s"] <= 20.0 * (1 + 1e-9)).all()
+    (end,) = [each for each in daemon.told(E.MOTION_ENDED) if each.id == id_]
+    assert end.code == MotionMode.GOTO
+
+
+def test_the_sample_says_what_was_sent_and_what_the_model_says(enabled: SteppedDaemon) -> None:
+    enabled.run(1.0)
+    sent = rpdos(enabled)
+    record(enabled)
+    id_ = enabled.move(3.0)
+    enabled.until(lambda: enabled.ended(id_))
+    axis = record(enabled)
+    counts = [target for _, target in sent]
+    assert np.allclose(axis["issued_deg"], np.array(counts) * 360 / 8000)
+    # The motor's target is N times the load's, less the correction, to half a count.
+    wanted = 50 * (axis["load_target_deg"] - axis["correction_arcsec"] / 3600)
+    assert np.abs(axis["issued_deg"] - wanted).max() <= 0.5 * 360 / 8000 + 1e-9
+    assert np.ptp(axis["correction_arcsec"]) > 5.0
+    assert np.allclose(axis["predicted_arcsec"], axis["correction_arcsec"], atol=1e-3)
+    assert (axis["weight"] == 1.0).all()
+    assert (axis["flags"] & SampleFlag.COMPENSATING).all()
+    assert (axis["power"] == list(State).index(State.OPERATION_ENABLED)).all()
+    assert np.isnan(axis["reading0"]).all()
+
+
+def test_a_move_is_re_targeted_without_a_stop(enabled: SteppedDaemon) -> None:
+    enabled.move(40.0)
+    enabled.run(1.0)
+    record(enabled)
+    id_ = enabled.move(-10.0)
+    enabled.until(lambda: enabled.ended(id_), 10.0)
+    axis = record(enabled)
+    jumps = np.abs(np.diff(axis["velocity_deg_s"]))
+    assert jumps.max() <= 200.0 * 0.004 * (1 + 1e-6)
+    assert axis["load_target_deg"][-1] == -10.0
+
+
+def test_a_jog_runs_out_when_nobody_renews_it(enabled: SteppedDaemon) -> None:
+    enabled.done(K.JOG, a=5.0, b=0.2)
+    enabled.run(0.15)
+    enabled.done(K.JOG, a=5.0, b=0.2)
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
+    axis = record(enabled)
+    assert axis["velocity_deg_s"].max() == pytest.approx(5.0)
+    assert 1.0 < axis["load_target_deg"][-1] < 3.0
+    assert enabled.told(E.MOTION_ENDED)[-1].code == MotionMode.STOP
+
+
+def test_stop_brakes_within_the_limits_and_keeps_power(enabled: SteppedDaemon) -> None:
+    enabled.move(100.0)
+    enabled.run(1.0)
+    enabled.done(K.STOP)
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
+    assert enabled.states == [S.ENABLED]
+    axis = record(enabled)
+    assert np.abs(np.diff(axis["velocity_deg_s"])).max() <= 200.0 * 0.004 * (1 + 1e-6)
+    assert enabled.order(K.STOP).kind is E.DONE
+
+
+def test_disabling_in_motion_brakes_first(enabled: SteppedDaemon) -> None:
+    enabled.move(100.0)
+    enabled.run(1.0)
+    record(enabled)
+    enabled.done(K.DISABLE)
+    assert enabled.states == [S.DISABLED]
+    axis = record(enabled)
+    driven = axis[axis["state"] == S.STOPPING]
+    assert np.abs(np.diff(driven["velocity_deg_s"])).max() <= 200.0 * 0.004 * (1 + 1e-6)
+    assert axis["power"][-1] == list(State).index(State.SWITCH_ON_DISABLED)
+    place = axis["load_position_deg"][-1]
+    enabled.run(0.5)
+    assert abs(record(enabled)["load_position_deg"][-1] - place) < 0.01
+
+
+def test_after_disabling_it_begins_from_where_it_was_turned_to(enabled: SteppedDaemon) -> None:
+    enabled.done(K.DISABLE)
+    enabled.run(0.2)
+    with_power_off = enabled.seeds(0)["i"]
+    enabled.enable()
+    enabled.run(0.1)
+    axis = record(enabled)
+    assert abs(axis["issued_deg"][-1] - with_power_off * 360 / 8000) < 1.0
+    assert axis["load_target_deg"][-1] == pytest.approx(with_power_off * 360 / 8000 / 50, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"a": 401.0}, "position limits are -400 and 400"),
+        ({"a": math.nan}, "finite"),
+        ({"a": math.inf}, "finite"),
+        ({"a": 1.0, "b": -3.0}, "above 0"),
+        ({"a": 1.0, "c": math.inf}, "finite"),
+    ],
+)
+def test_a_move_that_makes_no_sense_is_refused_and_moves_nothing(
+    enabled: SteppedDaemon, fields: dict[str, float], words: str
+) -> None:
+    enabled.run(1.0)
+    sent = rpdos(enabled)
+    answer = enabled.order(K.MOVE, **{"b": math.nan, "c": math.nan, **fields})
+    assert answer.kind is E.REFUSED
+    assert words in answer.text
+    enabled.run(0.1)
+    assert len({target for _, target in sent}) == 1
+    assert enabled.states == [S.ENABLED]
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "words"),
+    [
+        (99, 0, "99 is not a valid CommandKind"),
+        (K.MOVE, 7, "there is no axis 7"),
+        (K.ENABLE, -1, "no axis -1"),
+    ],
+)
+def test_a_command_that_is_none_is_refused(enabled: SteppedDaemon, kind: int, axis: int, words: str) -> None:
+    answer = enabled.order(kind, axis)  # type: ignore[arg-type]
+    assert answer.kind is E.REFUSED
+    assert words in answer.text
+
+
+@pytest.mark.parametrize("statusword", [0x0008, 0x0027, 0x0000, -1, 1 << 40])
+def test_enabling_from_anything_but_power_off_is_refused(daemon: SteppedDaemon, statusword: int) -> None:
+    daemon.verify()
+    answer = daemon.order(K.ENABLE, i=0, j=0, k=statusword)
+    assert answer.kind is E.REFUSED
+    assert daemon.states == [S.DISABLED]
+
+
+def test_enabling_outside_the_limits_is_refused(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    answer = daemon.order(K.ENABLE, i=8000 * 50 * 2, j=0, k=0x250)
+    assert answer.kind is E.REFUSED
+    assert "not an integer within" in answer.text
+
+
+def test_a_drive_that_does_not_come_to_power_is_given_up(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    fields = daemon.prepare()
+    node = daemon.nodes[0]
+    handle = node.handle
+
+    def deaf(message, now_s) -> None:
+        if message.arbitration_id != 0x201:
+            handle(message, now_s)
+
+    node.handle = deaf
+    answer = daemon.order(K.ENABLE, timeout_s=10.0, **fields)
+    assert answer.kind is E.REFUSED
+    assert "did not reach 'operation enabled'" in answer.text
+    daemon.until(lambda: daemon.states == [S.DISABLED])
+
+
+def test_the_axis_is_lent_for_homing_and_given_back(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    daemon.done(K.LEND)
+    sent = rpdos(daemon)
+    drive = daemon.drive(0)
+    drive.home(37, 1.0, 1.0)
+    drive.disable()
+    assert sent == []
+    daemon.done(K.UNLEND, **daemon.seeds(0))
+    assert daemon.states == [S.DISABLED]
+    daemon.enable()
+    assert sent
+
+
+def test_a_lent_axis_is_quick_stopped_by_the_loop(daemon: SteppedDaemon) -> None:
+    daemon.verify()
+    daemon.done(K.LEND)
+    drive = daemon.drive(0)
+    from hdbridge.drive.objects import Mode
+
+    drive.enable(Mode.PP)
+    daemon.done(K.QUICK_STOP)
+    assert daemon.states == [S.QUICK_STOPPED]
+    daemon.run(0.5)
+    assert daemon.axes[0].image.power.state is State.QUICK_STOP_ACTIVE
+
+
+def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
+    enabled.move(100.0)
+    enabled.run(1.0)
+    enabled.done(K.QUICK_STOP, -1)
+    assert enabled.states == [S.QUICK_STOPPED]
+    sent = rpdos(enabled)
+    assert enabled.order(K.RESET).kind is E.REFUSED  # still moving
+    enabled.run(1.0)
+    assert {word for word, _ in sent} == {0x02}
+    (stopped,) = enabled.told(E.STOPPED)
+    assert "quick stop by command" in stopped.text
+    for kind in (K.ENABLE, K.MOVE, K.VERIFIED, K.LEND):
+        assert enabled.order(kind).kind is E.REFUSED
+    enabled.done(K.RESET)
+    enabled.until(lambda: enabled.states == [S.DISABLED])
+    enabled.enable()
+    id_ = enabled.move(0.0)
+    enabled.until(lambda: enabled.ended(id_), 10.0)
+
+
+def test_a_quick_stopped_axis_is_not_disabled_but_reset_which_switches_power_off(
+    enabled: SteppedDaemon,
+) -> None:
+    enabled.done(K.QUICK_STOP)
+    enabled.run(0.5)
+    answer = enabled.order(K.DISABLE)
+    assert answer.kind is E.REFUSED
+    assert "then reset it" in answer.text
+    enabled.done(K.RESET)
+    enabled.run(0.5)
+    assert enabled.states == [S.DISABLED]
+    assert enabled.axes[0].image.power.state is State.SWITCH_ON_DISABLED
+
+
+def quintic(duration_s: float, travel_deg: float, step_s: float = 0.02) -> list[tuple[float, float, float]]:
+    """Knots of a smooth move from rest to rest."""
+    times = np.linspace(0.0, duration_s, round(duration_s / step_s) + 1)
+    s = times / duration_s
+    place = travel_deg * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    speed = travel_deg / duration_s * (30 * s**2 - 60 * s**3 + 30 * s**4)
+    return [(float(t), float(p), float(v)) for t, p, v in zip(times, place, speed, strict=True)]
+
+
+def test_a_stream_follows_its_knots(enabled: SteppedDaemon) -> None:
+    begin = enabled.axes[0].set_point.position_deg
+    knots = [(t, begin + p, v) for t, p, v in quintic(1.0, 4.0)]
+    record(enabled)
+    assert enabled.stream({0: knots}, timeout_s=0.1).kind is E.DONE
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
+    axis = record(enabled)
+    streamed = axis[axis["mode"] == MotionMode.STREAM]
+    assert streamed["load_target_deg"][-1] == knots[-1][1]
+    assert enabled.told(E.MOTION_ENDED)[-1].code == MotionMode.STREAM
+    times = np.array([t for t, _, _ in knots])
+    exact = np.interp(np.arange(250) * 0.004, times, [p for _, p, _ in knots])
+    assert np.abs(streamed["load_target_deg"][:250] - exact).max() < 0.01
+    assert enabled.told(E.UNDERRUN) == []
+
+
+def test_a_stream_that_is_ended_by_its_client_ends_at_once_when_it_rests(enabled: SteppedDaemon) -> None:
+    begin = enabled.axes[0].set_point.position_deg
+    enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=30.0)
+    enabled.done(K.STREAM_END)
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)), 1.0)
+
+
+def test_a_stream_without_further_knots_brakes_and_says_so(enabled: SteppedDaemon) -> None:
+    begin = enabled.axes[0].set_point.position_deg
+    knots = [(t, begin + p, v) for t, p, v in quintic(1.0, 4.0)][:25]
+    enabled.stream({0: knots})
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
+    assert len(enabled.told(E.UNDERRUN)) == 1
+    axis = record(enabled)
+    assert np.abs(np.diff(axis["load_target_deg"])).max() <= 20.0 * 0.004
+    assert enabled.states == [S.ENABLED]
+
+
+def test_a_knot_beyond_the_limits_ends_the_stream(enabled: SteppedDaemon) -> None:
+    begin = enabled.axes[0].set_point.position_deg
+    knots = [*((t, begin + p, v) for t, p, v in quintic(1.0, 4.0)[:10]), (0.3, 500.0, 0.0)]
+    enabled.stream({0: knots})
+    enabled.until(lambda: bool(enabled.told(E.STREAM_REFUSED)))
+    assert "deg/s" in enabled.told(E.STREAM_REFUSED)[0].text
+    enabled.until(lambda: enabled.axes[0].set_point.at_rest)
+    enabled.run(0.1)
+    assert len(enabled.memory.knots[0]) == 0
+
+
+def test_knots_of_another_stream_are_thrown_away(enabled: SteppedDaemon) -> None:
+    begin = enabled.axes[0].set_point.position_deg
+    enabled.memory.knots[0].put([Knot(77, 0.0, 300.0, 0.0)] * 200)
+    enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=0.1)
+    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
+    assert enabled.told(E.STREAM_REFUSED) == []
+    assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0)
+
+
+def test_a_stream_in_motion_is_refused(enabled: SteppedDaemon) -> None:
+    enabled.move(50.0)
+    enabled.run(0.1)
+    answer = enabled.stream({0: [(0.0, 0.0, 0.0)]})
+    assert answer.kind is E.REFUSED
+    assert "stop the axis first" in answer.text
+
+
+def test_axes_stream_together_or_not_at_all(pair: SteppedDaemon) -> None:
+    begins = [axis.set_point.position_deg for axis in pair.axes]
+    paths = {
+        index: [(t, begins[index] + p, v) for t, p, v in quintic(1.0, 2.0 * (1 + index))] for index in (0, 1)
+    }
+    pair.move(5.0, 1)
+    pair.run(0.1)
+    assert pair.stream(paths).kind is E.REFUSED
+    assert pair.axes[0].set_point.mode is MotionMode.HOLD
+    pair.done(K.STOP, 1)
+    pair.until(lambda: pair.axes[1].set_point.at_rest)
+    begins[1] = pair.axes[1].set_point.position_deg
+    paths[1] = [(t, begins[1] + p, v) for t, p, v in quintic(1.0, 4.0)]
+    pair.samples.read()
+    assert pair.stream(paths).kind is E.DONE
+    pair.until(lambda: len(pair.told(E.MOTION_ENDED)) >= 3)
+    samples, _ = pair.samples.read()
+    both = samples["axes"]["load_target_deg"]
+    moving = (samples["axes"]["mode"] == MotionMode.STREAM).all(axis=1)
+    assert np.allclose(2 * (both[moving, 0] - begins[0]), both[moving, 1] - begins[1], atol=1e-9)
+
+
+def test_a_fault_of_one_axis_stops_those_that_move_with_it_in_order(pair: SteppedDaemon) -> None:
+    begins = [axis.set_point.position_deg for axis in pair.axes]
+    pair.stream({
+        index: [(t, begins[index] + p, v) for t, p, v in quintic(3.0, 20.0)] for index in (0, 1)
+    })  # fmt: skip
+    pair.run(1.0)
+    pair.samples.read()
+    pair.nodes[0].faults.raise_error(0x3210)
+    pair.until(lambda: pair.states[0] is S.QUICK_STOPPED)
+    pair.until(lambda: pair.axes[1].set_point.at_rest)
+    assert pair.states == [S.QUICK_STOPPED, S.ENABLED]
+    samples, _ = pair.samples.read()
+    velocity = samples["axes"]["velocity_deg_s"][:, 1]
+    assert np.abs(np.diff(velocity)).max() <= 200.0 * 0.004 * 1.06
+    assert not pair.told(E.UNDERRUN)
+
+
+def test_an_axis_by_itself_goes_on_when_another_stops(pair: SteppedDaemon) -> None:
+    pair.move(5.0, 0)
+    id_ = pair.move(20.0, 1)
+    pair.nodes[0].faults.raise_error(0x3210)
+    pair.until(lambda: pair.ended(id_))
+    assert pair.states == [S.QUICK_STOPPED, S.ENABLED]
+
+
+def test_compensation_is_faded_out_and_in(enabled: SteppedDaemon) -> None:
+    enabled.run(1.0)
+    id_ = enabled.move(7.3)
+    enabled.until(lambda: enabled.ended(id_))
+    record(enabled)
+    enabled.done(K.COMPENSATE, i=0)
+    enabled.run(1.0)
+    axis = record(enabled)
+    assert axis["weight"][-1] == 0.0
+    assert axis["correction_arcsec"][-1] == 0.0
+    assert not axis["flags"][-1] & SampleFlag.COMPENSATING
+    assert np.abs(np.diff(axis["issued_deg"])).max() < 50 * 20_000 * 0.004 / 3600
+    enabled.done(K.COMPENSATE, i=1)
+    enabled.run(1.0)
+    assert record(enabled)["weight"][-1] == 1.0
+
+
+def test_another_model_takes_over_without_a_jump(enabled: SteppedDaemon) -> None:
+    enabled.run(1.0)
+    enabled.move(30.0, velocity_deg_s=5.0)
+    enabled.run(1.0)
+    config = enabled.axes[0].config
+    model = TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
+    other = compensation_for(config, model.only(("synchronous",)))
+    record(enabled)
+    enabled.done(K.CHANGE, i=enabled.memory.blobs.put(pickle.dumps(other)))
+    enabled.run(2.0)
+    assert len(enabled.told(E.CHANGED)) == 1
+    axis = record(enabled)
+    assert (axis["flags"] & SampleFlag.CHANGING).any()
+    assert not axis["flags"][-1] & SampleFlag.CHANGING
+    steps = np.diff(axis["issued_deg"])
+    assert np.abs(steps - 50 * 5.0 * 0.004).max() < 0.5  # a jump of the correction would be 5 deg
+    assert enabled.states == [S.ENABLED]
+
+
+def test_a_model_of_another_axis_is_refused(enabled: SteppedDaemon) -> None:
+    other = article_axes(2)[1]
+    model = TransmissionModel.load(PROFILE / "model.yaml").bound_to(other)
+    number = enabled.memory.blobs.put(pickle.dumps(compensation_for(other, model)))
+    answer = enabled.order(K.CHANGE, i=number)
+    assert answer.kind is E.REFUSED
+    assert "made for 'axis2'" in answer.text
+    assert enabled.order(K.CHANGE, i=number + 1).kind is E.REFUSED
+    assert enabled.order(K.CHANGE, i=enabled.memory.blobs.put(pickle.dumps("none"))).kind is E.REFUSED
+
+
+def test_a_load_loop_that_there_is_not_is_refused(enabled: SteppedDaemon) -> None:
+    answer = enabled.order(K.LOAD_LOOP, i=1)
+    assert answer.kind is E.REFUSED
+    assert "has no load loop" in answer.text
+
+
+def test_the_compensation_may_begin_switched_off() -> None:
+    with stepped_daemon(setup=lambda _, made: replace(made, compensating=False)) as daemon:
+        daemon.verify()
+        daemon.enable()
+        daemon.run(1.0)
+        assert record(daemon)["weight"].max() == 0.0
+
+
+def test_a_full_mailbox_is_emptied_eight_a_turn(enabled: SteppedDaemon) -> None:
+    ids = [enabled.post(K.STOP) for _ in range(100)]
+    enabled.turn()
+    assert len(enabled.memory.commands) == 92
+    enabled.run(0.1)
+    assert [each.id for each in enabled.told(E.DONE) if each.id >= ids[0]] == ids
+
+
+def test_a_loop_that_begins_anew_does_not_carry_out_what_was_posted_before(enabled: SteppedDaemon) -> None:
+    from hdbridge.daemon.loop.controller import Controller
+
+    enabled.post(K.ENABLE)
+    enabled.memory.knots[0].put([Knot(1, 0.0, 0.0, 0.0)])
+    cycle = enabled.controller.cycle
+    for axis in cycle.axes:
+        cycle.leave(axis)
+    setups = []
+    for axis in enabled.axes:
+        from hdbridge.daemon.loop.axisloop import AxisSetup
+
+        model = TransmissionModel(axis.config.gear.ratio)
+        setups.append(AxisSetup(axis.config, compensation_for(axis.config, model)))
+    again = Controller(cycle, setups, enabled.memory)
+    assert len(enabled.memory.commands) == 0
+    assert len(enabled.memory.knots[0]) == 0
+    for _ in range(50):
+        again.turn()
+    assert [axis.state for axis in again.axes] == [S.UNVERIFIED]

@@ -1,0 +1,93 @@
+"""What the relay lets through, by itself and on the bus."""
+
+from __future__ import annotations
+
+import pytest
+from support.daemon import SteppedDaemon
+
+from hdbridge.daemon.loop.relay import MAY_MOVE, incoming_ids, why_refused
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import EventKind
+
+UPLOAD, DOWNLOAD = bytes([0x40, 0x64, 0x60, 0, 0, 0, 0, 0]), bytes([0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0])
+READS = [UPLOAD, bytes([0x60, *bytes(7)]), bytes([0x80, *bytes(7)]), bytes([0xA0, *bytes(7)])]
+WRITES = [DOWNLOAD, bytes(8), bytes([0xC0, *bytes(7)]), bytes([0xE0, *bytes(7)]), b""]
+
+
+@pytest.mark.parametrize("state", list(AxisState))
+def test_reading_is_always_possible_writing_only_where_nothing_moves(state: AxisState) -> None:
+    for data in READS:
+        assert why_refused(0x601, data, {1: state}) is None
+    for data in WRITES:
+        refused = why_refused(0x601, data, {1: state})
+        assert (refused is not None) == (state in MAY_MOVE)
+    assert (why_refused(0x000, b"\x82\x01", {1: state}) is not None) == (state in MAY_MOVE)
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data"),
+    [
+        (0x080, b""),
+        (0x201, bytes(6)),
+        (0x77F, b"\x05"),
+        (0x600, UPLOAD),
+        (0x603, UPLOAD),
+        (0x581, UPLOAD),
+        (0x000, b"\x81\x00"),
+        (0x000, b"\x81\x03"),
+        (0x000, b"\x81"),
+        (0x000, b""),
+        (0x7E5, bytes(8)),
+    ],
+)
+def test_what_is_not_the_services_business_is_refused(can_id: int, data: bytes) -> None:
+    states = {1: AxisState.UNVERIFIED, 2: AxisState.DISABLED}
+    assert why_refused(can_id, data, states) is not None
+
+
+def test_one_axis_moving_does_not_keep_others_from_being_written() -> None:
+    states = {1: AxisState.ENABLED, 2: AxisState.DISABLED}
+    assert why_refused(0x602, DOWNLOAD, states) is None
+    assert why_refused(0x601, DOWNLOAD, states) == (
+        "SDO request to node 1: not while the axis is enabled; disable it first"
+    )
+
+
+def test_what_comes_in_is_answers_emergencies_and_everybodys_heartbeats() -> None:
+    wanted = incoming_ids([1, 5])
+    assert {0x581, 0x585, 0x081, 0x085, 0x701, 0x705, 0x742} <= wanted
+    assert not {0x080, 0x181, 0x201, 0x582, 0x000, 0x700, 0x780} & wanted
+
+
+def test_objects_can_be_read_in_motion_and_cost_no_cycle(enabled: SteppedDaemon) -> None:
+    id_ = enabled.move(20.0)
+    enabled.run(0.2)
+    reader = enabled.memory.reader()
+    drive = enabled.drive(0)
+    assert drive.sdo.read(0x1000) & 0xFFFF == 402
+    samples, _ = reader.read()
+    assert len(samples) > 1
+    assert (samples["axes"]["flags"] & 1).all()
+    assert not enabled.ended(id_)
+
+
+def test_a_write_in_motion_is_dropped_and_told(enabled: SteppedDaemon) -> None:
+    enabled.move(20.0)
+    sent: list[int] = []
+    enabled.bus.spy = lambda can_id, _: sent.append(can_id)
+    enabled.memory.outgoing.put(0, 0x601, DOWNLOAD)
+    enabled.memory.outgoing.put(0, 0x000, b"\x81\x01")
+    enabled.run(0.5)
+    assert not {0x601, 0x000} & set(sent)
+    assert "disable it first" in enabled.told(EventKind.REFUSED)[-1].text
+    assert enabled.states == [AxisState.ENABLED]
+
+
+def test_at_most_one_frame_a_turn(daemon: SteppedDaemon) -> None:
+    sent: list[int] = []
+    daemon.bus.spy = lambda can_id, _: sent.append(can_id)
+    for _ in range(10):
+        daemon.memory.outgoing.put(0, 0x601, UPLOAD)
+    for count in range(1, 11):
+        daemon.turn()
+        assert sent.count(0x601) == count

@@ -1,0 +1,70 @@
+"""The table of states by itself: what it promises whatever the rows are."""
+
+from __future__ import annotations
+
+import pytest
+
+from hdbridge.daemon.loop.states import (
+    TRANSITIONS,
+    AxisState,
+    Happening,
+    mermaid,
+    refusal,
+    target_of,
+)
+from hdbridge.daemon.memory import CommandKind
+
+S = AxisState
+
+
+def test_a_row_is_there_once() -> None:
+    assert len({(row.source, row.cause) for row in TRANSITIONS}) == len(TRANSITIONS)
+
+
+def test_only_an_enable_command_leads_towards_power() -> None:
+    ways = [row for row in TRANSITIONS if row.target is S.ENABLING and row.source is not S.ENABLING]
+    assert [(row.source, row.cause) for row in ways] == [(S.DISABLED, CommandKind.ENABLE)]
+    ways = [row for row in TRANSITIONS if row.target is S.ENABLED and row.source is not S.ENABLED]
+    assert [(row.source, row.cause) for row in ways] == [(S.ENABLING, Happening.POWERED)]
+
+
+def test_out_of_a_latch_leads_a_reset_alone() -> None:
+    for latched in (S.QUICK_STOPPED, S.LATCHED):
+        causes = {row.cause for row in TRANSITIONS if row.source is latched and row.target is not latched}
+        assert causes - {Happening.VERIFICATION_LOST} == {CommandKind.RESET}
+
+
+@pytest.mark.parametrize("state", list(AxisState))
+def test_to_stop_is_never_refused(state: AxisState) -> None:
+    for kind in (CommandKind.STOP, CommandKind.QUICK_STOP):
+        target = target_of(state, kind)
+        assert target is not None
+        assert target not in {S.ENABLING, S.ENABLED} or target is state
+
+
+@pytest.mark.parametrize("state", [S.DISABLED, S.ENABLING, S.ENABLED, S.STOPPING, S.LENT, S.QUICK_STOPPED])
+def test_a_lost_drive_latches_wherever_it_was_known(state: AxisState) -> None:
+    assert target_of(state, Happening.VERIFICATION_LOST) is S.LATCHED
+
+
+def test_every_state_is_reached_and_left() -> None:
+    for state in AxisState:
+        assert any(row.target is state for row in TRANSITIONS if row.source is not state)
+        assert any(row.source is state for row in TRANSITIONS if row.target is not state)
+
+
+def test_motion_is_possible_only_while_enabled() -> None:
+    for kind in (CommandKind.MOVE, CommandKind.JOG, CommandKind.STREAM_BEGIN):
+        assert [state for state in AxisState if target_of(state, kind) is not None] == [S.ENABLED]
+
+
+def test_a_refusal_says_what_to_do() -> None:
+    assert refusal(S.QUICK_STOPPED, CommandKind.ENABLE) == (
+        "enable is not possible while the axis is quick stopped: remove the cause, then reset it"
+    )
+
+
+def test_the_diagram_names_every_state_and_the_way_to_power() -> None:
+    text = mermaid()
+    assert all(state.name in text for state in AxisState)
+    assert "DISABLED --> ENABLING: ENABLE" in text

@@ -1,0 +1,285 @@
+"""The daemon's control loop with simulated drives, in one thread on virtual time: `SteppedDaemon`.
+
+Whoever waits on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as
+many turns as fit. So everything of the service runs here as it is, and as fast as the processor.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+import can
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.daemon.loop.axisloop import AxisSetup
+from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import Link
+from hdbridge.drive.objects import Mode
+from hdbridge.model import TransmissionModel
+from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
+from hdbridge.sim.node import SimulatedDrive
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+EVENTS_KEPT = 1000
+
+
+class SpoiltBus(LockstepBus):
+    """The loop's end of the channel: an interface that can fail, with a spy who sees what is sent."""
+
+    def __init__(self, channel: str, clock: VirtualClock) -> None:
+        super().__init__(channel, clock)
+        self.clock = clock
+        self.no_room_for: int | None = None
+        """Identifier of a frame for which the transmit queue is full, once."""
+        self.spy: Callable[[int, bytes], None] | None = None
+        self.down = False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.down:
+            raise can.CanOperationError("Network is down", errno.ENETDOWN)
+        if msg.arbitration_id == self.no_room_for:
+            self.no_room_for = None
+            raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
+        if self.spy is not None:
+            self.spy(msg.arbitration_id, bytes(msg.data))
+        super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self.down:
+            raise can.CanOperationError("Network is down", errno.ENETDOWN)
+        return super().recv(timeout)
+
+
+class SteppedClock:
+    """The service's clock: to wait on it turns the loop."""
+
+    def __init__(self, daemon: SteppedDaemon) -> None:
+        self._daemon = daemon
+
+    def now(self) -> float:
+        return self._daemon.clock.now()
+
+    def sleep_until(self, deadline_s: float) -> None:
+        while self._daemon.clock.now() < deadline_s:
+            self._daemon.turn()
+
+
+class SteppedRelay(can.BusABC):
+    """The service's end of the relay: the loop sends what it sends, and turns while it waits."""
+
+    def __init__(self, daemon: SteppedDaemon) -> None:
+        super().__init__(channel=None)
+        self.channel_info = "the relay"
+        self.private = True
+        self._daemon = daemon
+        self._reader = daemon.memory.incoming_reader()
+        self._waiting: deque[can.Message] = deque()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id >= 0x700:
+            return  # the master's heartbeat is the loop's
+        self._daemon.memory.outgoing.put(0, msg.arbitration_id, bytes(msg.data))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        clock = self._daemon.clock
+        deadline_s = clock.now() + (math.inf if timeout is None else timeout)
+        while True:
+            for frame in self._reader.read()[0]:
+                self._waiting.append(
+                    can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
+                )
+            if self._waiting:
+                return self._waiting.popleft()
+            if clock.now() >= deadline_s:
+                return None
+            self._daemon.turn()
+
+
+class SteppedDaemon:
+    """A control loop, its simulated drives, and a service's hands."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        memory: Memory,
+        clock: VirtualClock,
+        bus: SpoiltBus,
+        nodes: Sequence[SimulatedDrive],
+        intruder: can.BusABC,
+    ) -> None:
+        self.controller, self.memory, self.clock = controller, memory, clock
+        self.bus, self.nodes, self.intruder = bus, nodes, intruder
+        self.axes = controller.axes
+        self.period_s = controller.cycle.period_s
+        self.service_clock = SteppedClock(self)
+        self.samples = memory.reader()
+        self._events = memory.event_reader()
+        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        """What the loop has told, the newest."""
+        self.drives: list[Drive] = []
+        self._relay = SteppedRelay(self)
+        self._streams = 0
+
+    # ---------------------------------------------------------------- time
+
+    def turn(self, turns: int = 1) -> None:
+        for _ in range(turns):
+            self.controller.turn()
+        events, lost = self._events.read()
+        assert lost == 0
+        self.events.extend(events)
+
+    def run(self, duration_s: float) -> None:
+        self.turn(round(duration_s / self.period_s))
+
+    def until(self, done: Callable[[], bool], timeout_s: float = 5.0) -> None:
+        for _ in range(round(timeout_s / self.period_s)):
+            if done():
+                return
+            self.turn()
+        raise AssertionError(f"not within {timeout_s} s; states {self.states}, told {list(self.events)[-5:]}")
+
+    # ---------------------------------------------------------------- what is
+
+    @property
+    def states(self) -> list[AxisState]:
+        return [axis.state for axis in self.axes]
+
+    def told(self, kind: EventKind, axis: int | None = None) -> list[Event]:
+        return [each for each in self.events if each.kind is kind and axis in (None, each.axis)]
+
+    # ---------------------------------------------------------------- what a service does
+
+    def post(self, kind: CommandKind, axis: int = 0, **fields: float) -> int:
+        return self.memory.commands.post(kind, axis, **fields)  # type: ignore[arg-type]
+
+    def order(self, kind: CommandKind, axis: int = 0, timeout_s: float = 5.0, **fields: float) -> Event:
+        """Post a command and turn until it is answered."""
+        id_ = self.post(kind, axis, **fields)
+        answers = (EventKind.DONE, EventKind.REFUSED)
+        found: list[Event] = []
+
+        def answered() -> bool:
+            found[:] = [each for each in self.events if each.id == id_ and each.kind in answers]
+            return bool(found)
+
+        self.until(answered, timeout_s)
+        return found[0]
+
+    def done(self, kind: CommandKind, axis: int = 0, **fields: float) -> None:
+        """`order`, and it has to be done."""
+        answer = self.order(kind, axis, **fields)
+        assert answer.kind is EventKind.DONE, answer.text
+
+    def drive(self, axis: int) -> Drive:
+        """The service's drive object of an axis, over the relay."""
+        while len(self.drives) <= axis:
+            config = self.axes[len(self.drives)].config
+            self.drives.append(Drive(self._relay, config, self.service_clock, force=True))
+        return self.drives[axis]
+
+    def seeds(self, axis: int) -> dict[str, int]:
+        """Counts of both encoders and statusword, read by SDO: the fields of VERIFIED and ENABLE."""
+        drive = self.drive(axis)
+        positions = drive.read_positions()
+        drive.state()
+        return {"i": positions.motor_counts, "j": positions.load_counts, "k": drive.image.statusword or 0}
+
+    def verify(self, axis: int = 0) -> None:
+        """Boot the drive by SDO over the relay, and say so."""
+        self.drive(axis).boot()
+        self.done(CommandKind.VERIFIED, axis, **self.seeds(axis))
+
+    def prepare(self, axis: int = 0) -> dict[str, int]:
+        """What is done by SDO before ENABLE; the command's fields."""
+        drive = self.drive(axis)
+        drive.enable(Mode.CSP)
+        image = drive.image
+        return {"i": image.motor_counts, "j": image.load_counts, "k": image.statusword or 0}
+
+    def enable(self, axis: int = 0) -> None:
+        self.done(CommandKind.ENABLE, axis, **self.prepare(axis))
+
+    def move(self, target_deg: float, axis: int = 0, velocity_deg_s: float = math.nan) -> int:
+        """Begin a move; the command's id."""
+        answer = self.order(CommandKind.MOVE, axis, a=target_deg, b=velocity_deg_s, c=math.nan)
+        assert answer.kind is EventKind.DONE, answer.text
+        return answer.id
+
+    def ended(self, id_: int) -> bool:
+        return any(each.kind is EventKind.MOTION_ENDED and each.id == id_ for each in self.events)
+
+    def stream(self, knots: dict[int, Sequence[tuple[float, float, float]]], timeout_s: float = 0.5) -> Event:
+        """Begin a stream of one axis or several, its knots (time, position, velocity) queued before."""
+        self._streams += 1
+        for axis, points in knots.items():
+            wanted = [Knot(self._streams, *point) for point in points]
+            assert self.memory.knots[axis].put(wanted) == len(wanted)
+        mask = sum(1 << axis for axis in knots)
+        return self.order(CommandKind.STREAM_BEGIN, min(knots), a=timeout_s, i=mask, j=self._streams)
+
+    # ---------------------------------------------------------------- what goes wrong
+
+    def interfere(self, can_id: int, data: bytes = b"") -> None:
+        """A frame from another node, on the bus before the next turn."""
+        self.intruder.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def hang(self, duration_s: float) -> None:
+        """The control process does nothing for so long; the drives go on."""
+        self.clock.sleep_until(self.clock.now() + duration_s)
+
+
+def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
+    """So many axes of one kind on one bus: nodes 1, 2, ..."""
+    first = AxisConfig.load(profile)
+    return [
+        first.model_copy(
+            update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
+        )
+        for node in range(1, count + 1)
+    ]
+
+
+@contextmanager
+def stepped_daemon(
+    axes: int | Sequence[AxisConfig] = 1,
+    model: TransmissionModel | None = None,
+    setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
+    truth: Path = PROFILE / "truth.yaml",
+) -> Iterator[SteppedDaemon]:
+    """A control loop with simulated axes, none verified yet; with the article's model by default."""
+    configs = article_axes(axes) if isinstance(axes, int) else axes
+    known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")
+    channel = f"daemon-{uuid4()}"
+    simulated = [
+        SimulatedAxis(truth, each.eds_path, each.drive.node_id, seed) for seed, each in enumerate(configs)
+    ]
+    with ExitStack() as stack:
+        bus, clock, nodes = stack.enter_context(simulated_benches(simulated, channel))
+        bus.shutdown()
+        intruder = stack.enter_context(can.Bus(interface="virtual", channel=channel, ignore_config=True))
+        spoilt = stack.enter_context(SpoiltBus(channel, clock))
+        memory = stack.enter_context(Memory.create(len(configs), configs[0].drive.cycle_s))
+        cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=1_000_000)
+        setups = [
+            setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
+        ]
+
+        def reopen() -> Link | None:
+            return None if spoilt.down else Link(spoilt, clock)
+
+        controller = Controller(cycle, setups, memory, reopen)
+        daemon = SteppedDaemon(controller, memory, clock, spoilt, nodes, intruder)
+        yield daemon
+        daemon._relay.shutdown()
