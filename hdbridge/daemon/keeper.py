@@ -196,7 +196,8 @@ class Keeper:
         self._served.look(status.service_time_ns)
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         self._kill_hung(self._service, self._served, self._times.service_hung_s)
-        if not self._ready and self._turns.begun and self._served.begun:
+        serving = self._service is not None and status.service_pid == self._service.pid
+        if not self._ready and self._turns.begun and serving:
             self._ready = True
             self._notifier.ready()
             _log.info("ready", self._facts())

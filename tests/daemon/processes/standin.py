@@ -23,6 +23,7 @@ def main(kind: str, *arguments: str) -> int:
     signal.signal(signal.SIGTERM, lambda *_: told.append("term"))
     with Memory.attach(start.memory_fd) as memory:
         status = memory.status
+        time.sleep(0.05)
         status.set(Cell.LOOP_PID if kind == "control" else Cell.SERVICE_PID, os.getpid())
         print(f"{kind} {os.getpid()} {start.restarts}", flush=True)
         while not told and not (kind == "control" and status.stop_asked):
