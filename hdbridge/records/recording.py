@@ -1,7 +1,8 @@
 """A recording: a record, what moved how in it, and where it comes from; one folder, or somebody's CSV files.
 
-The folder holds ``record.csv.gz`` and ``recording.yaml``. The latter is written last and names the former's
-checksum: a folder without it is not a recording, and raw data that were touched are noticed.
+The folder holds ``record.csv.gz`` (several files where the record has several parts) and ``recording.yaml``.
+The latter is written last and names the former's checksum: a folder without it is not a recording, and raw
+data that were touched are noticed.
 """
 
 from __future__ import annotations
@@ -146,7 +147,10 @@ class Recording:
         return cls(concatenate(records), tuple(segments), **common)
 
     def save(self, folder: Path | str) -> None:
-        """Write the folder; refused (InputError) where there is a recording already: raw data stay."""
+        """Write the folder, a file for each part of the record.
+
+        Refused (InputError) where there is a recording already: raw data stay.
+        """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
             raise InputError(f"{folder}: there is a recording already; expected a new folder")
@@ -154,12 +158,15 @@ class Recording:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as problem:
             raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
-        self.record.write_csv(folder / RECORD_NAME)
-        write_atomically(
-            folder / ABOUT_NAME, HEADER + dump_yaml(self._about(sha256_of(folder / RECORD_NAME)))
-        )
+        parts = self.record.parts()
+        files = []
+        for number, part in enumerate(parts, 1):
+            path = folder / (RECORD_NAME if len(parts) == 1 else f"record-{number:03d}.csv.gz")
+            part.write_csv(path)
+            files.append({"name": path.name, "sha256": sha256_of(path), "samples": len(part)})
+        write_atomically(folder / ABOUT_NAME, HEADER + dump_yaml(self._about(files)))
 
-    def _about(self, sha256: str) -> dict[str, Any]:
+    def _about(self, files: list[dict[str, Any]]) -> dict[str, Any]:
         drive = self.drive.model_dump(exclude_none=True) if self.drive else {}
         about: dict[str, Any] = {
             "schema": "hdbridge.recording/1",
@@ -169,7 +176,7 @@ class Recording:
             "date": self.date,
             "versions": self.versions,
             "notes": self.notes,
-            "files": [{"name": RECORD_NAME, "sha256": sha256, "samples": len(self.record)}],
+            "files": files,
             "segments": [
                 each.model_dump(exclude={"notes"}) | ({"notes": each.notes} if each.notes else {})
                 for each in self.segments

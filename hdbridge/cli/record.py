@@ -1,0 +1,309 @@
+"""``hdbridge record``: the daemon's flight recordings: look, mend, and make records of them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from hdbridge.cli.options import JsonOption, console, notes, print_table, write_json, write_result
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import check_writable
+from hdbridge.files.outputs import Kind
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.recorder.reading import Flight, Overview
+    from hdbridge.records.recording import Recording
+
+_EXTRA = ("mcap", "google.protobuf")
+_NS = 10**9
+
+FlightsArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(
+        help="The daemon's flight recordings: list, mend, and make records for fit and diagnose.",
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+    )
+    group.command("list")(overviews)
+    group.command()(info)
+    group.command()(mend)
+    group.command()(export)
+    app.add_typer(group, name="record")
+
+
+def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
+    """List recordings: from when to when, how large, and what stopped an axis in them."""
+    _need_extra()
+    from hdbridge.daemon.recorder.reading import flight_files, overview
+
+    found = [overview(each) for each in flight_files(flights)]
+    write_json(json_file, {"schema": "hdbridge.flights/1", "flights": [_overview(each) for each in found]})
+    table = Table("recording", "begins", "duration", "MB", "faults and marks")
+    for each in found:
+        name = each.path.name + ("" if each.finished else " (not finished)")
+        stops = [event for event in each.events if event.kind in {"STOPPED", "BUS_DOWN", "MARK"}]
+        table.add_row(
+            escape(name),
+            f"{_date(each.first_ns):%Y-%m-%d %H:%M:%S}",
+            f"{(each.last_ns - each.first_ns) / _NS:,.0f} s",
+            f"{each.size / 1e6:.1f}",
+            escape("; ".join(f"{event.name}: {event.text or event.kind.lower()}" for event in stops[:3])),
+        )
+    print_table(table)
+
+
+def info(
+    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A flight recording.")],
+    json_file: JsonOption = None,
+) -> None:
+    """Tell what a recording holds: machine, axes, models, cycles that are missing, events."""
+    _need_extra()
+    import numpy as np
+
+    from hdbridge.daemon.recorder.reading import read
+
+    _need_file(flight)
+    found = read(flight)
+    about = found.about
+    steps = np.diff(found.machine["cycle"])
+    missing = int(np.sum(steps[steps > 1] - 1))
+    document: dict[str, Any] = {
+        "schema": "hdbridge.flight-info/1",
+        "machine": about.machine,
+        "finished": found.finished,
+        "from": _date(found.first_ns).isoformat(),
+        "to": _date(found.last_ns).isoformat(),
+        "period_s": about.period_s,
+        "cycles": len(found.machine["cycle"]),
+        "cycles_missing": missing,
+        "restarts": int(np.count_nonzero(steps <= 0)),
+        "versions": dict(about.versions),
+        "axes": [
+            {
+                "name": each.name,
+                "ratio": each.ratio,
+                "drive": each.identity.model_dump(exclude_none=True) if each.identity else None,
+                "enabled_s": float(np.count_nonzero(np.isin(found.axes[each.name]["state"], (3, 4))))
+                * about.period_s,
+                "models": [used.version for used in found.models if used.axis == each.name],
+            }
+            for each in about.axes
+        ],
+        "events": [_event(each) for each in found.events],
+    }
+    write_json(json_file, document)
+    _say(f"machine '{about.machine}', {document['from']} to {document['to']}")
+    _say(
+        f"{document['cycles']} cycles of {1e3 * about.period_s:g} ms, {missing} missing, "
+        f"{document['restarts']} restarts of the loop"
+        + ("" if found.finished else "; not finished: hdbridge record mend")
+    )
+    for each in document["axes"]:
+        models = f"; models {', '.join(each['models'])}" if any(each["models"]) else ""
+        _say(f"axis '{each['name']}', ratio {each['ratio']:g}, enabled for {each['enabled_s']:.1f} s{models}")
+    for told in found.events:
+        _say(f"{_date(told.time_ns):%H:%M:%S.%f}  {told.name}  {told.kind.lower()}  {told.text}")
+
+
+def mend(flights: FlightsArgument) -> None:
+    """Finish recordings that were cut off (kill, power): whole up to their last second.
+
+    The daemon does this itself when it starts. One that is being written is refused.
+    """
+    _need_extra()
+    from hdbridge.daemon.recorder import mend as mending
+    from hdbridge.daemon.recorder.reading import flight_files, overview
+
+    for path in flight_files(flights):
+        if path.name.endswith(".mcap") and overview(path).finished:
+            continue
+        done = mending.mend(path)
+        _say(f"{done}: finished" if done is not None else f"{path}: nothing in it was whole; removed")
+
+
+def export(
+    flights: FlightsArgument,
+    axis: Annotated[
+        str | None, typer.Option("--axis", metavar="NAME", help="Which axis, where there are several.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER|FILE.csv",
+            help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+        ),
+    ] = None,
+    begin: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="TIME", help="From this time on, ISO 8601, UTC unless it says otherwise."
+        ),
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Up to this time.")] = None,
+    all_states: Annotated[
+        bool, typer.Option("--all-states", help="Also where the axis was not enabled.")
+    ] = False,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end, too."
+        ),
+        Kind.MODEL,
+    ] = None,
+) -> None:
+    """Make a record of one axis, as `fit` and `diagnose` read it.
+
+    Nothing is rounded or interpolated. Where cycles are missing, or the axis was not enabled, a new part
+    begins: a recording folder has a file for each part. Of a CSV file there can be only one part.
+    """
+    _need_extra()
+    from hdbridge.daemon.recorder.export import axis_of, exported, last_model
+    from hdbridge.daemon.recorder.reading import flight_files, overview, read
+
+    if out is None:
+        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
+    _check_out(out)
+    limits = (_time_ns(begin, "--from"), _time_ns(end, "--to"))
+    found: list[Flight] = []
+    for path in flight_files(flights):
+        about = overview(path)
+        if not _outside(about, *limits):
+            found.append(read(path, (axis_of(about.about, axis, path)[1].name,)))
+    if not found:
+        raise InputError(f"{flights[0]}: nothing was recorded between --from and --to")
+    found.sort(key=lambda each: each.first_ns)
+    recording = exported(found, axis, all_states=all_states, start_ns=limits[0], end_ns=limits[1])
+    assert recording.axis is not None
+    used = last_model(found, recording.axis)
+    if model is not None and (used is None or not used.text):
+        raise InputError(f"{flights[0]}: no model was in use; leave out --model-out")
+    _write(recording, out)
+    if model is not None and used is not None:
+        write_result(model, used.text)
+    _print_export(recording, out)
+
+
+def _write(recording: Recording, out: Path) -> None:
+    if not _is_csv(out):
+        recording.save(out)
+        return
+    parts = recording.record.parts()
+    if len(parts) > 1:
+        raise InputError(
+            f"{out}: the record has {len(parts)} parts, between which nothing is known of the axis; expected "
+            "a folder for --out, or a time without gaps by --from and --to"
+        )
+    recording.record.write_csv(out)
+
+
+def _print_export(recording: Recording, out: Path) -> None:
+    record, about = recording.record, recording.notes
+    parts = about["parts"]
+    lengths = [float(each.time_s[-1] - each.time_s[0]) for each in record.parts()]
+    _say(
+        f"{out}: axis '{recording.axis}', {len(record)} samples in {parts} "
+        f"part{'s' * (parts != 1)}, {sum(lengths):.1f} s"
+    )
+    if count := about.get("cycles_missing_within_parts"):
+        notes.print(f"{count} cycles are missing within parts: the time goes on over them")
+    if count := about.get("parts_too_short"):
+        notes.print(f"{count} parts were too short and are left out")
+    if about.get("zeros_may_differ"):
+        notes.print(
+            "the drive was booted or homed meanwhile: where its encoders' zeros are lost with that, say "
+            "--independent-zeros to fit and diagnose"
+        )
+
+
+def _check_out(out: Path) -> None:
+    if _is_csv(out):
+        check_writable(out)
+        if out.exists():
+            raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
+
+
+def _is_csv(path: Path) -> bool:
+    return path.name.endswith((".csv", ".csv.gz"))
+
+
+def _outside(about: Overview, begin_ns: int | None, end_ns: int | None) -> bool:
+    return (begin_ns is not None and about.last_ns < begin_ns) or (
+        end_ns is not None and about.first_ns > end_ns
+    )
+
+
+def _need_extra() -> None:
+    """InputError where what reads recordings is not installed."""
+    lacking = [name for name in _EXTRA if not _found(name)]
+    if lacking:
+        raise InputError(
+            f"flight recordings need {', '.join(lacking)}: python -m pip install 'hdbridge[daemon]'"
+        )
+
+
+def _found(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _need_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; expected a flight recording")
+
+
+def _time_ns(text: str | None, option: str) -> int | None:
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"{option}: found '{text}'; expected a time such as 2026-03-01T12:30:00") from None
+    return round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * _NS)
+
+
+def _date(time_ns: int) -> datetime:
+    return datetime.fromtimestamp(time_ns / _NS, UTC)
+
+
+def _overview(each: Overview) -> dict[str, Any]:
+    return {
+        "file": str(each.path),
+        "machine": each.about.machine,
+        "axes": [axis.name for axis in each.about.axes],
+        "finished": each.finished,
+        "from": _date(each.first_ns).isoformat(),
+        "to": _date(each.last_ns).isoformat(),
+        "bytes": each.size,
+        "cycles": each.cycles,
+        "events": [_event(event) for event in each.events],
+    }
+
+
+def _event(event: Any) -> dict[str, Any]:
+    return {
+        "date": _date(event.time_ns).isoformat(),
+        "name": event.name,
+        "kind": event.kind,
+        "text": event.text,
+    }
+
+
+def _say(line: str) -> None:
+    console.print(line, markup=False, soft_wrap=True)

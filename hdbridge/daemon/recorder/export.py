@@ -1,0 +1,167 @@
+"""From a flight recording to a record: what `fit` and `diagnose` read.
+
+The columns are those of the bench: time is the number of the cycle times the period, the motor's target is
+the drive's demand. Cycles without fresh feedback are left out: what stands in them was not measured.
+
+Where the axis was not enabled it is left out unless asked for. Where more than `GAP_CYCLES` cycles are
+missing (lost, skipped, not fresh, or the axis was off) nothing is known of the path between, so a new part
+begins; within a part time goes on over the few that are missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.daemon.memory import SampleFlag
+from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.reading import Flight, ModelUsed
+from hdbridge.daemon.recorder.wire import STATES
+from hdbridge.errors import InputError
+from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Recording
+
+GAP_CYCLES: Final = 5
+"""Within so few missing cycles the motor does not reverse and come back unnoticed."""
+PART_SAMPLES: Final = 50
+"""A shorter part is left out."""
+ENABLED: Final = (STATES.index("ENABLED"), STATES.index("STOPPING"))
+UNSEATED: Final = (STATES.index("UNVERIFIED"), STATES.index("LENT"))
+"""Afterwards the encoders' zeros may be others: the drive was booted, or homed."""
+MEASURED: Final = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
+SAME_RUN_S: Final = 0.5
+Columns = Mapping[str, NDArray[Any]]
+_NS: Final = 1e9
+
+
+def axis_of(about: About, name: str | None, where: Path) -> tuple[int, AxisAbout]:
+    """The axis of that name, or the only one; InputError says which there are."""
+    names = [each.name for each in about.axes]
+    if name is None and len(names) == 1:
+        return 0, about.axes[0]
+    if name not in names:
+        which = "which axis?" if name is None else f"no axis '{name}';"
+        raise InputError(f"{where}: {which} expected --axis with one of: {', '.join(names)}")
+    return names.index(name), about.axes[names.index(name)]
+
+
+def exported(
+    flights: Sequence[Flight],
+    axis: str | None = None,
+    *,
+    all_states: bool = False,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Recording:
+    """One axis of recordings in the order of their time; ``start_ns`` and ``end_ns`` are times of day.
+
+    InputError where the axis is not in them, they are of different gears, or nothing is left.
+    """
+    if not flights:
+        raise InputError("no flight recording; expected at least one")
+    known = [axis_of(each.about, axis, each.path)[1] for each in flights]
+    for flight, each in zip(flights, known, strict=True):
+        if each.ratio != known[0].ratio:
+            raise InputError(
+                f"{flight.path}: the gear of '{each.name}' has a ratio of {each.ratio:g}, in "
+                f"{flights[0].path} it is {known[0].ratio:g}; export them one by one"
+            )
+    rows = _joined(
+        [
+            _rows(flight, about.name, all_states=all_states, start_ns=start_ns, end_ns=end_ns)
+            for flight, about in zip(flights, known, strict=True)
+        ]
+    )
+    period_s = flights[0].about.period_s
+    cuts, missing = _cuts(rows, period_s)
+    pieces = _split(rows, cuts)
+    parts = [_record(each, known[0], period_s) for each in pieces if len(each["cycle"]) >= PART_SAMPLES]
+    if not parts:
+        state = "" if all_states else " while it was enabled (--all-states takes the rest, too)"
+        raise InputError(
+            f"{flights[0].path}: nothing of axis '{known[0].name}' to export{state}: "
+            f"{len(rows['cycle'])} such cycles, no {PART_SAMPLES} of them together"
+        )
+    return Recording(
+        concatenate(parts),
+        axis=known[0].name,
+        ratio=known[0].ratio,
+        drive=known[0].identity,
+        date=datetime.fromtimestamp(int(rows["clock_ns"][0]) / _NS, UTC).isoformat(timespec="seconds"),
+        versions=dict(flights[0].about.versions),
+        notes=_notes(flights, known[0].name, len(parts), missing, len(pieces) - len(parts)),
+    )
+
+
+def last_model(flights: Sequence[Flight], axis: str) -> ModelUsed | None:
+    """The model that the axis used at the end; None where none was written down."""
+    used = [each for flight in flights for each in flight.models if each.axis == axis]
+    return used[-1] if used else None
+
+
+def _rows(
+    flight: Flight, axis: str, *, all_states: bool, start_ns: int | None, end_ns: int | None
+) -> Columns:
+    columns = dict(flight.axes[axis])
+    columns["clock_ns"] = flight.machine["time_ns"] + flight.about.offset_ns
+    chosen = (columns["flags"] & SampleFlag.FRESH) != 0
+    if not all_states:
+        chosen &= np.isin(columns["state"], ENABLED)
+    if start_ns is not None:
+        chosen &= columns["clock_ns"] >= start_ns
+    if end_ns is not None:
+        chosen &= columns["clock_ns"] <= end_ns
+    return {name: column[chosen] for name, column in columns.items()}
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    return {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
+
+
+def _cuts(rows: Columns, period_s: float) -> tuple[NDArray[np.intp], int]:
+    """Where a new part begins, and how many cycles are missing within the parts.
+
+    The cycles count on from file to file, and begin anew with the control process; then the clock does not go
+    with them.
+    """
+    steps = np.diff(rows["cycle"])
+    apart_s = np.abs(np.diff(rows["clock_ns"]) / _NS - steps * period_s)
+    cut = (steps <= 0) | (steps > GAP_CYCLES + 1) | (apart_s > SAME_RUN_S)
+    return np.flatnonzero(cut) + 1, int(np.sum(steps[~cut] - 1))
+
+
+def _split(rows: Columns, cuts: NDArray[np.intp]) -> list[Columns]:
+    edges = [0, *cuts.tolist(), len(rows["cycle"])]
+    return [{name: column[first:end] for name, column in rows.items()} for first, end in pairwise(edges)]
+
+
+def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
+    columns = {"time_s": rows["cycle"] * period_s, **{name: rows[name] for name in MEASURED}}
+    for place, channel in enumerate(axis.channels):
+        if np.all(rows["flags"] & (SampleFlag.CHANNEL0_KNOWN << place)):
+            columns[channel] = rows[f"reading{place}"]
+    return Record(columns)
+
+
+def _notes(flights: Sequence[Flight], axis: str, parts: int, missing: int, shorts: int) -> dict[str, Any]:
+    """What is to be known of how the record came about."""
+    model = last_model(flights, axis)
+    notes: dict[str, Any] = {
+        "source": [each.path.name for each in flights],
+        "machine": flights[0].about.machine,
+        "parts": parts,
+        "cycles_missing_within_parts": missing,
+        "parts_too_short": shorts,
+        "model": model.version if model else None,
+        "stops": [each.text for flight in flights for each in flight.events if each.kind == "STOPPED"],
+        "zeros_may_differ": any(
+            bool(np.any(np.isin(each.axes[axis]["state"], UNSEATED))) for each in flights
+        ),
+    }
+    return {name: value for name, value in notes.items() if value not in (None, 0, [], False)}

@@ -1,0 +1,227 @@
+"""One file of the flight recorder while it is written: MCAP, whole up to its last flush, whatever happens.
+
+A message goes into a chunk in memory; `flush` writes the chunk and has the disk confirm it. A file that was
+not finished has no index, but all its chunks: `mend` writes it again, finished. Until then its name ends in
+``.part``, and its writer holds a lock on it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from mcap.writer import CompressionType, Writer
+
+from hdbridge.daemon.memory import Event, EventKind, SampleArray
+from hdbridge.daemon.recorder.about import About
+from hdbridge.daemon.recorder.wire import AXIS, MACHINE, Message, axis_messages, machine_messages
+
+PART: Final = ".part"
+CHUNK_BYTES: Final = 64 << 20
+"""Larger than any second: chunks end where they are flushed."""
+EVENTS: Final = "/events"
+MODEL: Final = "/model"
+MACHINE_TOPIC: Final = "/machine"
+_LEVELS: Final = {"info": 2, "warning": 3, "error": 4}
+_BAD: Final = {
+    EventKind.STOPPED: "error",
+    EventKind.BUS_DOWN: "error",
+    EventKind.FAULT: "warning",
+    EventKind.REFUSED: "warning",
+    EventKind.STREAM_REFUSED: "warning",
+    EventKind.UNDERRUN: "warning",
+}
+_TEXT: Final = {"type": "string"}
+_NUMBER: Final = {"type": "integer"}
+_EVENT_SCHEMA: Final = {
+    "type": "object",
+    "properties": {
+        # Those of Foxglove's own log messages, so that its log panel shows them.
+        "timestamp": {"type": "object", "properties": {"sec": _NUMBER, "nsec": _NUMBER}},
+        "level": _NUMBER,
+        "message": _TEXT,
+        "name": _TEXT,
+        "file": _TEXT,
+        "line": _NUMBER,
+        "kind": _TEXT,
+        "cycle": _NUMBER,
+        "id": _NUMBER,
+        "code": _NUMBER,
+    },
+}
+_MODEL_SCHEMA: Final = {"type": "object", "properties": {"axis": _TEXT, "version": _TEXT, "text": _TEXT}}
+
+
+def axis_topic(name: str) -> str:
+    """Where the samples of an axis are."""
+    return f"/axis/{name}/sample"
+
+
+class _Stream:
+    """What MCAP's writer writes to: bytes wait here until `commit` has them on the disk.
+
+    A commit that fails leaves nothing half written, and may be tried again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._waiting = bytearray()
+        self._written = 0
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._written + len(self._waiting)
+
+    def flush(self) -> None:
+        """The writer flushes whenever it likes; what counts is `commit`."""
+
+    @property
+    def waiting(self) -> int:
+        return len(self._waiting)
+
+    def commit(self) -> None:
+        view = memoryview(bytes(self._waiting))
+        done = 0
+        try:
+            while done < len(view):
+                done += os.write(self.descriptor, view[done:])
+            os.fsync(self.descriptor)
+        except OSError:
+            os.ftruncate(self.descriptor, self._written)
+            os.lseek(self.descriptor, self._written, os.SEEK_SET)
+            raise
+        self._written += len(view)
+        self._waiting.clear()
+
+
+class FlightFile:
+    """Writes one file."""
+
+    def __init__(self, path: Path, about: About) -> None:
+        """``path`` is the finished file's name. OSError where it cannot be made."""
+        self.path = path
+        self._part = path.with_name(path.name + PART)
+        self._about = about
+        self._stream = _Stream(self._part)
+        try:
+            fcntl.flock(self._stream.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._writer = Writer(
+                self._stream,  # type: ignore[arg-type]  # all that it asks of a stream
+                chunk_size=CHUNK_BYTES,
+                compression=CompressionType.ZSTD,
+            )
+            self._writer.start(library=f"hdbridge {about.versions.get('hdbridge', '')}".strip())
+            for name, data in about.metadata().items():
+                self._writer.add_metadata(name, data)
+            self._machine = self._protobuf(MACHINE_TOPIC, self._schema(MACHINE))
+            axis = self._schema(AXIS)
+            self._axes = [self._protobuf(axis_topic(each.name), axis) for each in about.axes]
+            self._events = self._json(EVENTS, "foxglove.Log", _EVENT_SCHEMA)
+            self._models = self._json(MODEL, "hdbridge.Model", _MODEL_SCHEMA)
+            self._stream.commit()
+        except BaseException:
+            self.abandon()
+            self._part.unlink()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return self._stream.tell()
+
+    @property
+    def behind(self) -> int:
+        """Bytes that a flush could not write."""
+        return self._stream.waiting
+
+    def add_samples(self, samples: SampleArray) -> None:
+        """One message per cycle of the machine and of each axis."""
+        times = (samples["time_ns"] + self._about.offset_ns).tolist()
+        numbers = (samples["sequence"] & 0xFFFFFFFF).tolist()
+        self._add(self._machine, times, numbers, machine_messages(samples))
+        for place, channel in enumerate(self._axes):
+            self._add(channel, times, numbers, axis_messages(samples, place))
+
+    def add_event(self, event: Event) -> None:
+        """Something that the loop told."""
+        axes = self._about.axes
+        name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
+        kind = EventKind(event.kind)
+        self._tell(event.time_ns, name, kind.name, event.text, _BAD.get(kind, "info"), event)
+
+    def note(self, time_ns: int, kind: str, text: str, level: str = "info") -> None:
+        """Something that the recorder itself, or a client, has to say."""
+        self._tell(time_ns, self._about.machine, kind, text, level)
+
+    def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
+        """The model that an axis uses from now on."""
+        self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
+
+    def flush(self) -> None:
+        """Write what came since; it is on the disk then. OSError: it waits for the next flush."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._stream.commit()
+
+    def finish(self) -> None:
+        """Write the index; the file has its own name then. OSError: it stays a part, to be mended."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        try:
+            self._stream.commit()
+            self._part.rename(self.path)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close it as it is."""
+        if self._stream.descriptor >= 0:
+            os.close(self._stream.descriptor)
+            self._stream.descriptor = -1
+
+    def _tell(
+        self, time_ns: int, name: str, kind: str, text: str, level: str, event: Event | None = None
+    ) -> None:
+        seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)
+        content = {
+            "timestamp": {"sec": seconds, "nsec": rest},
+            "level": _LEVELS[level],
+            "message": text or kind,
+            "name": name,
+            "file": "",
+            "line": 0,
+            "kind": kind,
+            "text": text,
+        }
+        if event is not None:
+            content |= {"cycle": event.cycle, "id": event.id, "code": event.code, "axis": event.axis}
+        self._put(self._events, time_ns, content)
+
+    def _put(self, channel: int, time_ns: int, content: dict[str, Any]) -> None:
+        at = time_ns + self._about.offset_ns
+        self._writer.add_message(channel, at, json.dumps(content).encode(), at)
+
+    def _add(
+        self, channel: int, times: Sequence[int], numbers: Sequence[int], messages: Sequence[bytes]
+    ) -> None:
+        add = self._writer.add_message
+        for time_ns, number, data in zip(times, numbers, messages, strict=True):
+            add(channel, time_ns, data, time_ns, number)
+
+    def _schema(self, message: Message) -> int:
+        number: int = self._writer.register_schema(message.name, "protobuf", message.schema)
+        return number
+
+    def _protobuf(self, topic: str, schema: int) -> int:
+        number: int = self._writer.register_channel(topic, "protobuf", schema)
+        return number
+
+    def _json(self, topic: str, name: str, schema: dict[str, Any]) -> int:
+        number: int = self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+        channel: int = self._writer.register_channel(topic, "json", number)
+        return channel

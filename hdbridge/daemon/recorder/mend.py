@@ -1,0 +1,124 @@
+"""Writes files again that were not finished: whole up to their last chunk, with the index that they lack."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from hdbridge.daemon.recorder.flightfile import PART
+from hdbridge.daemon.recorder.reading import SUFFIX, records_of
+from hdbridge.errors import InputError, OutputError
+
+MENDING: Final = ".mending"
+CHUNK_BYTES: Final = 1 << 20
+
+
+def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> list[Path]:
+    """Mend every unfinished file of a folder but those that are being written; the mended ones.
+
+    A file in which nothing is whole is removed. What cannot be mended now is said and left as it is.
+    """
+    mended = []
+    for leftover in sorted(folder.glob(f".*{MENDING}")):
+        leftover.unlink(missing_ok=True)
+    for part in sorted(folder.glob(f"*{SUFFIX}{PART}")):
+        try:
+            path = mend(part)
+        except (InputError, OutputError) as problem:
+            say(str(problem))
+            continue
+        if path is not None:
+            mended.append(path)
+    return mended
+
+
+def mend(path: Path) -> Path | None:
+    """Mend one file; its name afterwards, or None where nothing of it was whole and it was removed.
+
+    A finished one stays as it is. InputError where it is being written; OutputError where there is no room.
+    """
+    target = path.with_name(path.name.removesuffix(PART))
+    aside = target.with_name(f".{target.name}{MENDING}")
+    try:
+        with path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise InputError(f"{path}: is being written; expected one whose daemon has ended") from None
+            with aside.open("wb") as out:
+                messages, finished = _copied(path, file, out)
+                out.flush()
+                os.fsync(out.fileno())
+            if finished and target == path:
+                aside.unlink()
+            elif messages:
+                aside.rename(target)
+                if target != path:
+                    path.unlink()
+            else:
+                aside.unlink()
+                path.unlink()
+                return None
+            _sync_folder(path.parent)
+    except OSError as problem:
+        aside.unlink(missing_ok=True)
+        raise OutputError(
+            f"{path}: cannot be mended: {problem.strerror}; free some space, then mend it again"
+        ) from None
+    return target
+
+
+def _copied(path: Path, file: BinaryIO, out: BinaryIO) -> tuple[int, bool]:
+    """Copy every whole record; how many messages there were, and whether the file had its end."""
+    writer = Writer(out, chunk_size=CHUNK_BYTES)
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    messages = 0
+    begun = finished = False
+    for record in records_of(file, path):
+        match record:
+            case Header():
+                writer.start(record.profile, record.library)
+                begun = True
+            case Schema():
+                if record.id not in schemas:
+                    schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+            case Channel():
+                if record.id not in channels:
+                    channels[record.id] = writer.register_channel(
+                        record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                    )
+            case Message():
+                writer.add_message(
+                    channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
+                messages += 1
+            case Metadata():
+                writer.add_metadata(record.name, record.metadata)
+            case Attachment():
+                writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
+            case Footer():
+                finished = True
+    if begun:
+        writer.finish()  # type: ignore[no-untyped-call]
+    return messages, finished
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,120 @@
+"""The flight recorder: everything that the loop tells, on disk within a second.
+
+`FlightRecorder` is a sink of the service's observer. It never blocks and never grows: what its thread is too
+slow for is dropped, counted and told. What the thread does is `flightlog`.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.recorder.about import About
+from hdbridge.daemon.recorder.flightlog import MARK, Batch, Counts, FlightLog, Item, ModelUse, Note
+from hdbridge.daemon.recorder.settings import RecorderSettings
+from hdbridge.daemon.recorder.store import Store, free_bytes
+
+FLUSH_S: Final = 1.0
+QUEUE_BATCHES: Final = 500
+"""Ten seconds of the observer's batches."""
+_log = logging.getLogger(__name__)
+
+
+class FlightRecorder:
+    """The sink: hands everything to a thread of its own; another mends what an earlier process has left."""
+
+    def __init__(
+        self,
+        folder: Path,
+        about: About,
+        settings: RecorderSettings | None = None,
+        *,
+        tell: Callable[[str], None] = lambda _: None,
+        wall_ns: Callable[[], int] = time.time_ns,
+        free: Callable[[Path], int] = free_bytes,
+    ) -> None:
+        """``tell`` is called in the recorder's thread. OSError where the folder cannot be made."""
+        self._flight = FlightLog(
+            Store(folder, settings or RecorderSettings(), free), about, tell=tell, wall_ns=wall_ns
+        )
+        self._queue: queue.Queue[Item | None] = queue.Queue(QUEUE_BATCHES)
+        self._tell = tell
+        self._dropped = 0
+        self._said: deque[Item] = deque(maxlen=1000)
+        """What others than the observer have to say; seldom."""
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+        # It may take as long as it likes: each file is mended whole or not at all.
+        self._mender = threading.Thread(target=self._mend, name="recorder-mend", daemon=True)
+        self._mender.start()
+
+    @property
+    def counts(self) -> Counts:
+        """What became of the cycles so far."""
+        return replace(self._flight.counts, dropped=self._dropped)
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer; never waits."""
+        batch = Batch(samples if len(samples) else None, tuple(events), lost)
+        try:
+            self._queue.put_nowait(batch)
+        except queue.Full:
+            if not self._dropped:
+                self._tell("the recorder is too slow: cycles are dropped")
+            self._dropped += len(samples)
+
+    def use_model(self, axis: str, text: str, version: str = "") -> None:
+        """From now on the axis uses this model: the text of its file."""
+        self._said.append(ModelUse(axis, version, text))
+
+    def mark(self, text: str = "") -> None:
+        """Keep the time about now, as that about a fault."""
+        self._said.append(Note(MARK, text))
+
+    def close(self) -> None:
+        """Finish the file; returns when it is on the disk."""
+        self._queue.put(None)
+        self._thread.join()
+        self._mender.join()
+
+    def _mend(self) -> None:
+        try:
+            self._flight.mend()
+        except Exception:
+            _log.exception("unfinished recordings could not be mended")
+
+    def _run(self) -> None:
+        flight = self._flight
+        due_s = time.monotonic() + FLUSH_S
+        told = 0
+        going = True
+        while going:
+            with suppress(queue.Empty):
+                item = self._queue.get(timeout=max(due_s - time.monotonic(), 0.01))
+                if item is None:
+                    going = False
+                else:
+                    flight.put(item)
+            if self._dropped != told:
+                flight.put(
+                    Note("DROPPED", f"{self._dropped - told} cycles were dropped: the recorder was too slow")
+                )
+                told = self._dropped
+            if time.monotonic() < due_s and going:
+                continue
+            due_s = time.monotonic() + FLUSH_S
+            while self._said:
+                flight.put(self._said.popleft())
+            try:
+                flight.flush() if going else flight.close()
+            except Exception:
+                _log.exception("the recorder failed; it goes on")

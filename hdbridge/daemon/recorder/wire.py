@@ -1,0 +1,179 @@
+"""Cycle samples as Protocol Buffers messages, a whole batch at a time.
+
+Foxglove, PlotJuggler and every MCAP tool read protobuf by the schema that the file itself carries. A message
+whose fields are all of fixed width, and all there, has one layout of bytes: tag, value, tag, value. So a
+batch is one numpy array of that layout, filled column by column, and no message is encoded by itself.
+
+One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) gives both the schema and the layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from enum import Enum
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
+from numpy.typing import NDArray
+
+from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault
+from hdbridge.errors import InputError
+from hdbridge.motion.modes import MotionMode
+
+PACKAGE: Final = "hdbridge"
+Bytes = NDArray[np.void]
+STATES: Final = (
+    "UNVERIFIED", "DISABLED", "ENABLING", "ENABLED", "STOPPING", "LENT", "QUICK_STOPPED", "LATCHED",
+)  # fmt: skip
+"""Of an axis in the loop, by their numbers in the shared memory."""
+_FIXED: Final = {
+    "f8": (FieldDescriptorProto.TYPE_DOUBLE, 1),
+    "f4": (FieldDescriptorProto.TYPE_FLOAT, 5),
+    "i8": (FieldDescriptorProto.TYPE_SFIXED64, 1),
+    "u8": (FieldDescriptorProto.TYPE_FIXED64, 1),
+    "u4": (FieldDescriptorProto.TYPE_FIXED32, 5),
+}
+"""numpy type: protobuf type and wire type."""
+_VARINT: Final = 0
+_MORE: Final = 0x80
+
+
+class Field(NamedTuple):
+    """A field of a message; its number is its place in the table, from 1."""
+
+    name: str
+    kind: str
+    """A numpy type, or ``enum``: a byte."""
+    values: Mapping[int, str] | None = None
+    """Of an enum."""
+
+
+def _names(values: Iterable[Enum]) -> dict[int, str]:
+    return {place: each.name for place, each in enumerate(values)}
+
+
+_ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
+    "state": dict(enumerate(STATES)),
+    "mode": {int(each): each.name for each in MotionMode},
+    "power": _names(State),
+    "fault": _names(Fault) | {NO_FAULT: "NONE"},
+}
+_WIDE: Final = {"u2": "u4"}
+"""What protobuf has no type of so few bytes for."""
+_AXIS_NAMES: Final = AXIS_SAMPLE.names or ()
+AXIS_FIELDS: Final = (
+    Field("cycle", "i8"),
+    *(
+        Field(name, "enum", _ENUMS[name])
+        if name in _ENUMS
+        else Field(name, _WIDE.get(AXIS_SAMPLE[name].str[1:], AXIS_SAMPLE[name].str[1:]))
+        for name in _AXIS_NAMES
+    ),
+)
+MACHINE_FIELDS: Final = (
+    Field("sequence", "u8"),
+    Field("cycle", "i8"),
+    Field("time_ns", "i8"),
+    Field("late_us", "f4"),
+    Field("busy_us", "f4"),
+    Field("bus_load", "f4"),
+    Field("skipped", "u4"),
+)
+
+
+class Message:
+    """One kind of message: its schema, and batches of it to bytes and back."""
+
+    def __init__(self, name: str, fields: tuple[Field, ...]) -> None:
+        self.name = f"{PACKAGE}.{name}"
+        self._short = name
+        self._fields = fields
+        layout: list[tuple[str, Any]] = []
+        tags: dict[str, bytes] = {}
+        for number, each in enumerate(fields, 1):
+            wire = _VARINT if each.kind == "enum" else _FIXED[each.kind][1]
+            tags[f"tag {number}"] = tag = _varint(number << 3 | wire)
+            layout.append((f"tag {number}", f"V{len(tag)}"))
+            # An enum is always two bytes, so that the layout does not depend on its value.
+            layout.append((each.name, ("u1", (2,)) if each.kind == "enum" else f"<{each.kind}"))
+        self.layout = np.dtype(layout)
+        self._template = np.zeros((), self.layout)
+        for place, tag in tags.items():
+            self._template[place] = np.void(tag)
+
+    @cached_property
+    def schema(self) -> bytes:
+        """A serialised FileDescriptorSet, as MCAP has it for protobuf."""
+        files = FileDescriptorSet()
+        file = files.file.add(name=f"{PACKAGE}/{self._short}.proto", package=PACKAGE, syntax="proto3")
+        message: DescriptorProto = file.message_type.add(name=self._short)
+        for number, each in enumerate(self._fields, 1):
+            field = message.field.add(
+                name=each.name, number=number, label=FieldDescriptorProto.LABEL_OPTIONAL
+            )
+            if each.values is None:
+                field.type = _FIXED[each.kind][0]
+                continue
+            kind = message.enum_type.add(name=each.name.title())
+            for value, name in each.values.items():
+                kind.value.add(name=f"{each.name.upper()}_{name}", number=value)
+            field.type = FieldDescriptorProto.TYPE_ENUM
+            field.type_name = f".{self.name}.{kind.name}"
+        return files.SerializeToString()
+
+    def encode(self, columns: Mapping[str, Any], count: int) -> list[bytes]:
+        """So many messages; ``columns`` has an array for each field."""
+        rows = np.full(count, self._template, self.layout)
+        for each in self._fields:
+            values = columns[each.name]
+            if each.kind == "enum":
+                rows[each.name][:, 0] = values & ~np.uint8(_MORE) | np.uint8(_MORE)
+                rows[each.name][:, 1] = values >> 7
+            else:
+                rows[each.name] = values
+        data, size = rows.tobytes(), self.layout.itemsize
+        return [data[at : at + size] for at in range(0, count * size, size)]
+
+    def decode(self, messages: list[bytes]) -> dict[str, NDArray[Any]]:
+        """A column for each field. InputError where a message is not of this layout."""
+        if any(len(each) != self.layout.itemsize for each in messages):
+            raise InputError(f"its {self._short} messages are of another release of hdbridge")
+        rows = np.frombuffer(b"".join(messages), self.layout)
+        for place in self.layout.names or ():
+            if place.startswith("tag ") and not np.all(rows[place] == self._template[place]):
+                raise InputError(f"its {self._short} messages are of another release of hdbridge")
+        return {
+            each.name: (rows[each.name][:, 0] & 0x7F) | (rows[each.name][:, 1] << 7)
+            if each.kind == "enum"
+            else rows[each.name]
+            for each in self._fields
+        }
+
+
+def _varint(value: int) -> bytes:
+    result = b""
+    while value >= _MORE:
+        result += bytes([value & 0x7F | _MORE])
+        value >>= 7
+    return result + bytes([value])
+
+
+AXIS: Final = Message("AxisSample", AXIS_FIELDS)
+MACHINE: Final = Message("MachineSample", MACHINE_FIELDS)
+
+
+def axis_messages(samples: SampleArray, place: int) -> list[bytes]:
+    """One message per sample, of the axis at ``place``."""
+    axis: Any = samples["axes"][:, place]
+    return AXIS.encode(
+        {"cycle": samples["cycle"], **{name: axis[name] for name in _AXIS_NAMES}}, len(samples)
+    )
+
+
+def machine_messages(samples: SampleArray) -> list[bytes]:
+    """One message per sample."""
+    return MACHINE.encode({each.name: samples[each.name] for each in MACHINE_FIELDS}, len(samples))

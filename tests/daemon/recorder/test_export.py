@@ -1,0 +1,239 @@
+"""From a flight recording to a record: lossless, cut where nothing is known, and fit for `diagnose`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.axis_samples import SampleMaker, moves_and_rests
+from support.command import run_here
+from support.flight import START_NS, about, event, flight_log, samples
+
+from hdbridge.axis import AxisConfig
+from hdbridge.daemon.recorder.export import exported, last_model
+from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
+from hdbridge.daemon.recorder.reading import flight_files, read
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.records.recording import Recording
+
+AXIS = AxisConfig.load("profiles/demo")
+
+
+def command(*arguments):
+    return run_here(Path.cwd(), *arguments)
+
+
+COLUMNS = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
+
+
+def flown(folder, *batches, axes=1, model=None, **limits):
+    """The files of a flight whose seconds are the batches."""
+    log, clock = flight_log(folder, axes=axes, **limits)
+    if model:
+        log.put(ModelUse("demo", "4", model))
+    for number, each in enumerate(batches):
+        log.put(each if isinstance(each, Batch) else Batch(each))
+        clock.ns = START_NS + (number + 1) * 10**9
+        log.flush()
+    log.close()
+    return [read(each) for each in flight_files([folder])]
+
+
+def test_every_column_of_a_record_is_there_to_the_last_bit(tmp_path):
+    made = samples(500, axes=2)
+    recording = exported(flown(tmp_path, made[:250], made[250:], axes=2), "tilt")
+    record = recording.record
+    assert record.parts() == (record,)
+    for name in COLUMNS:
+        np.testing.assert_array_equal(record.columns[name], made["axes"][name][:, 1])
+    np.testing.assert_array_equal(record.time_s, made["cycle"] * 0.004)
+    assert recording.axis == "tilt"
+    assert recording.ratio == AXIS.gear.ratio
+    assert recording.drive == AXIS.drive.identity
+    recording.save(tmp_path / "out")
+    assert Recording.load(tmp_path / "out").record == record
+
+
+def test_two_files_of_one_run_are_one_part(tmp_path):
+    flights = flown(tmp_path, *(samples(250, 1 + 250 * each) for each in range(4)), file_mb=0.1)
+    assert len(flights) > 1
+    assert len(exported(flights).record.parts()) == 1
+
+
+@pytest.mark.parametrize(("gap", "parts"), [(0, 1), (5, 1), (6, 2), (400, 2)])
+def test_a_gap_is_a_new_part_and_a_few_cycles_are_counted(tmp_path, gap, parts):
+    flights = flown(tmp_path, samples(250), samples(250, 251 + gap))
+    recording = exported(flights)
+    assert len(recording.record.parts()) == recording.notes["parts"] == parts
+    assert recording.notes.get("cycles_missing_within_parts", 0) == (gap if parts == 1 else 0)
+    assert len(recording.record) == 500
+
+
+def test_parts_survive_the_folder(tmp_path):
+    recording = exported(flown(tmp_path, samples(250), samples(250, 1251)))
+    recording.save(tmp_path / "out")
+    again = Recording.load(tmp_path / "out")
+    assert again.record == recording.record
+    assert again.record.starts == recording.record.starts == (0, 250)
+
+
+def test_where_the_axis_was_not_enabled_is_left_out_unless_asked_for(tmp_path):
+    made = samples(750)
+    made["axes"]["state"][200:400] = 1
+    flights = flown(tmp_path, made)
+    assert [len(each) for each in exported(flights).record.parts()] == [200, 350]
+    assert [len(each) for each in exported(flights, all_states=True).record.parts()] == [750]
+
+
+def test_a_cycle_without_fresh_feedback_is_no_measurement(tmp_path):
+    made = samples(500)
+    made["axes"]["flags"][100:103] = 8
+    record = exported(flown(tmp_path, made)).record
+    assert len(record) == 497
+    assert not np.any(np.isin(record.time_s, made["cycle"][100:103] * 0.004))
+
+
+def test_a_loop_that_began_anew_is_another_part_and_its_zeros_may_be_others(tmp_path):
+    again = samples(300)
+    again["time_ns"] += 4_000_000_000
+    again["axes"]["state"][:50] = 0
+    recording = exported(flown(tmp_path, samples(250), again))
+    assert [len(each) for each in recording.record.parts()] == [250, 250]
+    assert recording.notes["zeros_may_differ"]
+
+
+def test_a_channel_is_there_where_it_was_known(tmp_path):
+    made = samples(300)
+    made["axes"]["flags"] |= 256
+    flights = flown(tmp_path, made)
+    (flight,) = flights
+    known = flight.about.axes[0]
+    object.__setattr__(known, "channels", ("load_torque_nm", "temperature_c"))
+    columns = exported(flights).record.columns
+    np.testing.assert_array_equal(columns["load_torque_nm"], made["axes"]["reading0"][:, 0])
+    assert "temperature_c" not in columns
+
+
+def test_a_time_can_be_chosen(tmp_path):
+    flights = flown(tmp_path, *(samples(250, 1 + 250 * each) for each in range(4)))
+    begin = flights[0].first_ns + 10**9
+    record = exported(flights, start_ns=begin, end_ns=begin + 10**9).record
+    assert len(record) == 251
+
+
+@pytest.mark.parametrize(
+    ("axis", "complaint"),
+    [("nose", "no axis 'nose'; expected --axis with one of: demo, tilt"), (None, "which axis?")],
+)
+def test_an_axis_that_is_not_there_is_refused(tmp_path, axis, complaint):
+    with pytest.raises(InputError, match="expected --axis") as error:
+        exported(flown(tmp_path, samples(250, axes=2), axes=2), axis)
+    assert complaint in str(error.value)
+
+
+def test_nothing_enabled_is_said(tmp_path):
+    made = samples(250)
+    made["axes"]["state"] = 1
+    with pytest.raises(InputError, match="nothing of axis 'demo' to export while it was enabled"):
+        exported(flown(tmp_path, made))
+
+
+def test_the_model_in_use_comes_along(tmp_path):
+    flights = flown(tmp_path, samples(250), model="the text")
+    assert last_model(flights, "demo").text == "the text"
+    assert last_model(flights, "tilt") is None
+
+
+@pytest.fixture(scope="module")
+def worked(tmp_path_factory):
+    """A flight of an axis at work whose second order has grown by 8 arcsec, with the model that it uses."""
+    folder = tmp_path_factory.mktemp("worked")
+    model = TransmissionModel.load("profiles/article/model.yaml")
+    model = TransmissionModel(model.ratio, model.effects)
+    orders = model.effects[0].orders
+    grown = orders[1].model_copy(update={"amplitude_arcsec": orders[1].amplitude_arcsec + 8.0})
+    changed = model.effects[0].model_copy(update={"orders": (orders[0], grown, *orders[2:])})
+    truth = TransmissionModel(model.ratio, (changed, *model.effects[1:]))
+    made = SampleMaker(AXIS, model, truth).make(moves_and_rests(120.0, 0.004, 2, 3.0))
+    log, clock = flight_log(folder)
+    log.put(ModelUse("demo", "1", model.dump()))
+    for first in range(0, len(made), 250):
+        log.put(Batch(made[first : first + 250], (event(50.0),) if first == 5000 else ()))
+        clock.ns += 10**9
+        log.flush()
+    log.close()
+    return folder
+
+
+def test_the_command_makes_a_record_that_diagnose_names_the_change_in(worked, tmp_path):
+    out, model, result = tmp_path / "rec", tmp_path / "model.yaml", tmp_path / "result.json"
+    done = command("record", "export", str(worked), "--out", str(out), "--model-out", str(model))
+    assert done.returncode == 0, done.stderr
+    assert "30000 samples in 1 part, 120.0 s" in done.stdout
+    done = command("diagnose", str(out), "--model", str(model), "--json", str(result))
+    assert done.returncode == 0, done.stderr
+    assert [each["cause"] for each in json.loads(result.read_text())["findings"]] == [
+        "motor_encoder_eccentricity"
+    ]
+
+
+def test_the_command_lists_and_tells(worked, tmp_path):
+    done = command("record", "list", str(worked))
+    assert done.returncode == 0
+    assert "the axis was stopped" in done.stdout
+    path = next((worked / "kept").glob("*.mcap"))
+    done = command("record", "info", str(path))
+    assert " cycles of 4 ms, 0 missing, 0 restarts" in done.stdout
+    assert "axis 'demo', ratio 50, enabled for " in done.stdout
+    assert "models 1" in done.stdout
+
+
+def test_the_command_writes_a_csv_file_of_one_part(worked, tmp_path):
+    out = tmp_path / "rec.csv.gz"
+    done = command("record", "export", str(worked), "--axis", "demo", "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    assert len(Recording.load(out).record) == 30000
+
+
+def test_bad_input_is_one_line_and_status_2(worked, tmp_path):
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "a").touch()
+    (tmp_path / "no.mcap").write_text("no flight recording, but a text")
+    for arguments, complaint in (
+        ((str(worked), "--axis", "nose", "--out", str(tmp_path / "x")), "no axis 'nose'"),
+        ((str(worked),), "--out is missing"),
+        ((str(worked), "--out", str(full)), "not an empty folder"),
+        ((str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")), "no such file or folder"),
+        ((str(tmp_path / "no.mcap"), "--out", str(tmp_path / "x")), "is no MCAP file"),
+        ((str(full), "--out", str(tmp_path / "x")), "no .mcap file in this folder"),
+        ((str(worked), "--from", "noon", "--out", str(tmp_path / "x")), "--from: found 'noon'"),
+        ((str(worked), "--to", "2020-01-01", "--out", str(tmp_path / "x")), "nothing was recorded between"),
+    ):
+        done = command("record", "export", *arguments)
+        assert done.returncode == 2, arguments
+        assert done.stderr.count("\n") == 1
+        assert complaint in done.stderr
+        assert not (tmp_path / "x").exists()
+
+
+def test_without_the_extra_it_says_what_to_install(worked, tmp_path, monkeypatch):
+    monkeypatch.setattr("hdbridge.cli.record._EXTRA", ("mcap", "no_such_package"))
+    done = command("record", "list", str(worked))
+    assert done.returncode == 2
+    assert "pip install 'hdbridge[daemon]'" in done.stderr
+
+
+def test_mending_by_hand(tmp_path):
+    log, _ = flight_log(tmp_path)
+    log.put(Batch(samples(250)))
+    log.flush()
+    done = command("record", "mend", str(tmp_path))
+    assert done.returncode == 2
+    assert "is being written" in done.stderr
+    log._file.abandon()
+    assert command("record", "mend", str(tmp_path)).returncode == 0
+    (path,) = tmp_path.iterdir()
+    assert read(path).finished
+    assert read(path).about.axes == about().axes

@@ -1,0 +1,86 @@
+"""A disk that is full: nothing stops, what is missing is counted and said once, and it goes on by itself."""
+
+import subprocess
+import sys
+
+from support.flight import START_NS, flight_log, samples
+
+from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.daemon.recorder.reading import read
+
+SECOND = 250
+SCRIPT = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, "tests")
+from support.flight import flight_log, samples
+from hdbridge.daemon.recorder.flightlog import Batch
+told = []
+log, clock = flight_log(Path(sys.argv[1]), told)
+put = 0
+def second():
+    global put
+    log.put(Batch(samples(250, 1 + 250 * put)))
+    put += 1
+    log.flush()
+second()
+size = log._file.size
+resource.setrlimit(resource.RLIMIT_FSIZE, (size + 1000, resource.RLIM_INFINITY))  # as on a full disk
+for _ in range(3):
+    second()
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+second()
+log.close()
+print(log.counts.recorded, log.counts.refused, len(told))
+print(*told, sep="\\n")
+"""
+
+
+def test_free_space_is_asked_before_and_what_is_missing_is_counted(tmp_path):
+    told, free = [], [10**9]
+    log, clock = flight_log(tmp_path, told, free=lambda _: free[0], free_mb=100.0)
+    for second in range(6):
+        free[0] = 99_000_000 if second in (2, 3) else 10**9
+        log.put(Batch(samples(SECOND, 1 + second * SECOND)))
+        clock.ns = START_NS + second * 10**9
+        log.flush()
+    log.close()
+    assert log.counts.recorded == 4 * SECOND
+    assert log.counts.refused == 2 * SECOND
+    assert len(told) == 2
+    assert "nothing is recorded" in told[0]
+    assert "less than 100 MB" in told[0]
+    assert f"{2 * SECOND} cycles were not" in told[1]
+    (path,) = tmp_path.glob("*.mcap")
+    flight = read(path)
+    assert len(flight.machine["cycle"]) == 4 * SECOND
+    assert [each.kind for each in flight.events] == ["REFUSED_BY_DISK"]
+
+
+def test_a_write_that_fails_leaves_a_whole_file_and_is_made_up_for(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    counts, *told = done.stdout.splitlines()
+    assert counts == "750 500 2", done.stdout
+    assert "File too large" in told[0]
+    (path,) = tmp_path.glob("*.mcap")
+    flight = read(path)
+    assert flight.finished
+    # The chunk that failed waited for room; the two after it were not taken.
+    assert list(flight.machine["cycle"][[0, 249, 250, 499, 500]]) == [1, 250, 251, 500, 1001]
+
+
+def test_a_folder_that_takes_no_file_leaves_no_crumbs(tmp_path):
+    told = []
+    log, _ = flight_log(tmp_path / "inside", told)
+    (tmp_path / "inside").rmdir()
+    for _ in range(3):
+        log.put(Batch(samples(SECOND)))
+        log.flush()
+    assert len(told) == 1
+    (tmp_path / "inside").mkdir()
+    log.put(Batch(samples(SECOND)))
+    log.close()
+    assert len(list((tmp_path / "inside").iterdir())) == 1
+    assert log.counts.refused == 3 * SECOND

@@ -1,0 +1,76 @@
+"""Samples and a machine for the tests of the flight recorder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.daemon.memory import AXIS_SAMPLE, Event, EventKind, sample_dtype
+from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightlog import FlightLog
+from hdbridge.daemon.recorder.settings import RecorderSettings
+from hdbridge.daemon.recorder.store import Store
+
+AXIS = AxisConfig.load("profiles/demo")
+PERIOD_S = 0.004
+START_NS = 1_790_000_000_000_000_000
+"""Time of day when the samples' clock is zero."""
+ROOM = 10**12
+
+
+def about(axes: int = 1) -> About:
+    known = AxisAbout.of(AXIS)
+    names = ("demo", "tilt", "roll", "lift", "wrist", "grip")
+    return About.of(
+        "cell",
+        tuple(AxisAbout(each, known.ratio, known.text, known.identity) for each in names[:axes]),
+        PERIOD_S,
+    )
+
+
+def samples(count: int, first: int = 1, axes: int = 1, seed: int = 0) -> Any:
+    """Numbers that are all different: what is mixed up shows."""
+    random = np.random.default_rng([seed, first])
+    made = np.zeros(count, sample_dtype(axes))
+    made["sequence"] = first + np.arange(count)
+    made["cycle"] = first + np.arange(count)
+    made["time_ns"] = (made["cycle"] * PERIOD_S * 1e9).astype(np.int64)
+    for name in ("late_us", "busy_us", "bus_load"):
+        made[name] = random.uniform(0.0, 100.0, count)
+    for name in AXIS_SAMPLE.names or ():
+        kind = AXIS_SAMPLE[name]
+        size = (count, axes)
+        made["axes"][name] = (
+            random.normal(0.0, 100.0, size) if kind.kind == "f" else random.integers(0, 5, size).astype(kind)
+        )
+    made["axes"]["fault"] = 255
+    made["axes"]["statusword"] = 0xFFFF
+    made["axes"]["state"] = 3
+    made["axes"]["flags"] = 1 | 8
+    return made
+
+
+def event(time_s: float, kind: EventKind = EventKind.STOPPED, text: str = "the axis was stopped") -> Event:
+    return Event(1, int(time_s / PERIOD_S), int(time_s * 1e9), 0, kind, 0, 3, text)
+
+
+class Clock:
+    """Time of day that goes with the samples."""
+
+    def __init__(self) -> None:
+        self.ns = START_NS
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+def flight_log(folder: Path, told: list[str] | None = None, free: Any = None, axes: int = 1, **limits: float):
+    """The recorder without its thread, and its clock."""
+    clock = Clock()
+    settings = RecorderSettings(**{"free_mb": 0.0, **limits})
+    store = Store(folder, settings, free or (lambda _: ROOM))
+    tell = told.append if told is not None else (lambda _: None)
+    return FlightLog(store, about(axes), tell=tell, wall_ns=clock), clock

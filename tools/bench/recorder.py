@@ -1,0 +1,164 @@
+"""What the flight recorder costs: processor time per message, share of a core, bytes an hour.
+
+    python tools/bench/recorder.py [--axes 1 6] [--seconds 120] [--rate 250] [--json FILE]
+
+For each number of axes a machine at work is recorded, second by second as the daemon does it, onto the disk
+of the temporary folder. The axes move and rest in turn; angles are in whole counts, the load encoder is
+noisy. The same samples are written as JSON for comparison: the other encoding that Foxglove and PlotJuggler
+open without more. Processor time is that of the thread, without the disk's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from hdbridge.daemon.memory import AXIS_SAMPLE, sample_dtype
+from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
+from hdbridge.daemon.recorder.reading import read
+from hdbridge.daemon.recorder.settings import RecorderSettings
+from hdbridge.daemon.recorder.store import Store
+
+RATIO = 50.0
+MOTOR_COUNTS, LOAD_COUNTS = 8_000, 2_880_000
+
+
+def at_work(seconds: int, rate: int, axes: int) -> Any:
+    """Samples of axes that move for 2 s and rest for 1 s, in turn."""
+    random = np.random.default_rng(1)
+    count = seconds * rate
+    samples = np.zeros(count, sample_dtype(axes))
+    samples["sequence"] = samples["cycle"] = 1 + np.arange(count)
+    samples["time_ns"] = (1 + np.arange(count)) * (10**9 // rate) + random.integers(-50_000, 50_000, count)
+    samples["late_us"] = random.gamma(2.0, 30.0, count)
+    samples["busy_us"] = random.gamma(20.0, 20.0, count)
+    samples["bus_load"] = 0.2
+    time_s = np.arange(count) / rate
+    for place in range(axes):
+        axis = samples["axes"][:, place]
+        phase = (time_s + 0.5 * place) % 3.0
+        speed = np.where(phase < 2.0, 10.0 * np.sin(np.pi * phase / 2.0) ** 2, 0.0)
+        speed *= np.where((time_s + 0.5 * place) // 3.0 % 2, -1.0, 1.0)
+        target = np.cumsum(speed) / rate
+        axis["state"], axis["power"], axis["fault"], axis["statusword"] = 3, 4, 255, 0x1237
+        axis["mode"] = speed != 0.0
+        axis["flags"] = 1 | 2 | 8
+        axis["load_target_deg"], axis["velocity_deg_s"] = target, speed
+        error = 13.0 * np.cos(2.0 * np.radians(RATIO * target)) + 30.0 * np.sign(speed)
+        axis["predicted_arcsec"] = axis["correction_arcsec"] = error
+        axis["issued_deg"] = RATIO * (target - error / 3600.0)
+        axis["motor_target_deg"] = _counted(axis["issued_deg"], MOTOR_COUNTS)
+        axis["motor_position_deg"] = _counted(axis["issued_deg"], MOTOR_COUNTS)
+        axis["load_position_deg"] = _counted(target + random.normal(0.0, 0.3 / 3600.0, count), LOAD_COUNTS)
+        axis["motor_torque_nm"] = np.round(random.normal(0.05, 0.01, count), 3) * np.sign(speed)
+        axis["weight"] = 1.0
+        axis["reading0"] = axis["reading1"] = np.nan
+    return samples
+
+
+def _counted(angle_deg: Any, counts: int) -> Any:
+    return np.round(angle_deg * counts / 360.0) * 360.0 / counts
+
+
+def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
+    """Processor time and bytes of the recorder."""
+    axes = samples["axes"].shape[1]
+    about = About.of("bench", tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)), 1.0 / rate)
+    settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
+    log = FlightLog(Store(folder, settings), about)
+    begun = time.thread_time()
+    batch = max(rate // 50, 1)
+    for first in range(0, len(samples), rate):
+        for at in range(first, first + rate, batch):
+            log.put(Batch(samples[at : at + batch]))
+        log.flush()
+    log.close()
+    taken = time.thread_time() - begun
+    return taken, sum(each.stat().st_size for each in folder.iterdir())
+
+
+def as_json(samples: Any, rate: int, path: Path) -> tuple[float, int]:
+    """The same with JSON messages."""
+    axes = samples["axes"].shape[1]
+    names = AXIS_SAMPLE.names or ()
+    begun = time.thread_time()
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 26, compression=CompressionType.ZSTD)
+        writer.start()
+        schema = writer.register_schema("axis", "jsonschema", b'{"type": "object"}')
+        channels = [writer.register_channel(f"/{each}", "json", schema) for each in range(axes + 1)]
+        for first in range(0, len(samples), rate):
+            rows = samples[first : first + rate]
+            times = rows["time_ns"].tolist()
+            heads = zip(*(rows[each].tolist() for each in rows.dtype.names if each != "axes"), strict=True)
+            head_names = [each for each in rows.dtype.names if each != "axes"]
+            for at, head in zip(times, heads, strict=True):
+                data = json.dumps(dict(zip(head_names, head, strict=True))).encode()
+                writer.add_message(channels[0], at, data, at)
+            for place in range(axes):
+                for at, cycle, row in zip(
+                    times, rows["cycle"].tolist(), rows["axes"][:, place].tolist(), strict=True
+                ):
+                    data = json.dumps({"cycle": cycle, **dict(zip(names, row, strict=True))}).encode()
+                    writer.add_message(channels[1 + place], at, data, at)
+            writer.flush()
+        writer.finish()
+    return time.thread_time() - begun, path.stat().st_size
+
+
+def measured(axes: int, seconds: int, rate: int) -> dict[str, Any]:
+    """All figures for so many axes."""
+    samples = at_work(seconds, rate, axes)
+    messages = len(samples) * (1 + axes)
+    result: dict[str, Any] = {"axes": axes, "rate_hz": rate}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, write in (("recorder", as_recorded), ("json", as_json)):
+            place = Path(folder) / name
+            if name == "recorder":
+                place.mkdir()
+            taken_s, size = write(samples, rate, place)
+            result[name] = {
+                "us_per_message": 1e6 * taken_s / messages,
+                "share_of_core": taken_s / seconds,
+                "mb_per_hour": 3600.0 * size / seconds / 1e6,
+            }
+        (path,) = (Path(folder) / "recorder").iterdir()
+        begun = time.thread_time()
+        read(path)
+        result["reading_us_per_message"] = 1e6 * (time.thread_time() - begun) / messages
+    return result
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--axes", type=int, nargs="+", default=[1, 6])
+    parser.add_argument("--seconds", type=int, default=120)
+    parser.add_argument("--rate", type=int, default=250)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    results = [measured(axes, given.seconds, given.rate) for axes in given.axes]
+    print(f"{'axes':>4} {'encoding':>9} {'us/message':>11} {'% of a core':>12} {'MB/hour':>8}")
+    for each in results:
+        for name in ("recorder", "json"):
+            row = each[name]
+            print(
+                f"{each['axes']:4d} {name:>9} {row['us_per_message']:11.1f} "
+                f"{100 * row['share_of_core']:12.2f} "
+                f"{row['mb_per_hour']:8.0f}"
+            )
+        print(f"     reading back: {each['reading_us_per_message']:.1f} us a message")
+    if given.json:
+        given.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
