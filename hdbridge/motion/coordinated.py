@@ -112,7 +112,7 @@ class _Eased(NamedTuple):
 
 def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
     """Where the jerk changes within a period T, the cubic passes the acceleration by up to 4/27 of jerk T,
-    and the velocity by up to 0.015 of jerk T^2.
+    and the velocity by up to 0.0162 of jerk T^2.
     """
     velocity, acceleration = share * limits.velocity_deg_s, share * limits.acceleration_deg_s2
     jerk = min(
@@ -120,7 +120,7 @@ def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
         (ACCELERATION_MARGIN - 1.0) * 27.0 / 4.0 * acceleration / period_s,
         velocity / period_s**2,
     )
-    return _Eased(velocity - 0.015 * jerk * period_s**2, acceleration, jerk)
+    return _Eased(velocity - 0.0162 * jerk * period_s**2, acceleration, jerk)
 
 
 def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
