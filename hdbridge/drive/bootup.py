@@ -105,6 +105,25 @@ class BootUp:
             notes=tuple(notes),
         )
 
+    def look(self) -> BootReport:
+        """Compare a drive that runs already with its axis file; writes nothing and changes no state.
+
+        Raises as `run` does.
+        """
+        self._check_device_type()
+        identity = self._check_identity()
+        modes = self._check_modes()
+        notes = self._check_scaling()
+        return BootReport(
+            node_id=self._axis.drive.node_id,
+            identity=identity,
+            names=self._names(),
+            modes=modes,
+            state=decode(self._sdo.fetch(objects.STATUSWORD)),
+            written=(),
+            notes=tuple(notes),
+        )
+
     # -- network management -------------------------------------------------------------------------------
 
     def _nmt(self, command: NmtCommand, node_id: int) -> None:

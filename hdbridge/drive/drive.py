@@ -119,6 +119,15 @@ class Drive:
         _log.info("booted", {"node": self.axis.drive.node_id, "bus": self.link.name, **self.report.identity})
         return self.report
 
+    def take_over(self) -> BootReport:
+        """Take over a drive that another process of this machine has booted, in whatever state it is.
+
+        Compares it with the axis file as `boot` does, and raises as that; writes nothing.
+        """
+        self.listen()
+        self.report = BootUp(self.link, self.monitor, self.axis, self._clients).look()
+        return self.report
+
     @property
     def identity(self) -> Identity:
         """Which drive it is: what the booted one has answered, else what the axis file expects."""
@@ -132,6 +141,25 @@ class Drive:
         set-points while it is enabled, so ``image.power`` is aimed and the cycle walks. Raises `DriveError`
         for a fault (`fault_reset` first), for a position outside the limits, `TransitionError`.
         """
+        positions = self._make_ready(mode)
+        motor_counts = self._commander.preload_target()
+        self.image.halt = False
+        self.image.seed(motor_counts, positions.load_counts, self._commander.statusword())
+        _log.info("enable", {"node": self.axis.drive.node_id, "mode": mode.name})
+        if mode is Mode.CSP:
+            self.image.power.go(State.OPERATION_ENABLED)
+        else:
+            self._commander.walk(State.OPERATION_ENABLED)
+
+    def prepare(self) -> Positions:
+        """Make ready for power in CSP while a control cycle runs already; where the axis stands.
+
+        As `enable`, but the cycle's RPDOs keep the target at the actual position, and it walks the states.
+        """
+        return self._make_ready(Mode.CSP)
+
+    def _make_ready(self, mode: Mode) -> Positions:
+        """All that precedes power but the target: checks, the watch for the master, the mode."""
         modes_of_drive = self._booted().modes
         if mode not in modes_of_drive:
             raise DriveError(
@@ -153,14 +181,7 @@ class Drive:
         self._expect_master(True)
         self._commander.set_mode(mode)
         self._mode = mode
-        motor_counts = self._commander.preload_target()
-        self.image.halt = False
-        self.image.seed(motor_counts, positions.load_counts, self._commander.statusword())
-        _log.info("enable", {"node": self.axis.drive.node_id, "mode": mode.name})
-        if mode is Mode.CSP:
-            self.image.power.go(State.OPERATION_ENABLED)
-        else:
-            self._commander.walk(State.OPERATION_ENABLED)
+        return positions
 
     def disable(self) -> None:
         """Brake, then switch power off, by SDO. Allowed in every state but a running fault reaction."""
