@@ -14,13 +14,14 @@ raise an `HdbridgeError` whose text is one line that a person can act on:
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping, Sequence
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, Self
 
 from hdbridge.client import messages
 from hdbridge.evaluation.stepping import Scheme
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.memory import Event, SampleArray
+    from hdbridge.daemon.memory import SampleArray
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.drive.values import Object, Value
 
@@ -52,17 +53,26 @@ class Batch(NamedTuple):
 
     samples: SampleArray
     """One row per cycle, as `hdbridge.daemon.memory.sample_dtype` has it."""
-    events: Sequence[Event]
+    events: Sequence[messages.Event]
     lost: int
     """Cycles that this subscriber was too slow for."""
+
+
+class Feed(Protocol):
+    """Batches as they come; `close` it when no more are wanted."""
+
+    def __aiter__(self) -> AsyncIterator[Batch]: ...
+    async def __anext__(self) -> Batch: ...
+    def close(self) -> None: ...
 
 
 class StreamPort(Protocol):
     """A stream of set-points that is under way. An asynchronous context manager: it ends with the block."""
 
     async def __aenter__(self) -> Self: ...
-
-    async def __aexit__(self, *error: object) -> None: ...
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
         """Hand over set-points; waits while the buffer is full. Raises where the stream has ended."""
@@ -210,7 +220,7 @@ class Bridge(Protocol):
         """Move several axes so that all begin and end together; ``speed`` is a share of the limits."""
         ...
 
-    def subscribe(self, most: int = 512) -> AsyncIterator[Batch]:
+    def subscribe(self, most: int = 512) -> Feed:
         """Samples and events as they come; of what is not fetched the newest ``most`` samples are kept."""
         ...
 

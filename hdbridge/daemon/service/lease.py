@@ -102,6 +102,10 @@ class Lease:
             raise LeaseError(f"'{holder.client}' holds the right to move: take the lease first")
         self._heard_s = self._now()
 
+    def holds(self, token: str) -> bool:
+        """Whether ``token`` is the present holder's; it is not heard of by that."""
+        return self.holder is not None and token == self._token
+
     def ended(self) -> tuple[str, ...]:
         """The clients whose lease has ended since this was last asked, in that order: for what follows it.
 

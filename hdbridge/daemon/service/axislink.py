@@ -1,0 +1,138 @@
+"""One axis of the control process: commands with their answers, and what the newest cycle says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, Unpack
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
+from hdbridge.daemon.service.activity import Activity
+from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
+from hdbridge.daemon.service.timing import POLL_S
+from hdbridge.drive.states import State
+from hdbridge.errors import DaemonError, InputError, RefusedError, SafetyStop
+from hdbridge.motion import MotionMode
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.service.core import Core
+
+_STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+_POWER: Final = tuple(State)
+
+
+class AxisLink:
+    """The way to one axis; ``index`` is its place in the shared memory."""
+
+    def __init__(self, core: Core, index: int, name: str) -> None:
+        self.core = core
+        self.index = index
+        self.name = name
+
+    # ---------------------------------------------------------------- the newest cycle
+
+    def value(self, field: str) -> float:
+        """A field of `AXIS_SAMPLE`, by the newest cycle; 0 before the first."""
+        newest = self.core.observer.newest
+        return float(newest[0]["axes"][self.index][field]) if newest is not None else 0.0
+
+    def flag(self, flag: SampleFlag) -> bool:
+        """Whether it is set in the newest cycle."""
+        return bool(int(self.value("flags")) & flag)
+
+    @property
+    def state(self) -> AxisState:
+        """Where the control process has it."""
+        return AxisState(int(self.value("state")))
+
+    @property
+    def power(self) -> State:
+        """The drive's power state."""
+        newest = self.core.observer.newest
+        return _POWER[int(self.value("power"))] if newest is not None else State.UNKNOWN
+
+    # ---------------------------------------------------------------- commands
+
+    async def do(
+        self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
+    ) -> Event:
+        """As `Dispatcher.do`; what the newest cycle says is from after the answer."""
+        answer = await self.core.dispatch.do(kind, self.index, within_s, **arguments)
+        observer = self.core.observer
+        await self.until(lambda: observer.cycle > answer.cycle, ANSWER_S)
+        return answer
+
+    async def until(self, found: Callable[[], bool], within_s: float) -> bool:
+        """Wait until ``found``, which is asked anew with each cycle; whether it was within that time."""
+        timing, observer = self.core.timing, self.core.observer
+        deadline_s = timing.clock.now() + within_s
+        observer.poll()
+        while not found():
+            left_s = deadline_s - timing.clock.now()
+            if left_s <= 0.0:
+                return False
+            await timing.sleep(min(POLL_S, left_s))
+            observer.poll()
+        return True
+
+    async def arrival(self, activity: Activity, waiting: Activity | None = None) -> None:
+        """Wait until a motion has come to its end.
+
+        ``waiting`` is what waits for it, where that is another activity: once over, it waits no more.
+        SafetyStop where the supervision stopped it, RefusedError where something else has taken its place,
+        InputError where a set-point of it was refused, DaemonError where the control process is gone.
+        """
+        stopping = False
+        while True:
+            done, stopping = self._look(activity, stopping)
+            if done:
+                return
+            why = activity.over or (waiting.over if waiting is not None else "")
+            if why and not stopping:
+                raise RefusedError(f"{self.name}: {why}")
+            if not self.core.observer.alive:
+                raise DaemonError(
+                    f"{self.name}: the control process has not turned lately: it hangs or is gone; the drive "
+                    "stops by itself, and the axis comes back disabled"
+                )
+            await self.core.timing.sleep(POLL_S)
+
+    def look(self, activity: Activity) -> None:
+        """What has become of a motion so far; raises as `arrival`, and does not wait."""
+        done, _ = self._look(activity, stopping=False)
+        if done or activity.over:
+            raise RefusedError(f"{self.name}: {activity.over}")
+
+    def _look(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
+        """Whether a motion came to its end, and whether the axis is stopping for a reason still to come."""
+        self.core.observer.poll()
+        log = self.core.log
+        newest = log.newest
+        for event in log.of_axis(self.index, activity.since):
+            if event.kind is EventKind.STOPPED:
+                activity.end("the supervision stopped it")
+                raise SafetyStop(f"{self.name}: {event.text}")
+            if event.kind is EventKind.STATE:
+                stopping = AxisState(event.code) in _STOPPED
+                if not stopping and event.code != AxisState.ENABLED:
+                    activity.end(f"the axis became {AxisState(event.code).name.lower()}")
+            elif event.id == activity.command_id and self._ended(event, activity):
+                return True, stopping
+        activity.since = newest
+        return False, stopping
+
+    def _ended(self, event: Event, activity: Activity) -> bool:
+        """Whether an event of a motion says that it came to its end; raises where it says that it did not."""
+        if event.kind is EventKind.STREAM_REFUSED:
+            activity.end(event.text)
+            raise InputError(f"{self.name}: {event.text}; the axis brakes")
+        if event.kind is EventKind.UNDERRUN:
+            activity.end("its set-points ran out in motion, and the axis braked")
+        if event.kind is not EventKind.MOTION_ENDED:
+            return False
+        if event.code == MotionMode.STOP:
+            why = activity.over or "it was braked before its end"
+            activity.end(why)
+            raise RefusedError(f"{self.name}: {why}")
+        activity.end("it came to its end")
+        return True

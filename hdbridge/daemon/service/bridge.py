@@ -1,0 +1,358 @@
+"""The machine, for those above: its axes, the lease, coordinated moves, jobs, what is and what has happened.
+
+    async with ServiceBridge(machine, memory, timing) as bridge:
+        ...
+
+Everything here runs in one event loop. Nothing of it is needed for an axis to hold where it is: when this
+process dies the axes go to the end of what they were told, and the next one finds them there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+
+from hdbridge.client import messages
+from hdbridge.daemon.memory import Cell, CommandKind, EventKind
+from hdbridge.daemon.service import reports
+from hdbridge.daemon.service.coordination import run_together
+from hdbridge.daemon.service.core import Core
+from hdbridge.daemon.service.eventlog import KEPT, Entry
+from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
+from hdbridge.daemon.service.models import recall, remember
+from hdbridge.daemon.service.observer import PERIOD_S, Subscription
+from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.daemon.service.power import UNKNOWN
+from hdbridge.daemon.service.timing import Timing
+from hdbridge.errors import HdbridgeError, InputError
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machine import Machine
+    from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.service.lease import Lease
+
+VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
+"""Pauses before a drive is asked for again that could not be verified; the last one repeats."""
+EVENTS_TOLD: Final = 1000
+_log = logging.getLogger(__name__)
+
+
+class Adaptation(Protocol):
+    """What follows the parameters of one axis."""
+
+    def state(self) -> messages.AdaptationState: ...
+    async def set_mode(self, mode: messages.AdaptationMode) -> None: ...
+    async def back(self) -> None: ...
+
+
+class ServiceBridge:
+    """The machine; `interface.Bridge` says what each method does."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        memory: Memory,
+        timing: Timing,
+        *,
+        runtime: Path | None = None,
+        recordings: Callable[[ServiceAxis], Path] = lambda axis: axis.axis.profile.folder / "recordings",
+        runner: Runner = in_own_process,
+        simulated: bool = False,
+    ) -> None:
+        """``runtime`` is the folder in which the model in use is remembered; None: it is not.
+
+        ``recordings`` says where the recordings of an axis's jobs go, ``runner`` how they are done.
+        """
+        self.machine = machine
+        self.core = Core.of(memory, timing, machine.lease_s)
+        self.book = JobBook(self.core, recordings, runner)
+        self.axes: dict[str, ServiceAxis] = {
+            axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state, self._remember)
+            for index, axis in enumerate(machine.axes)
+        }
+        self.adaptations: dict[str, Adaptation] = {}
+        """By axis, where something adapts."""
+        self.advice: Callable[[str], Sequence[str]] = lambda _: ()
+        """What the watch says of an axis."""
+        self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
+        self.marks: list[Callable[[str], None]] = []
+        """Who wants to hear of remarks: the recorder."""
+        self._names = tuple(self.axes)
+        self._remembered = runtime / f"{machine.name}.models.json" if runtime is not None else None
+        self._simulated = simulated
+        self._started = datetime.now(UTC)
+        self._stopped: dict[str, Entry] = {}
+        self._seen = 0
+        self._bus_up = True
+        self._loop_pid = 0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._verifying: set[str] = set()
+
+    @property
+    def lease(self) -> Lease:
+        """The right to move."""
+        return self.core.lease
+
+    # ---------------------------------------------------------------- its life
+
+    async def __aenter__(self) -> Self:
+        """Begin: find every axis as it is, and look after them from now on."""
+        self._loop_pid = self.core.memory.status.loop_pid
+        if self._remembered is not None:
+            recall(self._remembered, self._loop_pid, {name: each.models for name, each in self.axes.items()})
+        self._start(self._watch())
+        for axis in self.axes.values():
+            self._start(self._take_over(axis))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """End: jobs are cancelled; the axes go on with what they were told."""
+        await self.book.close()
+        for task in tuple(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for axis in self.axes.values():
+            await axis.close()
+
+    async def end(self) -> None:
+        """Stop every axis in order and switch power off: the daemon ends."""
+        for axis in self.axes.values():
+            axis.give_up("the daemon ends")
+        await self.book.close()
+        for axis in self.axes.values():
+            with suppress(HdbridgeError):
+                await axis.power.disable()
+        with suppress(HdbridgeError):
+            await self.core.dispatch.do(CommandKind.ENDING)
+
+    async def _watch(self) -> None:
+        """Every `PERIOD_S`: what the control process tells, the lease, drives that must be verified again."""
+        core = self.core
+        while True:
+            core.observer.poll()
+            core.memory.status.set(Cell.SERVICE_TIME_NS, time.monotonic_ns())
+            self._look()
+            for axis in self.axes.values():
+                try:
+                    await axis.end_without_lease()
+                except HdbridgeError as error:
+                    core.log.note(f"could not be stopped: {error}", axis.link.index)
+                if axis.link.state in UNKNOWN and self._bus_up and axis.name not in self._verifying:
+                    self._verifying.add(axis.name)
+                    self._start(self._verify(axis))
+            await core.timing.sleep(PERIOD_S)
+
+    def _look(self) -> None:
+        """Take note of what has happened."""
+        for entry in self.core.log.since(self._seen):
+            self._seen = entry.number
+            event = entry.event
+            if event is None:
+                continue
+            if event.kind is EventKind.STOPPED and 0 <= event.axis < len(self._names):
+                self._stopped[self._names[event.axis]] = entry
+            elif event.kind is EventKind.BUS_DOWN:
+                self._bus_up = False
+            elif event.kind is EventKind.BUS_UP:
+                self._bus_up = True
+        pid = self.core.memory.status.loop_pid
+        if pid != self._loop_pid:
+            if self._loop_pid:
+                self.core.log.note("the control process was started again: every axis is disabled")
+                self._bus_up = True
+                for axis in self.axes.values():
+                    self._start(self._put_back(axis))
+            self._loop_pid = pid
+            self._remember()
+
+    async def _put_back(self, axis: ServiceAxis) -> None:
+        """A new control process compensates by the machine file; have it use what was in use."""
+        try:
+            await axis.put_back()
+        except HdbridgeError as error:
+            self.core.log.note(f"the compensation could not be put back: {error}", axis.link.index)
+
+    async def _take_over(self, axis: ServiceAxis) -> None:
+        try:
+            await axis.take_over()
+        except HdbridgeError as error:
+            self.core.log.note(
+                f"the drive could not be compared with its axis file: {error}", axis.link.index
+            )
+
+    async def _verify(self, axis: ServiceAxis) -> None:
+        """Boot and verify a drive, again and again until it is there. It stays disabled."""
+        told = ""
+        try:
+            for attempt in range(1_000_000):
+                await self.core.timing.sleep(VERIFY_AGAIN_S[min(attempt, len(VERIFY_AGAIN_S) - 1)])
+                if axis.link.state not in UNKNOWN or not self._bus_up:
+                    return
+                try:
+                    await axis.verify()
+                except HdbridgeError as error:
+                    if str(error) != told:
+                        told = str(error)
+                        self.core.log.note(f"the drive could not be verified: {error}", axis.link.index)
+                        _log.warning("not verified", extra={"axis": axis.name, "why": told})
+        finally:
+            self._verifying.discard(axis.name)
+
+    def _remember(self) -> None:
+        """Keep what is in use for the next service."""
+        if self._remembered is not None:
+            with suppress(HdbridgeError):
+                models = {name: each.models for name, each in self.axes.items()}
+                remember(self._remembered, self.core.memory.status.loop_pid, models)
+
+    # ---------------------------------------------------------------- what is
+
+    def state(self) -> messages.MachineState:
+        """Everything about the machine at the newest cycle."""
+        core = self.core
+        newest = core.observer.newest
+        head = newest[0] if newest is not None else None
+        return messages.MachineState(
+            name=self.machine.name,
+            version=version("hdbridge"),
+            started=self._started,
+            simulated=self._simulated,
+            axes=[self.axis_state(name) for name in self.axes],
+            bus=messages.BusState(
+                interface=self.machine.bus.interface,
+                channel=str(self.machine.bus.channel),
+                up=self._bus_up,
+                load=float(head["bus_load"]) if head is not None else None,
+            ),
+            cycle=messages.CycleState(
+                period_s=core.memory.period_s,
+                cycle=core.observer.cycle,
+                alive=core.observer.alive,
+                skipped=int(head["skipped"]) if head is not None else 0,
+                late_us=float(head["late_us"]) if head is not None else None,
+                busy_us=float(head["busy_us"]) if head is not None else None,
+            ),
+            lease=reports.lease_state(core.lease, core.timing.clock.now()),
+            recorder=self.recorder(),
+            jobs=self.book.all(),
+            warnings=self._warnings(),
+        )
+
+    def axis_state(self, name: str) -> messages.AxisState:
+        """Everything about one axis at the newest cycle."""
+        adaptation = self.adaptations.get(name)
+        return reports.axis_state(
+            self._axis(name),
+            self._stopped.get(name),
+            self.book.of_axis(name),
+            adaptation.state() if adaptation is not None else messages.AdaptationState(),
+            self.advice(name),
+        )
+
+    def _warnings(self) -> list[str]:
+        core = self.core
+        warnings = []
+        if not core.observer.alive:
+            warnings.append(
+                "the control process does not turn: it hangs or is gone, and is started again by itself"
+            )
+        if not self._bus_up:
+            warnings.append("the bus is down: bring the interface up; it is opened again by itself")
+        if core.observer.lost:
+            warnings.append(
+                f"{core.observer.lost} cycles were lost before they were read: this machine is too busy"
+            )
+        return warnings
+
+    def events(self, since: int = 0) -> messages.Events:
+        """Events with a higher sequence number than ``since``, oldest first."""
+        log = self.core.log
+        entries = log.since(since)
+        lost = entries[0].number - since - 1 if entries else 0
+        told = entries[:EVENTS_TOLD]
+        return messages.Events(
+            events=[reports.event_message(each, self._names) for each in told],
+            lost=max(lost, 0),
+            newest=told[-1].number if told else log.newest,
+        )
+
+    def subscribe(self, most: int = 512) -> Subscription:
+        """Samples and events as they come."""
+        return Subscription(self.core.observer, self._messages_since, most)
+
+    def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
+        entries = self.core.log.since(number)[-KEPT:]
+        return [reports.event_message(each, self._names) for each in entries], self.core.log.newest
+
+    def jobs(self) -> list[messages.Job]:
+        """The jobs that run and the last ones that ran, newest last."""
+        return self.book.all()
+
+    # ---------------------------------------------------------------- what it is told
+
+    async def quick_stop(self) -> None:
+        """Every axis at once."""
+        for axis in self.axes.values():
+            axis.give_up("it was stopped by a quick stop")
+        await self.core.dispatch.do(CommandKind.QUICK_STOP)
+
+    async def coordinated(
+        self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
+    ) -> None:
+        """Move several axes so that all begin and end together."""
+        if not moves:
+            raise InputError("a coordinated move of no axis; expected a target for at least one")
+        axes = [self._axis(name) for name in moves]
+        await run_together(holder, axes, moves, speed, wait=wait)
+
+    async def cancel_job(self, holder: str, job_id: str) -> None:
+        """Stop a job's axis in order; what it has measured is kept."""
+        self.core.lease.check(holder)
+        self.book.cancel(job_id)
+
+    def mark(self, text: str) -> None:
+        """A remark for the event log and the flight recorder, at the present cycle."""
+        self.core.log.note(text)
+        for hear in self.marks:
+            hear(text)
+
+    async def load_loop(self, holder: str, axis: str, on: bool) -> None:
+        """Switch an axis's slow integral of the measured error on or off."""
+        await self._axis(axis).switch_load_loop(holder, on=on)
+
+    async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
+        """How an axis's parameters follow the load encoder from now on."""
+        self.core.lease.check(holder)
+        await self._adaptation(axis).set_mode(mode)
+
+    async def adaptation_back(self, holder: str, axis: str) -> None:
+        """Forget what the adaptation of an axis has changed."""
+        self.core.lease.check(holder)
+        await self._adaptation(axis).back()
+
+    def _axis(self, name: str) -> ServiceAxis:
+        axis = self.axes.get(name)
+        if axis is None:
+            raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
+        return axis
+
+    def _adaptation(self, name: str) -> Adaptation:
+        self._axis(name)
+        adaptation = self.adaptations.get(name)
+        if adaptation is None:
+            raise InputError(
+                f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
+            )
+        return adaptation
+
+    def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

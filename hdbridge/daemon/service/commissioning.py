@@ -1,0 +1,180 @@
+"""One axis's drive by SDO, through the control process: boot and verify, make ready, home, read, write.
+
+All of this blocks and runs in worker threads. One thing at a time is asked of a drive; what finds it busy
+waits for a while. Whether another master is on the bus was listened for before the control process sent its
+first frame, so nothing is listened for here.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.clock import Clock
+from hdbridge.daemon.memory import Memory
+from hdbridge.daemon.service.dispatch import Arguments
+from hdbridge.daemon.service.relaybus import RelayBus
+from hdbridge.drive.drive import Drive, Positions
+from hdbridge.drive.states import State
+from hdbridge.drive.values import Object, Value, find_object
+from hdbridge.errors import InputError, RefusedError
+
+if TYPE_CHECKING:
+    from hdbridge.drive.bootup import BootReport
+
+BUSY_S = 3.0
+"""So long is waited for a drive that something else is asked of."""
+TOWARDS_SWITCH = 0.1
+"""Of the axis's highest speed, where none is given."""
+TOWARDS_ZERO = 0.02
+
+
+class Seeds(NamedTuple):
+    """Where a drive stands, for the control process to begin from."""
+
+    motor_counts: int
+    load_counts: int
+    statusword: int
+
+    def arguments(self) -> Arguments:
+        """As VERIFIED, UNLEND and ENABLE have them."""
+        return Arguments(i=self.motor_counts, j=self.load_counts, k=self.statusword)
+
+
+class HomingRun(NamedTuple):
+    """How to home; speeds and acceleration at the load, None for those of the axis."""
+
+    method: int
+    switch_velocity_deg_s: float | None = None
+    zero_velocity_deg_s: float | None = None
+    acceleration_deg_s2: float | None = None
+    offset_deg: float = 0.0
+    timeout_s: float = 60.0
+
+
+class Commissioning:
+    """The drive of one axis, as the service sees it."""
+
+    def __init__(self, axis: AxisConfig, memory: Memory, clock: Clock) -> None:
+        source = axis.load_encoder.source.node
+        nodes = {axis.drive.node_id} | ({source} if source is not None else set())
+        self.bus = RelayBus(memory, clock, nodes, f"{axis.bus.interface}:{axis.bus.channel}")
+        self._drive = Drive(self.bus, axis, clock, force=True)
+        self._busy = threading.Lock()
+        self._doing = ""
+
+    @property
+    def report(self) -> BootReport | None:
+        """What was found when it was verified; None before."""
+        return self._drive.report
+
+    @property
+    def identity(self) -> Identity:
+        """Which drive it is: what it has answered, else what the axis file expects."""
+        return self._drive.identity
+
+    def verify(self) -> Seeds:
+        """Boot the drive and compare everything with the axis file; power is off then.
+
+        Raises as `Drive.boot` does.
+        """
+        with self._asked("it is being booted"):
+            self._drive.boot()
+            return self._seeds(self._drive.read_positions())
+
+    def take_over(self) -> None:
+        """Compare a drive that the control process drives already with the axis file; nothing is written."""
+        with self._asked("it is being compared with its axis file"):
+            self._drive.take_over()
+
+    def abandon_homing(self) -> None:
+        """Stop a drive that was lent to a service that is gone, and switch its power off."""
+        with self._asked("it is being stopped"):
+            if self._drive.state() is State.OPERATION_ENABLED:
+                self._drive.quick_stop()
+            self._drive.disable()
+
+    def prepare(self) -> Seeds:
+        """Make ready to be enabled by the control process. Raises as `Drive.enable` does."""
+        with self._asked("it is being made ready"):
+            return self._seeds(self._drive.prepare())
+
+    def rest(self) -> None:
+        """After the control process has switched power off: the drive need no longer watch the master."""
+        with self._asked("it is being switched off"):
+            self._drive.disable()
+
+    def clear_fault(self) -> None:
+        """Reset a fault of the drive, while the control process sends it nothing."""
+        with self._asked("its fault is being reset"):
+            if self._drive.state() is State.FAULT:
+                self._drive.fault_reset()
+
+    def home(self, run: HomingRun) -> tuple[Positions, Seeds]:
+        """Home, while the control process has lent the drive; power is off again then.
+
+        Raises as `Drive.home` does; the axis is stopped and power off in any case that can be reached.
+        """
+        limits = self._drive.axis.limits
+        with self._asked("it is being homed"):
+            try:
+                positions = self._drive.home(
+                    run.method,
+                    run.switch_velocity_deg_s or TOWARDS_SWITCH * limits.velocity_deg_s,
+                    run.zero_velocity_deg_s or TOWARDS_ZERO * limits.velocity_deg_s,
+                    run.acceleration_deg_s2,
+                    run.offset_deg,
+                    run.timeout_s,
+                )
+            finally:
+                self._drive.disable()
+            return positions, self._seeds(positions)
+
+    def interrupt(self, reason: str) -> None:
+        """End what is under way with these words; a homing run stops the axis by that. From any thread."""
+        if self._busy.locked():
+            self.bus.interrupt(reason)
+
+    def read(self, object_: str) -> tuple[Object, Value]:
+        """An object, by its number or its name in the EDS."""
+        wanted = find_object(object_, self._drive.sdo.od)
+        if not wanted.readable:
+            raise InputError(f"{wanted}: can only be written, by the EDS")
+        with self._asked(f"{object_} is being read"):
+            return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
+
+    def write(self, object_: str, text: str) -> Object:
+        """Write an object; the control process refuses it while the axis is enabled."""
+        wanted = find_object(object_, self._drive.sdo.od)
+        if not wanted.writable:
+            raise InputError(f"{wanted}: can only be read, by the EDS")
+        data = wanted.encode(text)
+        with self._asked(f"{object_} is being written"):
+            self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
+        return wanted
+
+    def seeds(self) -> Seeds:
+        """Where the drive stands now."""
+        with self._asked("its position is being read"):
+            return self._seeds(self._drive.read_positions())
+
+    def close(self) -> None:
+        """Leave the relay; the drive stays as it is."""
+        self.bus.shutdown()
+
+    def _seeds(self, positions: Positions) -> Seeds:
+        self._drive.state()
+        return Seeds(positions.motor_counts, positions.load_counts, self._drive.image.statusword or 0)
+
+    @contextmanager
+    def _asked(self, doing: str) -> Iterator[None]:
+        if not self._busy.acquire(timeout=BUSY_S):
+            raise RefusedError(f"the drive of axis '{self._drive.axis.name}' is busy: {self._doing}")
+        self._doing = doing
+        try:
+            yield
+        finally:
+            self._busy.release()

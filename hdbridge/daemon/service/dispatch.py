@@ -1,0 +1,76 @@
+"""Commands to the control process, each with its answer: for coroutines and for blocking work."""
+
+from __future__ import annotations
+
+from typing import TypedDict, Unpack
+
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Memory
+from hdbridge.daemon.service.eventlog import EventLog
+from hdbridge.daemon.service.timing import POLL_S, Timing
+from hdbridge.errors import DaemonError, RefusedError
+
+ANSWER_S = 2.0
+"""The control process answers within a few cycles; after so long it is not there. ENABLE and DISABLE are
+answered when they are done."""
+
+
+class Arguments(TypedDict, total=False):
+    """The fields of a `Command`; `CommandKind` says what they mean."""
+
+    a: float
+    b: float
+    c: float
+    d: float
+    i: int
+    j: int
+    k: int
+
+
+class Dispatcher:
+    """Posts commands and waits for their answers. Thread-safe."""
+
+    def __init__(self, memory: Memory, log: EventLog, timing: Timing) -> None:
+        self._memory = memory
+        self._timing = timing
+        self.log = log
+
+    async def do(
+        self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
+    ) -> Event:
+        """Post a command and wait until it is carried out, or has begun; the event that says so.
+
+        RefusedError with the control process's own words, and nothing was done; DaemonError where it does
+        not answer.
+        """
+        command_id = self._memory.commands.post(kind, axis, **arguments)
+        deadline_s = self._timing.clock.now() + within_s
+        while (answer := self._answer(command_id)) is None:
+            self._check(kind, deadline_s, within_s)
+            await self._timing.sleep(POLL_S)
+        return answer
+
+    def do_now(
+        self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
+    ) -> Event:
+        """The same for blocking work."""
+        clock = self._timing.clock
+        command_id = self._memory.commands.post(kind, axis, **arguments)
+        deadline_s = clock.now() + within_s
+        while (answer := self._answer(command_id)) is None:
+            self._check(kind, deadline_s, within_s)
+            clock.sleep_until(clock.now() + POLL_S)
+        return answer
+
+    def _answer(self, command_id: int) -> Event | None:
+        self.log.poll()
+        answer = self.log.answer(command_id)
+        if answer is not None and answer.kind is EventKind.REFUSED:
+            raise RefusedError(answer.text)
+        return answer
+
+    def _check(self, kind: CommandKind, deadline_s: float, within_s: float) -> None:
+        if self._timing.clock.now() >= deadline_s:
+            raise DaemonError(
+                f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is gone; "
+                "it is started again by itself, with every axis disabled"
+            )

@@ -1,0 +1,91 @@
+"""What has happened: the control process's events and the service's own notes, in one bounded list.
+
+Thread-safe: whoever waits for something polls. Each entry has a number of the service's own count, so that a
+client asks for those since the last one that it has seen.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from hdbridge.daemon.memory import Event, EventKind, EventReader
+
+KEPT = 4096
+ANSWERS_KEPT = 1024
+_ANSWERS = (EventKind.DONE, EventKind.REFUSED)
+
+
+class Entry(NamedTuple):
+    """Something that happened."""
+
+    number: int
+    """Counts from 1 at the start of the service."""
+    date: datetime
+    axis: int
+    """Index of the axis; -1: the machine."""
+    event: Event | None
+    """Of the control process; None: a note of the service."""
+    text: str
+    hint: str = ""
+
+
+class EventLog:
+    """The newest `KEPT` entries, and the answers to the newest commands."""
+
+    def __init__(self, reader: EventReader, now: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
+        """``now`` gives the date of an entry."""
+        self._reader = reader
+        self._date = now
+        self._lock = threading.Lock()
+        self._entries: deque[Entry] = deque(maxlen=KEPT)
+        self._answers: dict[int, Event] = {}
+        self._number = 0
+        self.lost = 0
+        """Events that came faster than they were read."""
+
+    @property
+    def newest(self) -> int:
+        """Number of the newest entry; 0 before the first."""
+        return self._number
+
+    def poll(self) -> None:
+        """Take in what the control process has told since."""
+        with self._lock:
+            events, lost = self._reader.read()
+            self.lost += lost
+            for event in events:
+                self._add(event.axis, event, event.text)
+                if event.id and event.kind in _ANSWERS:
+                    self._answers[event.id] = event
+            while len(self._answers) > ANSWERS_KEPT:
+                del self._answers[next(iter(self._answers))]
+
+    def note(self, text: str, axis: int = -1, hint: str = "") -> None:
+        """Add a note of the service."""
+        with self._lock:
+            self._add(axis, None, text, hint)
+
+    def answer(self, command_id: int) -> Event | None:
+        """DONE or REFUSED of a command; None while there is none."""
+        return self._answers.get(command_id)
+
+    def since(self, number: int) -> list[Entry]:
+        """The entries after that number that are kept, oldest first."""
+        with self._lock:
+            if number >= self._number:
+                return []
+            new = min(self._number - number, len(self._entries))
+            return [self._entries[place] for place in range(len(self._entries) - new, len(self._entries))]
+
+    def of_axis(self, axis: int, since: int) -> list[Event]:
+        """The control process's events of one axis, those of the whole machine included."""
+        entries = self.since(since)
+        return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
+
+    def _add(self, axis: int, event: Event | None, text: str, hint: str = "") -> None:
+        self._number += 1
+        self._entries.append(Entry(self._number, self._date(), axis, event, text, hint))

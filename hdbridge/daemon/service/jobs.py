@@ -1,0 +1,185 @@
+"""Jobs: procedures that run through the daemon while it holds the bus. At most one per axis.
+
+A job has the axis to itself: whatever else would move it is refused until the job has ended, but anybody may
+stop it. It goes on when the lease runs out under which it began. Afterwards the axis is disabled, and
+compensated as before.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hdbridge.client import messages
+from hdbridge.client.messages import JobKind, JobState
+from hdbridge.daemon.memory import CommandKind
+from hdbridge.daemon.service import jobwork
+from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.jobpipe import Begin, Served
+from hdbridge.daemon.service.jobprocess import job_process
+from hdbridge.daemon.service.jobwork import Told, Work
+from hdbridge.daemon.service.rigs import DaemonRig
+from hdbridge.errors import HdbridgeError, InputError
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.service.core import Core
+    from hdbridge.daemon.service.ports import ServiceAxis
+
+JOBS_KEPT: Final = 100
+_log = logging.getLogger(__name__)
+
+Runner = Callable[[Work, DaemonRig, Told], dict[str, Any]]
+"""Does a job, blocking."""
+
+
+def in_own_process(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
+    """In a process of its own, with low priority."""
+    with job_process(Begin(work, rig.identity)) as process:
+        return Served(process.connection, rig, told, process.ended, process.interrupt).until_done()
+
+
+class _Running:
+    """A job and what is known of it; the worker thread writes, the event loop reads."""
+
+    def __init__(self, job: messages.Job, axis: ServiceAxis, activity: Activity) -> None:
+        self.job = job
+        self.axis = axis
+        self.activity = activity
+        self.cancelled = threading.Event()
+
+    def update(self, **changes: Any) -> None:
+        """Another state of it."""
+        self.job = self.job.model_copy(update=changes)
+
+    def phase(self, name: str, done_s: float, total_s: float) -> None:
+        """How far it is."""
+        share = min(max(done_s / total_s, 0.0), 1.0) if total_s > 0.0 else 0.0
+        self.update(text=name, share=max(share, self.job.share))
+
+
+class JobBook:
+    """The jobs of all axes."""
+
+    def __init__(
+        self,
+        core: Core,
+        recordings: Callable[[ServiceAxis], Path],
+        runner: Runner = in_own_process,
+    ) -> None:
+        """``recordings`` says where an axis's recordings go."""
+        self._core = core
+        self._recordings = recordings
+        self._runner = runner
+        self._jobs: dict[str, _Running] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._numbers = itertools.count(1)
+
+    def all(self) -> list[messages.Job]:
+        """Those that run and the last ones that ran, newest last."""
+        return [each.job for each in self._jobs.values()]
+
+    def of_axis(self, name: str) -> messages.Job | None:
+        """The one that runs on an axis."""
+        running = (each.job for each in self._jobs.values() if each.job.axis == name)
+        return next((each for each in running if each.state is JobState.RUNNING), None)
+
+    def begin(self, axis: ServiceAxis, holder: str, kind: JobKind, given: Mapping[str, Any]) -> messages.Job:
+        """Begin a job; it runs when this returns. InputError for options that it does not have."""
+        options = jobwork.options_of(kind, given)
+        axis.check_free()
+        now = datetime.now(UTC)
+        work = Work(
+            kind, options, axis.axis.profile, axis.axis.config, self._recordings(axis), now.astimezone()
+        )
+        job = messages.Job(
+            id=f"{kind.value}-{next(self._numbers)}",
+            kind=kind,
+            axis=axis.name,
+            state=JobState.RUNNING,
+            started=now,
+        )
+        running = _Running(job, axis, Activity(Kind.JOB, holder))
+        axis.occupy(running.activity)
+        self._jobs[job.id] = running
+        while len(self._jobs) > JOBS_KEPT:
+            oldest = next((key for key, each in self._jobs.items() if each.activity.over), None)
+            if oldest is None:
+                break
+            del self._jobs[oldest]
+        self._core.log.note(f"job {job.id} has begun", axis.link.index)
+        task = asyncio.get_running_loop().create_task(self._run(running, work))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return job
+
+    def cancel(self, job_id: str) -> None:
+        """Stop a job's axis in order; what it has measured is kept. InputError where there is no such job."""
+        running = self._jobs.get(job_id)
+        if running is None:
+            raise InputError(
+                f"there is no job '{job_id}'; expected one of: {', '.join(self._jobs) or 'none yet'}"
+            )
+        running.cancelled.set()
+
+    async def close(self) -> None:
+        """Cancel what runs, and wait for its end."""
+        for each in self._jobs.values():
+            each.cancelled.set()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _run(self, running: _Running, work: Work) -> None:
+        told = Told(
+            phase=running.phase,
+            line=lambda text: running.update(text=text),
+            folder=lambda path: running.update(folder=str(path)),
+            interrupted=running.cancelled.is_set,
+        )
+        state, problem, document = JobState.DONE, None, None
+        try:
+            rig = DaemonRig(running.axis, running.activity)
+            document = await self._core.timing.work(_uninterrupted, self._runner, work, rig, told)
+            if document is None:
+                state = JobState.CANCELLED
+        except HdbridgeError as error:
+            state = JobState.CANCELLED if running.cancelled.is_set() else JobState.FAILED
+            problem = messages.Problem.of(error, running.axis.name)
+        except Exception as error:
+            _log.exception("job failed", extra={"job": running.job.id})
+            state = JobState.FAILED
+            problem = messages.Problem.of(
+                HdbridgeError(f"an error in hdbridge: {error!r}"), running.axis.name
+            )
+        await self._put_back(running.axis)
+        running.activity.end(f"job {running.job.id} is {state.value}")
+        running.update(
+            state=state,
+            problem=problem,
+            result=document,
+            ended=datetime.now(UTC),
+            share=1.0 if state is JobState.DONE else running.job.share,
+        )
+        why = f": {problem.detail}" if problem is not None else ""
+        self._core.log.note(f"job {running.job.id} is {state.value}{why}", running.axis.link.index)
+
+    async def _put_back(self, axis: ServiceAxis) -> None:
+        """Compensate the axis as before."""
+        try:
+            await axis.put_back()
+            if axis.axis.load_loop is not None:
+                await axis.link.do(CommandKind.LOAD_LOOP, i=int(axis.load_loop_on))
+        except HdbridgeError as error:
+            self._core.log.note(f"the compensation could not be put back: {error}", axis.link.index)
+
+
+def _uninterrupted(runner: Runner, work: Work, rig: DaemonRig, told: Told) -> dict[str, Any] | None:
+    """The job's document; None where it was interrupted."""
+    try:
+        return runner(work, rig, told)
+    except KeyboardInterrupt:
+        return None

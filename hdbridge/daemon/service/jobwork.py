@@ -1,0 +1,272 @@
+"""What a job does, on whatever rig it is given: step, calibrate, improve, as the commands of these names do.
+
+It runs in a process of its own (`jobprocess`), so that hours of fitting cost the clients nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import Journal, calibrate, start_journal
+from hdbridge.calibration.measure import outlook
+from hdbridge.calibration.validation import validation_s
+from hdbridge.client.messages import JobKind
+from hdbridge.control.bench import Run
+from hdbridge.control.rig import Rig
+from hdbridge.errors import InputError
+from hdbridge.evaluation.comparison import compare_schemes
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.files.atomic import make_folder, new_folder, write_atomically
+from hdbridge.files.profile import Profile
+from hdbridge.improvement import Source, improve
+from hdbridge.improvement.trial import trial_s
+from hdbridge.model import TransmissionModel, store
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.records.record import Record
+from hdbridge.report.calibration import calibration_page
+from hdbridge.report.diagnosis import diagnosis_page
+from hdbridge.report.page import render
+
+RESULT_NAME: Final = "result.json"
+PAGE_NAME: Final = "report.html"
+_Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
+"""Of a plan or a folder: a name and no path, for it comes from a client."""
+
+
+class _Options(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class StepOptions(_Options):
+    """Of ``hdbridge step``."""
+
+    scheme: tuple[Scheme, ...] | Scheme | None = None
+    count: int = Field(240, ge=2, le=100_000)
+    step_deg: float = 43.56
+    start_deg: float = 0.0
+    model: int | None = Field(None, ge=1)
+    """Number of a version; else the active one."""
+
+
+class CalibrateOptions(_Options):
+    """Of ``hdbridge calibrate``."""
+
+    plan: _Name = "quick"
+    resume: _Name | None = None
+    """Folder, within the axis's recordings, of one that goes on."""
+
+
+class ImproveOptions(CalibrateOptions):
+    """Of ``hdbridge improve``."""
+
+    auto: bool = False
+    rounds: int = Field(3, ge=1, le=20)
+
+
+OPTIONS: Final[Mapping[JobKind, type[_Options]]] = {
+    JobKind.STEP: StepOptions,
+    JobKind.CALIBRATE: CalibrateOptions,
+    JobKind.IMPROVE: ImproveOptions,
+}
+
+
+def options_of(kind: JobKind, given: Mapping[str, Any]) -> _Options:
+    """The options of a job, checked; InputError names the wrong one."""
+    try:
+        return OPTIONS[kind].model_validate(dict(given))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"][:1])) or "options"
+        known = ", ".join(OPTIONS[kind].model_fields)
+        raise InputError(f"{kind.value}: {where}: {first['msg']}; the options are {known}") from None
+
+
+@dataclass(frozen=True)
+class Work:
+    """A job as it is handed to its process."""
+
+    kind: JobKind
+    options: _Options
+    profile: Profile
+    axis: AxisConfig
+    recordings: Path
+    """Where recordings of this axis go."""
+    date: datetime
+
+
+@dataclass(frozen=True)
+class Told:
+    """How a job tells how far it is."""
+
+    phase: Callable[[str, float, float], None]
+    """What is going on, seconds done of its phase, seconds of the phase in all."""
+    line: Callable[[str], None]
+    folder: Callable[[Path], None]
+    """Where what is measured goes."""
+    interrupted: Callable[[], bool]
+    """Asked in each cycle; a yes stops the axis."""
+
+
+def run(work: Work, rig: Rig, told: Told) -> dict[str, Any]:
+    """Do it; the document that the command of the same name writes. Raises as that does.
+
+    KeyboardInterrupt where it was interrupted; what was measured is kept.
+    """
+    match work.options:
+        case StepOptions() as options:
+            return _step(work, options, rig, told)
+        case ImproveOptions() as options:
+            return _improve(work, options, rig, told)
+        case CalibrateOptions() as options:
+            return _calibrate(work, options, rig, told)
+    raise InputError(f"{work.kind.value}: no such job")
+
+
+def _step(work: Work, options: StepOptions, rig: Rig, told: Told) -> dict[str, Any]:
+    scheme = options.scheme
+    schemes = (scheme,) if isinstance(scheme, Scheme) else scheme
+    if schemes and set(schemes) == {Scheme.NONE}:
+        model = TransmissionModel(work.axis.gear.ratio)
+    else:
+        model = _model(work, options.model)
+    wanted = schemes or Scheme.offered_by(model)
+    if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in Scheme.offered_by(model):
+        raise InputError("scheme extended: the model has no effect beyond its two parts; leave it out")
+    folder = _new_folder(work, "step")
+    told.folder(folder)
+
+    def progress(scheme: Scheme, share: float) -> None:
+        told.phase(f"stepping, {scheme.value}", wanted.index(scheme) + share, len(wanted))
+
+    def finished(scheme: Scheme, run: Run[SteppingOutcome]) -> None:
+        run.record.write_csv(folder / f"stepping-{scheme.value}.csv.gz")
+
+    def stopped(scheme: Scheme, record: Record) -> None:
+        record.write_csv(folder / f"stepping-{scheme.value}-stopped.csv.gz")
+
+    comparison = compare_schemes(
+        rig,
+        model,
+        wanted,
+        Stepping(count=options.count, step_deg=options.step_deg, start_deg=options.start_deg),
+        progress=progress,
+        interrupted=told.interrupted,
+        finished=finished,
+        stopped=stopped,
+    )
+    return _kept(folder, comparison.as_dict())
+
+
+def _calibrate(work: Work, options: CalibrateOptions, rig: Rig, told: Told) -> dict[str, Any]:
+    with store.measuring(work.profile.axis):
+        plan, folder, journal = _journal(work, options, rig, told)
+        phases = _Phases(
+            told, outlook(plan, work.axis, journal.done).duration_s + validation_s(plan, work.axis)
+        )
+        result = calibrate(
+            rig,
+            journal,
+            work.profile.folder,
+            work.date,
+            progress=phases.progress,
+            interrupted=told.interrupted,
+            tell=told.line,
+        )
+    write_atomically(folder / PAGE_NAME, render(calibration_page(result)))
+    return _kept(folder, result.as_dict())
+
+
+def _improve(work: Work, options: ImproveOptions, rig: Rig, told: Told) -> dict[str, Any]:
+    active = _model(work, None)
+    with store.measuring(work.profile.axis):
+        plan, folder, journal = _journal(work, options, rig, told)
+        phases = _Phases(
+            told, outlook(plan, work.axis, journal.done).duration_s + trial_s(plan, work.axis, active)
+        )
+        result = improve(
+            rig,
+            Source(plan, folder, journal),
+            work.profile.folder,
+            active,
+            work.date,
+            rounds=options.rounds if options.auto else 0,
+            progress=phases.progress,
+            interrupted=told.interrupted,
+            tell=told.line,
+        )
+    page = diagnosis_page(
+        result.diagnosis,
+        title=f"Improvement of axis '{result.axis}'",
+        provenance={
+            "axis": result.axis,
+            "recordings": ", ".join(result.recordings),
+            "recorded": result.date or "not known",
+            "plan": result.plan,
+            **{f"round {number}": each.about for number, each in enumerate(result.rounds, 1)},
+            **({"survived": "; ".join(result.survived)} if result.survived else {}),
+        },
+        stepping=result.trial.stepping if result.trial else None,
+        offer=result.offer,
+    )
+    write_atomically(folder / PAGE_NAME, render(page))
+    return _kept(folder, result.as_dict())
+
+
+def _model(work: Work, version: int | None) -> TransmissionModel:
+    if version is not None:
+        return store.find(work.profile.folder, str(version)).model
+    if not work.profile.model.exists():
+        raise InputError(f"{work.profile.model}: there is no active model; calibrate and commit one first")
+    return TransmissionModel.load(work.profile.model)
+
+
+def _journal(work: Work, options: CalibrateOptions, rig: Rig, told: Told) -> tuple[Plan, Path, Journal]:
+    """The recording that goes on, else a new one."""
+    if options.resume is not None:
+        folder = work.recordings / options.resume
+        journal = Journal.open(folder)
+        journal.check_is_of(work.axis)
+        told.folder(folder)
+        return journal.plan, folder, journal
+    plan = Plan.load(options.plan)
+    outlook(plan, work.axis)  # refused before a folder is made
+    folder = _new_folder(work, "")
+    told.folder(folder)
+    return plan, folder, start_journal(folder, work.axis, plan, work.date, rig.identity)
+
+
+def _new_folder(work: Work, what: str) -> Path:
+    make_folder(work.recordings)
+    name = "-".join(filter(None, (work.axis.name, what, f"{work.date:%Y%m%d-%H%M%S}")))
+    return new_folder(work.recordings / name)
+
+
+def _kept(folder: Path, document: dict[str, Any]) -> dict[str, Any]:
+    write_atomically(folder / RESULT_NAME, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    return document
+
+
+class _Phases:
+    """Phases that follow each other, told as one: each total is another phase."""
+
+    def __init__(self, told: Told, total_s: float) -> None:
+        self._told = told
+        self._total_s = total_s
+        self._phase_s = 0.0
+        self._before_s = 0.0
+
+    def progress(self, name: str, done_s: float, total_s: float) -> None:
+        if total_s != self._phase_s:
+            self._before_s += self._phase_s
+            self._phase_s = total_s
+        done_s += self._before_s
+        self._told.phase(name, done_s, max(self._total_s, done_s))

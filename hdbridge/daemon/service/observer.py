@@ -1,0 +1,151 @@
+"""What the control process tells, handed on to whoever looks: recorder, watch, adaptation, live clients."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from hdbridge.client import messages
+from hdbridge.clock import Clock
+from hdbridge.daemon.memory import Event, Memory, SampleArray, sample_dtype
+from hdbridge.daemon.service.eventlog import EventLog
+from hdbridge.daemon.service.interface import Batch
+
+PERIOD_S = 0.02
+GONE_S = 1.0
+"""Without a turn for so long the control process hangs or is gone."""
+_log = logging.getLogger(__name__)
+
+
+class Sink(Protocol):
+    """Takes what comes; it must not block: what takes time is for a thread of its own and a bounded queue."""
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Cycles and events since the last call, oldest first, and how many cycles were lost before them."""
+        ...
+
+
+class Observer:
+    """Reads the rings every `PERIOD_S` and hands on what came."""
+
+    def __init__(self, memory: Memory, log: EventLog, clock: Clock) -> None:
+        self._reader = memory.reader()
+        self._clock = clock
+        self._status = memory.status
+        self._turns = -1
+        self._turned_s = clock.now()
+        self._log = log
+        self._seen = log.newest
+        self._sinks: list[Sink] = []
+        self._broken: set[int] = set()
+        self.none: SampleArray = np.empty(0, sample_dtype(memory.axes))
+        """No samples, of the right kind."""
+        self.newest: SampleArray | None = None
+        """The newest sample, shape (1,); None before the first."""
+        self.lost = 0
+        """Cycles that this process was too slow for."""
+
+    def add(self, sink: Sink) -> None:
+        """Hand on to ``sink`` too, from now on."""
+        self._sinks.append(sink)
+
+    def remove(self, sink: Sink) -> None:
+        """Hand nothing more to it."""
+        self._sinks.remove(sink)
+
+    @property
+    def cycle(self) -> int:
+        """Number of the newest cycle; -1 before the first."""
+        return int(self.newest[0]["cycle"]) if self.newest is not None else -1
+
+    @property
+    def alive(self) -> bool:
+        """Whether the control process has turned lately."""
+        return self._clock.now() - self._turned_s < GONE_S
+
+    def poll(self) -> None:
+        """Read what came and hand it on. One sink's error stays its own; it is logged once."""
+        samples, lost = self._reader.read()
+        self._log.poll()
+        turns = self._status.loop_count
+        if turns != self._turns:
+            self._turns, self._turned_s = turns, self._clock.now()
+        entries = self._log.since(self._seen)
+        self._seen = entries[-1].number if entries else self._seen
+        events = [each.event for each in entries if each.event is not None]
+        self.lost += lost
+        if len(samples):
+            self.newest = samples[-1:].copy()
+        if not (len(samples) or events or lost):
+            return
+        for sink in tuple(self._sinks):
+            try:
+                sink.take(samples, events, lost)
+            except Exception:
+                if id(sink) not in self._broken:
+                    self._broken.add(id(sink))
+                    _log.exception("a sink failed", extra={"sink": type(sink).__name__})
+
+
+class Subscription:
+    """One live client's share: the newest samples until they are fetched. An asynchronous iterator.
+
+    A client that is too slow loses samples, not memory; each batch tells how many.
+    """
+
+    def __init__(
+        self,
+        observer: Observer,
+        events_since: Callable[[int], tuple[list[messages.Event], int]],
+        most: int,
+    ) -> None:
+        """At most ``most`` samples wait; ``events_since`` gives the events after a number, and the newest."""
+        self._observer = observer
+        self._most = most
+        self._samples: deque[SampleArray] = deque()
+        self._waiting = 0
+        self._events_since = events_since
+        _, self._seen = events_since(1 << 62)
+        self._lost = 0
+        self._came = asyncio.Event()
+        observer.add(self)
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer, in the thread of the event loop."""
+        self._lost += lost + max(len(samples) - self._most, 0)
+        kept = samples[-self._most :]
+        if len(kept):
+            self._samples.append(kept)
+            self._waiting += len(kept)
+        while self._waiting > self._most:
+            oldest = self._samples.popleft()
+            over = min(self._waiting - self._most, len(oldest))
+            self._lost += over
+            self._waiting -= over
+            if over < len(oldest):
+                self._samples.appendleft(oldest[over:])
+        self._came.set()
+
+    def __aiter__(self) -> AsyncIterator[Batch]:
+        """Itself."""
+        return self
+
+    async def __anext__(self) -> Batch:
+        """What came since the last one; waits until there is something."""
+        await self._came.wait()
+        self._came.clear()
+        events, self._seen = self._events_since(self._seen)
+        samples = list(self._samples)
+        batch = Batch(np.concatenate(samples) if samples else self._observer.none, events, self._lost)
+        self._samples.clear()
+        self._waiting = self._lost = 0
+        return batch
+
+    def close(self) -> None:
+        """Nothing more is wanted."""
+        self._observer.remove(self)

@@ -1,0 +1,281 @@
+"""One axis, for clients: who may ask, and what it then does; the parts of it do the rest."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from hdbridge.client import messages
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.axislink import AxisLink
+from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
+from hdbridge.daemon.service.interface import WayPoint
+from hdbridge.daemon.service.models import AxisModels, Choice
+from hdbridge.daemon.service.moves import AxisMotion
+from hdbridge.daemon.service.power import UNKNOWN, AxisPower
+from hdbridge.daemon.service.streams import ServiceStream
+from hdbridge.drive.values import Object, Value
+from hdbridge.errors import RefusedError
+from hdbridge.evaluation.stepping import Scheme
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machine import Axis
+    from hdbridge.daemon.service.core import Core
+
+CHANGE_S: Final = 120.0
+"""By then another compensation has been faded in, however slow its ramp."""
+_POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
+
+
+class ServiceAxis:
+    """One axis of the machine; `interface.AxisPort` says what each method does."""
+
+    def __init__(
+        self,
+        index: int,
+        axis: Axis,
+        core: Core,
+        begin_job: Callable[[ServiceAxis, str, messages.JobKind, Mapping[str, Any]], messages.Job],
+        report: Callable[[str], messages.AxisState],
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        """``begin_job`` begins a job for the lease's holder, ``report`` says everything about an axis, and
+        ``changed`` hears of another model in use.
+        """
+        self.axis = axis
+        self.name = axis.name
+        self.core = core
+        self.link = AxisLink(core, index, axis.name)
+        self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
+        self.models = AxisModels(axis)
+        self.power = AxisPower(self.link, self.commissioning, self.models.check_drive)
+        self.motion = AxisMotion(self.link, axis.config.limits)
+        self.load_loop_on = axis.load_loop is not None
+        """Whether the slow integral of the measured error is wanted."""
+        self._begin_job = begin_job
+        self._report = report
+        self._changed = changed
+        self._changing = asyncio.Lock()
+        self._doing = ""
+        """What has the drive to itself at present, in words."""
+
+    # ---------------------------------------------------------------- who may
+
+    def state(self) -> messages.AxisState:
+        """Everything about it at the newest cycle."""
+        return self._report(self.name)
+
+    def check_may(self, holder: str) -> None:
+        """LeaseError unless the lease is theirs; RefusedError while something has the axis to itself."""
+        self.core.lease.check(holder)
+        if self.motion.busy(Kind.JOB):
+            raise RefusedError(f"{self.name}: a job is running on this axis; wait for its end, or cancel it")
+        self.check_free()
+
+    def check_free(self) -> None:
+        """RefusedError while something has the drive to itself."""
+        if self._doing:
+            raise RefusedError(f"{self.name}: {self._doing}; wait for its end, or stop it")
+
+    @asynccontextmanager
+    async def _alone(self, doing: str) -> AsyncIterator[None]:
+        """Nothing else begins meanwhile; to stop is possible at any time."""
+        self.check_free()
+        self._doing = doing
+        try:
+            yield
+        finally:
+            self._doing = ""
+
+    # ---------------------------------------------------------------- power
+
+    async def enable(self, holder: str) -> None:
+        """Power on, standing still."""
+        self.check_may(holder)
+        async with self._alone("the axis is being enabled"):
+            self.motion.replace(None, "the axis was enabled anew")
+            await self.power.enable()
+
+    async def disable(self, holder: str) -> None:
+        """Brake to rest, then power off."""
+        self.core.lease.check(holder)
+        self.motion.replace(None, "the axis was disabled")
+        async with self._alone("the axis is being disabled"):
+            await self.power.disable()
+
+    def give_up(self, why: str) -> None:
+        """Nothing that is under way goes on: what waits, what is asked of the drive by SDO."""
+        self.motion.replace(None, why)
+        self.power.interrupt(f"{self.name}: {why}")
+
+    async def quick_stop(self) -> None:
+        """Stop at once, latched."""
+        self.give_up("it was stopped by a quick stop")
+        await self.link.do(CommandKind.QUICK_STOP)
+
+    async def stop(self) -> None:
+        """Brake to rest within the limits, and stay enabled."""
+        self.give_up("it was stopped by a client")
+        await self.link.do(CommandKind.STOP)
+
+    async def reset(self, holder: str) -> None:
+        """Release what is latched; disabled then."""
+        self.check_may(holder)
+        async with self._alone("the axis is being reset"):
+            self.motion.replace(None, "the axis was reset")
+            await self.power.reset()
+
+    async def take_over(self) -> None:
+        """The service begins: take the axis as an earlier one has left it."""
+        async with self._alone("its drive is being compared with its axis file"):
+            await self.power.take_over()
+
+    async def verify(self) -> None:
+        """Boot the drive and compare it with its axis file, where that is due; disabled then."""
+        if self._doing or self.link.state not in UNKNOWN:
+            return
+        async with self._alone("its drive is being verified"):
+            await self.power.verify()
+        self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
+
+    async def home(
+        self,
+        holder: str,
+        method: int,
+        switch_velocity_deg_s: float | None = None,
+        zero_velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+        offset_deg: float = 0.0,
+        timeout_s: float = 60.0,
+    ) -> float:
+        """Home by the drive's own method; disabled before and after."""
+        self.check_may(holder)
+        run = HomingRun(
+            method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
+        )
+        async with self._alone("the axis is being homed"):
+            return await self.power.home(run)
+
+    # ---------------------------------------------------------------- motion
+
+    async def move(
+        self,
+        holder: str,
+        target_deg: float,
+        velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+        wait: bool = True,
+    ) -> None:
+        """Move, from rest or from any motion."""
+        self.check_may(holder)
+        activity = await self.motion.move(holder, WayPoint(target_deg, velocity_deg_s, acceleration_deg_s2))
+        if wait:
+            await self.link.arrival(activity)
+
+    async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
+        """Turn at a speed until the time-out."""
+        self.check_may(holder)
+        await self.motion.jog(holder, velocity_deg_s, timeout_s)
+
+    async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
+        """Append moves, each begun when the one before stands."""
+        self.check_may(holder)
+        return await self.motion.queue(holder, points)
+
+    async def clear_queue(self, holder: str) -> int:
+        """Forget the moves that have not begun."""
+        self.check_may(holder)
+        return self.motion.clear_queue()
+
+    async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
+        """Follow set-points."""
+        self.check_may(holder)
+        return await self.motion.stream(holder, timeout_s)
+
+    async def end_without_lease(self) -> None:
+        """Stop what must not go on, because the lease has ended under which it began."""
+        if self.motion.without_lease():
+            assert self.motion.activity is not None
+            what = self.motion.activity.kind.value
+            self.core.log.note(f"{what} was stopped: the lease of its client has ended", self.link.index)
+            self.motion.replace(None, "the lease has ended")
+            await self.link.do(CommandKind.STOP)
+
+    # ---------------------------------------------------------------- what compensates it
+
+    async def compensate(self, holder: str, scheme: Scheme) -> None:
+        """Compensate by this part of the model in use."""
+        self.check_may(holder)
+        async with self._changing:
+            await self.change(await self.core.timing.work(self.models.with_scheme, scheme))
+
+    async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
+        """Make another model of the profile the active one, and use it."""
+        self.check_may(holder)
+        identity = self.commissioning.identity
+        async with self._changing:
+            await self.change(await self.core.timing.work(self.models.found, version, identity))
+            date = datetime.now(UTC)
+            await self.core.timing.work(self.models.activate, version, identity, date)
+            self._changed()
+
+    async def put_back(self) -> None:
+        """Have the control process compensate by what is in use, whatever it did meanwhile."""
+        async with self._changing:
+            await self.change(await self.core.timing.work(self.models.made, self.models.in_use))
+
+    async def switch_load_loop(self, holder: str, *, on: bool) -> None:
+        """The slow integral of the measured error on or off."""
+        self.check_may(holder)
+        await self.link.do(CommandKind.LOAD_LOOP, i=int(on))
+        self.load_loop_on = on
+
+    async def change(self, choice: Choice) -> None:
+        """Have the control process change to another compensation, and wait until it has."""
+        log, index = self.core.log, self.link.index
+        since = log.newest
+        if choice.compensating:
+            await self.link.do(CommandKind.CHANGE, i=self.core.memory.blobs.put(choice.pickled))
+        await self.link.do(CommandKind.COMPENSATE, i=int(choice.compensating))
+        self.models.taken(choice)
+        self._changed()
+        if choice.compensating:
+            await self.link.until(
+                lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
+            )
+
+    # ---------------------------------------------------------------- objects of the drive, jobs
+
+    async def sdo_read(self, object_: str) -> tuple[Object, Value]:
+        """An object of the drive."""
+        return await self.core.timing.work(self.commissioning.read, object_)
+
+    async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
+        """Write an object of the drive, while it is not enabled."""
+        self.check_may(holder)
+        if self.link.state in _POWERED:
+            raise RefusedError(
+                f"{self.name}: no object is written while the axis is enabled; disable it first"
+            )
+        return await self.core.timing.work(self.commissioning.write, object_, value)
+
+    async def job(
+        self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
+    ) -> messages.Job:
+        """Begin a job."""
+        self.check_may(holder)
+        return self._begin_job(self, holder, kind, options or {})
+
+    def occupy(self, activity: Activity) -> None:
+        """A job has the axis from now on."""
+        self.motion.replace(activity, "a job took its place")
+
+    async def close(self) -> None:
+        """Nothing more is begun; the axis goes on with what it was told."""
+        await self.motion.close()
+        self.commissioning.close()

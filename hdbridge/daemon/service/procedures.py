@@ -1,0 +1,342 @@
+"""Procedures on an axis that the daemon holds: a rig whose benches run through the control process.
+
+Each leg's path is sampled at the cycle, handed over as knots and followed from rest to rest; the samples
+come back from the ring. A leg that stands still (a rest, a hold) sends nothing. So a run is what `Bench.run`
+gives: samples of the same cycles, with a few cycles of standing between two legs, which is how long it takes
+to hear of a leg's end and to begin the next.
+
+Blocking: it runs in a worker thread. Power is on only while a procedure runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import numpy as np
+
+from hdbridge.axis.channels import BY_KEY
+from hdbridge.control.bench import Run, axis_view
+from hdbridge.control.compensation import Compensation
+from hdbridge.control.survived import PERIODS_SKIPPED, Survived
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, SampleArray, SampleFlag, SampleReader
+from hdbridge.daemon.service.reports import fault_of
+from hdbridge.errors import DaemonError, RefusedError, SafetyStop
+from hdbridge.motion.stream import Cubic
+from hdbridge.procedures.moves import MotionLimits, Move, Path, Procedure, Sample
+from hdbridge.procedures.rehearsal import Rehearsal, rehearse
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Segment, versions_here
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.service.rigs import DaemonRig
+
+Outcome = TypeVar("Outcome")
+POLL_S: Final = 0.01
+"""How often is looked for new samples."""
+STREAM_TIMEOUT_S: Final = 10.0
+BRAKE_S: Final = 30.0
+"""By then an axis that was told to stop stands, and its power is off."""
+_HALVINGS: Final = 5
+"""Of a period between two knots, at most."""
+_ACCELERATION_SHARE: Final = 1.04
+"""Of the limit: a stream may have a little more."""
+_SLOPE_S: Final = 1e-5
+"""Half the time over which a path's velocity is taken."""
+_ROUNDING_S: Final = 1e-9
+_COLUMNS: Final = Sample._fields[1:-1]
+"""Fields of a sample in the ring that a procedure's sample has by the same name."""
+_NOT_SURVIVED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED, AxisState.UNVERIFIED})
+
+
+def knots_of(path: Path, stream: int, period_s: float, limits: MotionLimits) -> Iterator[Knot]:
+    """A path as knots, at rest at both ends; at whole periods they are a bench's targets.
+
+    Where the cubic between two of them would pass a limit that the path itself keeps, as it does when the
+    jerk changes in between, there are more of them.
+    """
+    cycles = max(math.ceil(path.duration_s / period_s - _ROUNDING_S), 1)
+    before = Knot(stream, 0.0, path.at(0.0), 0.0)
+    yield before
+    for number in range(1, cycles + 1):
+        end = _knot(path, stream, number * period_s)
+        if number == cycles:
+            end = end._replace(velocity_deg_s=0.0)
+        yield from _refined(path, before, end, limits, _HALVINGS)
+        before = end
+
+
+def _knot(path: Path, stream: int, time_s: float) -> Knot:
+    if time_s >= path.duration_s:
+        return Knot(stream, time_s, path.at(path.duration_s), 0.0)
+    step_s = min(_SLOPE_S, path.duration_s - time_s)
+    slope = (path.at(time_s + step_s) - path.at(time_s - step_s)) / (2.0 * step_s)
+    return Knot(stream, time_s, path.at(time_s), slope)
+
+
+def _refined(path: Path, begin: Knot, end: Knot, limits: MotionLimits, halvings: int) -> Iterator[Knot]:
+    """``end``, and what has to come before it."""
+    cubic = Cubic.between(*begin[1:], *end[1:])
+    kept = (
+        cubic.fastest_deg_s() <= limits.velocity_deg_s
+        and cubic.hardest_deg_s2() <= _ACCELERATION_SHARE * limits.acceleration_deg_s2
+    )
+    if not kept and halvings:
+        middle = _knot(path, begin.stream, 0.5 * (begin.time_s + end.time_s))
+        yield from _refined(path, begin, middle, limits, halvings - 1)
+        yield from _refined(path, middle, end, limits, halvings - 1)
+    else:
+        yield end
+
+
+@dataclass(slots=True)
+class _Measured:
+    """What a run has measured so far."""
+
+    samples: list[Sample] = field(default_factory=list)
+    legs: list[Segment] = field(default_factory=list)
+    faults: Counter[str] = field(default_factory=Counter)
+    first: dict[str, str] = field(default_factory=dict)
+    skipped: int = 0
+
+    def take_fault(self, event: Event) -> None:
+        """A fault that the supervision let pass, or that has stopped the axis."""
+        fault = fault_of(event.code)
+        if fault is not None:
+            self.faults[fault.value] += 1
+            self.first.setdefault(fault.value, event.text)
+
+
+class DaemonBench:
+    """As `Bench`, on an axis that the daemon holds."""
+
+    def __init__(
+        self, rig: DaemonRig, compensation: Compensation | None, interrupted: Callable[[], bool]
+    ) -> None:
+        """Made by `DaemonRig.bench`."""
+        self._rig = rig
+        self._axis = rig.axis
+        self._compensation = compensation or rig.uncompensated()
+        self._interrupted = interrupted
+        self._view = axis_view(rig.axis)
+        self._period_s = rig.period_s
+        self._measured = _Measured()
+        self._reader: SampleReader = rig.core.memory.reader()
+        self._pending: list[tuple[int, Sample]] = []
+        """Samples that have come and were not given to a leg yet, with their cycles."""
+        self._place = 0.0
+        self._since = 0
+        self._skipped: int | None = None
+
+    # ---------------------------------------------------------------- as Bench has them
+
+    @property
+    def legs(self) -> tuple[Segment, ...]:
+        """The moves that the present procedure has run so far."""
+        return tuple(self._measured.legs)
+
+    @property
+    def survived(self) -> tuple[Survived, ...]:
+        """What the present procedure has gone on in spite of so far; the fault that stopped it included."""
+        measured = self._measured
+        found = [
+            Survived(what=what, cycles=cycles, first=measured.first.get(what, ""))
+            for what, cycles in measured.faults.items()
+        ]
+        if measured.skipped:
+            found.append(Survived(what=PERIODS_SKIPPED, cycles=measured.skipped))
+        return tuple(found)
+
+    def record(self) -> Record:
+        """What the present procedure has measured so far; without a channel that was lost on the way."""
+        samples = self._measured.samples
+        names = Sample._fields[:-1]
+        table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
+        columns = dict(zip(names, table.T, strict=True))
+        columns.pop("load_target_deg")
+        for place, key in enumerate(self._axis.channels):
+            reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
+            if not np.isnan(reading).any():
+                columns[BY_KEY[key].value] = reading
+        return Record(columns)
+
+    def run(
+        self,
+        procedure: Procedure[Outcome],
+        progress: Callable[[float], None] = lambda _: None,
+        /,
+    ) -> Run[Outcome]:
+        """Run one procedure to its end. Refuses and raises as `Bench.run` does.
+
+        RefusedError where another client has stopped the axis.
+        """
+        rig = self._rig
+        self._compensation.model.check_bound_to(self._axis, rig.identity)
+        self._measured = _Measured()
+        standing_deg = rig.value("motor_position_deg") / self._view.ratio
+        rehearsal = rehearse(procedure, self._view, standing_deg)
+        rig.enable(self._compensation)
+        try:
+            self._begin()
+            outcome = self._walk(procedure, rehearsal, progress)
+        except SafetyStop:
+            raise  # it stands, or stops by itself; the latch stays
+        except BaseException:
+            rig.stop()
+            raise
+        rig.disable()
+        return Run(
+            self.record(),
+            self.legs,
+            axis=self._axis.name,
+            ratio=self._view.ratio,
+            drive=rig.identity,
+            versions=versions_here(),
+            notes={"procedure": type(procedure).__name__},
+            outcome=outcome,
+            survived=self.survived,
+        )
+
+    # ---------------------------------------------------------------- legs
+
+    def _begin(self) -> None:
+        """The axis is enabled: what it does is measured from now on."""
+        self._reader = self._rig.core.memory.reader()
+        self._pending.clear()
+        self._skipped = None
+        self._since = self._rig.core.log.newest
+        while not self._pending:
+            self._take()
+        self._place = self._pending[-1][1].load_target_deg
+
+    def _walk(
+        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
+    ) -> Outcome:
+        done_s = 0.0
+        steps = procedure.moves(self._view)
+        try:
+            move = next(steps)
+            while True:
+                path = move.path(self._place, self._view.limits)
+                samples = self._leg(move, path)
+                done_s += path.duration_s
+                progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
+                move = steps.send(samples)
+        except StopIteration as end:
+            outcome: Outcome = end.value
+            return outcome
+
+    def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
+        """One move, from where the load target stands."""
+        if path.lowest_deg == path.highest_deg:
+            begin = None
+            feed: Iterator[Knot] = iter(())
+        else:
+            stream = self._rig.core.next_stream()
+            feed = self._hand_over(knots_of(path, stream, self._period_s, self._view.limits))
+            answer = self._rig.command(CommandKind.STREAM_BEGIN, a=STREAM_TIMEOUT_S, j=stream)
+            begin = answer.cycle + 1
+        samples: list[Sample] = []
+        try:
+            while True:
+                for place, (cycle, sample) in enumerate(self._pending, 1):
+                    if begin is not None and cycle < begin:
+                        continue
+                    samples.append(sample)
+                    # Counted in cycles that were run, as a stream's time is: one may have been skipped.
+                    elapsed_s = (len(samples) - 1) * self._period_s
+                    if elapsed_s >= path.duration_s - _ROUNDING_S and move.ended(samples):
+                        self._keep(place)
+                        self._place = path.at(path.duration_s)
+                        if begin is not None:
+                            self._rig.command(CommandKind.STREAM_END)
+                        return samples
+                self._keep(len(self._pending))
+                feed = self._hand_over(feed)
+                self._take()
+        finally:
+            if samples:
+                self._measured.legs.append(
+                    Segment(kind=move.kind, start_s=samples[0].time_s, end_s=samples[-1].time_s)
+                )
+
+    def _hand_over(self, knots: Iterator[Knot]) -> Iterator[Knot]:
+        """As many knots as there is room for; the rest of them."""
+        queue = self._rig.knots
+        while queue.free:
+            knot = next(knots, None)
+            if knot is None:
+                break
+            queue.put([knot])
+        return knots
+
+    def _keep(self, count: int) -> None:
+        """So many of the pending samples belong to the record now."""
+        self._measured.samples += [sample for _, sample in self._pending[:count]]
+        del self._pending[:count]
+
+    # ---------------------------------------------------------------- samples
+
+    def _take(self) -> None:
+        """Wait for samples; raises where the axis was stopped, or the run is to end."""
+        rig = self._rig
+        rig.wait(POLL_S)
+        rows, lost = self._reader.read()
+        if lost:
+            raise DaemonError(
+                f"{self._axis.name}: {lost} cycles were lost before they were read, so this run is worth "
+                "nothing: the machine is too busy; end what else runs on it"
+            )
+        self._add(rows)
+        self._look()
+        # Asked once per cycle, as a bench does.
+        if sum(self._interrupted() for _ in range(max(len(rows), 1))):
+            raise KeyboardInterrupt
+        rig.check_alive()
+
+    def _add(self, rows: SampleArray) -> None:
+        """Samples as a procedure sees them, to those that wait."""
+        if not len(rows):
+            return
+        axis = rows["axes"][:, self._rig.index]
+        cycles = rows["cycle"].tolist()
+        times = [cycle * self._period_s for cycle in cycles]
+        columns = [times, *(axis[name].tolist() for name in _COLUMNS)]
+        readings: list[list[float | None]] = []
+        for place in range(len(self._axis.channels)):
+            known = axis["flags"] & (SampleFlag.CHANNEL0_KNOWN << place)
+            values = zip(axis[f"reading{place}"].tolist(), known.tolist(), strict=True)
+            readings.append([value if there else None for value, there in values])
+        channels = zip(*readings, strict=True) if readings else [()] * len(cycles)
+        told = zip(*columns, channels, strict=True)
+        self._pending += zip(cycles, map(Sample._make, told), strict=True)
+        skipped = int(rows[-1]["skipped"])
+        self._measured.skipped += 0 if self._skipped is None else max(skipped - self._skipped, 0)
+        self._skipped = skipped
+
+    def _look(self) -> None:
+        """What the control process has told of the axis meanwhile."""
+        rig = self._rig
+        log = rig.core.log
+        newest = log.newest
+        for event in log.of_axis(rig.index, self._since):
+            if event.kind is EventKind.FAULT:
+                self._measured.take_fault(event)
+            elif event.kind is EventKind.STREAM_REFUSED:
+                raise DaemonError(f"{self._axis.name}: {event.text}; the axis was braked")
+            elif event.kind is EventKind.UNDERRUN:
+                raise DaemonError(
+                    f"{self._axis.name}: the set-points of a leg came too late, and the axis was braked: the "
+                    "machine is too busy; end what else runs on it"
+                )
+            elif event.kind is EventKind.STATE and event.code != AxisState.ENABLED:
+                if AxisState(event.code) in _NOT_SURVIVED:
+                    raise rig.stopped()
+                raise RefusedError(f"{self._axis.name}: {rig.why_over() or 'the axis was disabled'}")
+        self._since = newest
+        if why := rig.why_over():
+            raise RefusedError(f"{self._axis.name}: {why}")

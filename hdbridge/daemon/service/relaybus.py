@@ -1,0 +1,108 @@
+"""A python-can bus whose frames go through the control process, which has the real one.
+
+The service's SDO clients and boot-up run on it unchanged. What the service must not send never gets as far:
+SYNC, set-points and the master's heartbeat are the control process's own. It sends one relayed frame a cycle
+at most, and refuses NMT commands and SDO downloads to an axis that is enabled.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Container
+from typing import Any, Final
+
+import can
+
+from hdbridge.clock import Clock
+from hdbridge.daemon.memory import Memory, RelayedFrame
+from hdbridge.drive import objects
+from hdbridge.errors import DaemonError
+
+POLL_S: Final = 0.001
+"""How often is looked for a frame: less than the period of any cycle."""
+_FUNCTION: Final = 0x780
+_NODE: Final = 0x7F
+_FROM_NODES: Final = frozenset({objects.COB_EMCY, objects.COB_SDO_ANSWER, objects.COB_HEARTBEAT})
+
+
+class RelayBus(can.BusABC):
+    """The bus of one axis as blocking work sees it; its `recv` waits on the clock that is passed in.
+
+    ``nodes`` are those of the axis: the drive, and an encoder that is a node of its own. One thread uses it;
+    `interrupt` may be called from any.
+    """
+
+    def __init__(self, memory: Memory, clock: Clock, nodes: Container[int], name: str) -> None:
+        super().__init__(channel=name)
+        self.channel_info = name
+        self._clock = clock
+        self._outgoing = memory.outgoing
+        self._incoming = memory.incoming_reader()
+        self._nodes = nodes
+        self._waiting: deque[RelayedFrame] = deque()
+        self._interrupted = threading.Event()
+        self._reason = ""
+
+    def interrupt(self, reason: str) -> None:
+        """Let what is under way on this bus fail at its next wait, once, with these words."""
+        self._reason = reason
+        self._interrupted.set()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Hand a frame over. The master's heartbeat is left out: the control process sends it."""
+        can_id = msg.arbitration_id
+        function, node = can_id & _FUNCTION, can_id & _NODE
+        if function == objects.COB_HEARTBEAT:
+            return
+        to_node = function == objects.COB_SDO_REQUEST and node in self._nodes
+        nmt = can_id == objects.COB_NMT and len(msg.data) == 2 and msg.data[1] in self._nodes
+        if not (to_node or nmt):
+            raise can.CanOperationError(f"{can_id:03X}h is not for the service to send")
+        if not self._outgoing.put(int(1e9 * self._clock.now()), can_id, bytes(msg.data)):
+            raise can.CanOperationError("the control process takes no frames: it hangs or is gone")
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        clock = self._clock
+        deadline_s = clock.now() + (timeout or 0.0)
+        while True:
+            if self._interrupted.is_set():
+                self._interrupted.clear()
+                raise DaemonError(self._reason)
+            frame = self._next()
+            if frame is not None:
+                message = can.Message(
+                    timestamp=frame.time_ns / 1e9,
+                    arbitration_id=frame.can_id,
+                    is_extended_id=False,
+                    data=frame.data,
+                )
+                return message, True
+            now_s = clock.now()
+            if now_s >= deadline_s and timeout is not None:
+                return None, True
+            clock.sleep_until(min(now_s + POLL_S, deadline_s) if timeout is not None else now_s + POLL_S)
+
+    def _next(self) -> RelayedFrame | None:
+        """The next frame of one of the axis's nodes."""
+        if not self._waiting:
+            frames, _ = self._incoming.read()
+            self._waiting.extend(frames)
+        while self._waiting:
+            frame = self._waiting.popleft()
+            if frame.can_id & _FUNCTION in _FROM_NODES and frame.can_id & _NODE in self._nodes:
+                return frame
+        return None
+
+    def shutdown(self) -> None:
+        """Nothing of its own is open."""
+        super().shutdown()
+
+    @property
+    def state(self) -> can.BusState:
+        """Active: whether the real one is, the control process knows."""
+        return can.BusState.ACTIVE
+
+    @state.setter
+    def state(self, new_state: Any) -> None:
+        raise NotImplementedError("the control process has the bus")

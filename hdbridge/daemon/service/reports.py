@@ -1,0 +1,218 @@
+"""What the service tells of itself, in the messages of the API."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.axis.channels import BY_KEY
+from hdbridge.client import messages
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, SampleFlag
+from hdbridge.daemon.service.eventlog import Entry
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import ROWS, Fault, Reaction
+from hdbridge.motion import MotionMode
+from hdbridge.units import ARCSEC_PER_DEG
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hdbridge.axis import AxisConfig
+    from hdbridge.daemon.service.lease import Lease
+    from hdbridge.daemon.service.models import InUse
+    from hdbridge.daemon.service.ports import ServiceAxis
+
+FAULTS: Final = tuple(Fault)
+STATES: Final = tuple(messages.ControlState)
+MODES: Final = tuple(messages.MotionMode)
+_LATCHED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+_KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
+_WITH_FAULT: Final = frozenset({EventKind.FAULT, EventKind.STOPPED})
+
+
+def fault_of(code: int) -> Fault | None:
+    """A fault by its number in samples and events."""
+    return FAULTS[code] if 0 <= code < len(FAULTS) else None
+
+
+def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
+    """An entry of the log; ``names`` are those of the axes."""
+    axis = names[entry.axis] if 0 <= entry.axis < len(names) else None
+    event = entry.event
+    if event is None:
+        return messages.Event(
+            sequence=entry.number,
+            kind=messages.EventKind.NOTE,
+            date=entry.date,
+            axis=axis,
+            text=entry.text,
+            hint=entry.hint or None,
+        )
+    fault = fault_of(event.code) if event.kind in _WITH_FAULT else None
+    return messages.Event(
+        sequence=entry.number,
+        kind=_KINDS[event.kind],
+        date=entry.date,
+        cycle=event.cycle,
+        axis=axis,
+        text=_words(event, fault),
+        hint=ROWS[fault].hint if fault is not None else None,
+    )
+
+
+def _words(event: Event, fault: Fault | None) -> str:
+    """An event in words."""
+    match event.kind:
+        case EventKind.STATE:
+            return STATES[event.code].value
+        case EventKind.MOTION_ENDED:
+            return MotionMode(event.code).name.lower()
+        case EventKind.FAULT if fault is not None:
+            detail = f" ({event.text})" if event.text else ""
+            return f"{fault.value}{detail}: {Reaction(event.id).name.lower().replace('_', ' ')}"
+        case _:
+            return event.text
+
+
+def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
+    """Who may move."""
+    holder = lease.holder
+    if holder is None:
+        return messages.LeaseState(held=False, timeout_s=lease.timeout_s)
+    since = datetime.fromtimestamp(datetime.now(UTC).timestamp() - (now_s - holder.taken_s), UTC)
+    return messages.LeaseState(
+        held=True,
+        client=holder.client,
+        since=since,
+        remaining_s=max(holder.expires_s - now_s, 0.0),
+        timeout_s=lease.timeout_s,
+    )
+
+
+def model_in_use(in_use: InUse) -> messages.ModelInUse | None:
+    """The model and its age; None where there is none."""
+    if not in_use.model.effects:
+        return None
+    date = _date(in_use.model.provenance.get("date"))
+    age_s = max((datetime.now(UTC) - date).total_seconds(), 0.0) if date is not None else None
+    return messages.ModelInUse(
+        version=in_use.version,
+        file=str(in_use.file),
+        date=date,
+        age_s=age_s,
+        reason=str(in_use.model.provenance.get("reason", "")),
+        effects=[each.name for each in in_use.model.effects],
+    )
+
+
+def limits(config: AxisConfig) -> messages.Limits:
+    """What the axis may do."""
+    own = config.limits
+    return messages.Limits(
+        position_min_deg=own.position_min_deg,
+        position_max_deg=own.position_max_deg,
+        velocity_deg_s=own.velocity_deg_s,
+        acceleration_deg_s2=own.acceleration_deg_s2,
+        jerk_deg_s3=own.jerk_deg_s3,
+    )
+
+
+def axis_state(
+    axis: ServiceAxis,
+    stopped: Entry | None,
+    job: messages.Job | None,
+    adaptation: messages.AdaptationState,
+    advice: Sequence[str],
+) -> messages.AxisState:
+    """Everything about an axis; ``stopped`` is the entry that told of its last stop."""
+    link, config = axis.link, axis.axis.config
+    flags = SampleFlag(int(link.value("flags")))
+    known = link.core.observer.newest is not None
+    in_use = axis.models.in_use
+
+    def number(field: str) -> float | None:
+        value = link.value(field)
+        return value if known and math.isfinite(value) else None
+
+    target, load = number("load_target_deg"), number("load_position_deg")
+    error = None if target is None or load is None else ARCSEC_PER_DEG * (load - target)
+    readings = {BY_KEY[key].value: number(f"reading{place}") for place, key in enumerate(config.channels)}
+    return messages.AxisState(
+        name=axis.name,
+        profile=str(axis.axis.profile.folder),
+        node_id=config.drive.node_id,
+        ratio=config.gear.ratio,
+        state=STATES[link.state],
+        power=messages.PowerState(link.power.value),
+        mode=MODES[int(link.value("mode"))],
+        at_rest=bool(flags & SampleFlag.AT_REST),
+        load_target_deg=target,
+        velocity_deg_s=number("velocity_deg_s"),
+        motor_target_deg=number("motor_target_deg"),
+        motor_position_deg=number("motor_position_deg"),
+        load_position_deg=load,
+        error_arcsec=error,
+        motor_torque_nm=number("motor_torque_nm"),
+        readings=readings,
+        scheme=messages.Scheme(in_use.scheme.value),
+        compensating=bool(flags & SampleFlag.COMPENSATING),
+        correction_arcsec=number("correction_arcsec"),
+        predicted_arcsec=number("predicted_arcsec"),
+        weight=number("weight"),
+        limited=bool(flags & SampleFlag.LIMITED),
+        changing=bool(flags & SampleFlag.CHANGING),
+        memory_known=bool(flags & SampleFlag.MEMORY_KNOWN),
+        underrun=bool(flags & SampleFlag.UNDERRUN),
+        limits=limits(config),
+        fault=_fault(axis, stopped),
+        model=model_in_use(in_use),
+        load_loop=messages.LoadLoopState(
+            configured=axis.axis.load_loop is not None,
+            on=axis.load_loop_on,
+            correction_arcsec=link.value("loop_arcsec"),
+        ),
+        adaptation=adaptation,
+        advice=list(advice),
+        queued=axis.motion.queued,
+        job=job,
+    )
+
+
+def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
+    """What stopped the axis, while that is latched or the drive is in fault."""
+    link = axis.link
+    code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
+    fault = fault_of(code)
+    latched = link.state in _LATCHED
+    if not latched and link.power is not State.FAULT:
+        return None
+    event = stopped.event if stopped is not None else None
+    if fault is None and event is not None:
+        fault = fault_of(event.code)
+    if fault is None and not latched:
+        fault = Fault.DRIVE_FAULT
+    return messages.Fault(
+        name=fault.name if fault is not None else "COMMAND",
+        text=event.text
+        if event is not None
+        else fault.value
+        if fault is not None
+        else "quick stop by command",
+        hint=ROWS[fault].hint if fault is not None else "reset it when the axis may move again",
+        cycle=event.cycle if event is not None else None,
+        date=stopped.date if stopped is not None else None,
+        needs_verification=link.state is AxisState.LATCHED,
+    )
+
+
+def _date(value: object) -> datetime | None:
+    """A date of a provenance; None where it is none."""
+    if isinstance(value, datetime):
+        return value if value.tzinfo is not None else value.replace(tzinfo=UTC)
+    try:
+        date = datetime.fromisoformat(str(value))
+    except ValueError:
+        return None
+    return date if date.tzinfo is not None else date.replace(tzinfo=UTC)

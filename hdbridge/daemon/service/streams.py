@@ -1,0 +1,195 @@
+"""Set-points of a client, handed on to the control process as knots with velocities.
+
+A point without a velocity gets the slope between its neighbours, so it waits for the next one; the last one
+of a stream is at rest. The stream's time begins when `LEAD_S` of path is there, or its end, so that a client
+may be late by as much.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from types import TracebackType
+from typing import Final, Self
+
+from hdbridge.daemon.memory import CommandKind, Knot
+from hdbridge.daemon.service.activity import Activity
+from hdbridge.daemon.service.axislink import AxisLink
+from hdbridge.daemon.service.interface import StreamPoint
+from hdbridge.errors import InputError, RefusedError
+
+LEAD_S: Final = 0.1
+"""Path that waits before a stream begins."""
+ROOM_POLL_S: Final = 0.02
+BEGIN_DEG: Final = 1e-6
+"""A stream begins so near to where the axis stands."""
+
+
+class Knots:
+    """Points of a stream, in order, made into knots. Pure.
+
+    ``begin_deg`` is where the axis stands at rest at time 0.
+    """
+
+    def __init__(self, stream: int, begin_deg: float) -> None:
+        self._stream = stream
+        self._begin_deg = begin_deg
+        self._before: StreamPoint | None = None
+        """The last point whose knot was made."""
+        self._held: StreamPoint | None = None
+        """The newest point, where its velocity is not known yet."""
+
+    def add(self, points: Sequence[StreamPoint]) -> list[Knot]:
+        """The knots that these points complete; InputError, and none of them is taken, for a bad one."""
+        newest = self._held or self._before
+        chain = [*([newest] if newest else []), *points]
+        self._check(points, chain)
+        knots: list[Knot] = []
+        before, held = self._before, self._held
+        for point in points:
+            if before is None and held is None:
+                knots.append(Knot(self._stream, 0.0, self._begin_deg, 0.0))
+                before = StreamPoint(0.0, self._begin_deg, 0.0)
+                if point.time_s == 0.0:
+                    continue
+            if held is not None:
+                assert before is not None
+                knots.append(self._knot(held, _slope(before, point)))
+                before, held = held, None
+            if point.velocity_deg_s is None:
+                held = point
+            else:
+                knots.append(self._knot(point, point.velocity_deg_s))
+                before = point
+        self._before, self._held = before, held
+        return knots
+
+    def end(self) -> list[Knot]:
+        """The last knot, at rest, where it was still held back."""
+        held, self._held = self._held, None
+        if held is None:
+            return []
+        self._before = held
+        return [self._knot(held, 0.0)]
+
+    def _knot(self, point: StreamPoint, velocity_deg_s: float) -> Knot:
+        return Knot(self._stream, float(point.time_s), float(point.position_deg), float(velocity_deg_s))
+
+    def _check(self, points: Sequence[StreamPoint], chain: Sequence[StreamPoint]) -> None:
+        for point in points:
+            velocity = point.velocity_deg_s
+            if not all(map(math.isfinite, (point.time_s, point.position_deg, velocity or 0.0))):
+                raise InputError(f"a set-point of {tuple(point)}; expected finite numbers")
+        if points and self._before is None and self._held is None:
+            first = points[0]
+            if first.time_s < 0.0:
+                raise InputError(f"a set-point at {first.time_s:g} s; a stream's time begins at 0")
+            if first.time_s == 0.0 and abs(first.position_deg - self._begin_deg) > BEGIN_DEG:
+                raise InputError(
+                    f"a stream begins at {first.position_deg:.9g} deg, but the axis stands at "
+                    f"{self._begin_deg:.9g}: begin there, or move there first"
+                )
+            if first.time_s == 0.0 and first.velocity_deg_s:
+                raise InputError(
+                    f"a stream begins with {first.velocity_deg_s:g} deg/s, but the axis stands: begin at rest"
+                )
+        for one, next_ in pairwise(chain):
+            if not next_.time_s > one.time_s:
+                raise InputError(
+                    f"a set-point at {next_.time_s:g} s after one at {one.time_s:g} s: each must be later "
+                    "than the one before; none of these was taken"
+                )
+
+
+def _slope(one: StreamPoint, other: StreamPoint) -> float:
+    return (other.position_deg - one.position_deg) / (other.time_s - one.time_s)
+
+
+class ServiceStream:
+    """A stream under way; `interface.StreamPort` says what each method does."""
+
+    def __init__(self, link: AxisLink, activity: Activity, timeout_s: float) -> None:
+        """It is of ``activity``, and over with it."""
+        self._link = link
+        self._activity = activity
+        self._timeout_s = timeout_s
+        self._number = link.core.next_stream()
+        self._knots: Knots | None = None
+        self._queue = link.core.memory.knots[link.index]
+        self._begun_cycle: int | None = None
+        self._last_s = 0.0
+        """Time of the last knot that was handed over."""
+        self._ended = False
+
+    @property
+    def buffered_s(self) -> float:
+        """Time of path that is there and was not followed yet."""
+        if self._begun_cycle is None:
+            return self._last_s
+        core = self._link.core
+        run_s = (core.observer.cycle - self._begun_cycle) * core.memory.period_s
+        return max(self._last_s - run_s, 0.0)
+
+    async def put(self, points: Sequence[StreamPoint]) -> None:
+        """Hand over set-points; waits while the buffer is full."""
+        self._check_open()
+        if self._knots is None:
+            await self._link.until(lambda: True, 0.0)
+            self._knots = Knots(self._number, self._link.value("load_target_deg"))
+        await self._hand_over(self._knots.add(points))
+        if self._begun_cycle is None and self._last_s >= LEAD_S:
+            await self._begin()
+
+    async def end(self) -> None:
+        """Follow what was handed over, come to rest there, and return then."""
+        self._check_open()
+        if self._knots is None:
+            self._ended = True
+            self._activity.end("it came to its end")
+            return
+        await self._hand_over(self._knots.end())
+        if self._begun_cycle is None:
+            await self._begin()
+        self._ended = True
+        await self._link.do(CommandKind.STREAM_END)
+        await self._link.arrival(self._activity)
+
+    async def _begin(self) -> None:
+        core = self._link.core
+        self._activity.since = core.log.newest
+        answer = await self._link.do(CommandKind.STREAM_BEGIN, a=float(self._timeout_s), j=self._number)
+        self._activity.command_id = answer.id
+        self._begun_cycle = answer.cycle
+
+    async def _hand_over(self, knots: Sequence[Knot]) -> None:
+        while knots:
+            taken = self._queue.put(knots)
+            if taken:
+                self._last_s = knots[taken - 1].time_s
+            knots = knots[taken:]
+            if knots:
+                if self._begun_cycle is None:
+                    await self._begin()
+                await self._link.core.timing.sleep(ROOM_POLL_S)
+                self._check_open()
+
+    def _check_open(self) -> None:
+        """RefusedError where the stream has ended, with the reason; LeaseError where the lease has."""
+        self._link.core.lease.check(self._activity.holder)
+        if self._begun_cycle is not None and not self._ended:
+            self._link.look(self._activity)
+        if self._activity.over or self._ended:
+            why = self._activity.over or "it was ended"
+            raise RefusedError(f"{self._link.name}: the stream is over: {why}")
+
+    async def __aenter__(self) -> Self:
+        """Itself."""
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """`end`, unless it is over, or the block fails: then the axis brakes when the buffer is used up."""
+        if error is None and not (self._activity.over or self._ended):
+            await self.end()

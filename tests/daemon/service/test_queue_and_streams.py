@@ -1,0 +1,250 @@
+"""Way points, streams and coordinated moves: what follows what, and how they end."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.service import Service, play, stepped_service, until
+
+from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.errors import InputError, LeaseError, RefusedError
+
+
+@pytest.fixture
+def service(tmp_path: Path):
+    with stepped_service(tmp_path) as made:
+        yield made
+
+
+def test_way_points_are_stood_at_one_after_the_other(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            reader = service.daemon.memory.reader()
+            assert await axis.queue(token, [WayPoint(2.0, dwell_s=0.3), WayPoint(-1.0)]) == 2
+            assert await axis.queue(token, [WayPoint(1.0)]) >= 2
+            await until(bridge, lambda: axis.motion.activity.over != "")
+            samples, lost = reader.read()
+            assert lost == 0
+            stands = samples["axes"][:, 0]
+            standing = stands["load_target_deg"][stands["velocity_deg_s"] == 0.0]
+            order = [value for value, before in zip(standing[1:], standing, strict=False) if value != before]
+            assert order == pytest.approx([2.0, -1.0, 1.0])
+            assert np.count_nonzero(np.isclose(standing, 2.0)) * service.daemon.period_s >= 0.3
+
+    play(story())
+
+
+def test_a_move_takes_the_place_of_the_queue(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.queue(token, [WayPoint(20.0), WayPoint(-20.0)])
+            await bridge.core.timing.sleep(0.2)
+            await axis.move(token, 1.0)
+            assert axis.state().queued == 0
+            await bridge.core.timing.sleep(1.0)
+            assert axis.state().load_target_deg == pytest.approx(1.0)
+
+    play(story())
+
+
+def test_a_bad_way_point_takes_none(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            for bad in (
+                WayPoint(1e6),
+                WayPoint(math.nan),
+                WayPoint(1.0, velocity_deg_s=0.0),
+                WayPoint(1.0, dwell_s=-1),
+            ):
+                with pytest.raises(InputError):
+                    await axis.queue(token, [WayPoint(2.0), bad])
+            await bridge.core.timing.sleep(0.5)
+            assert axis.state().load_target_deg == pytest.approx(0.0, abs=0.01)
+
+    play(story())
+
+
+def test_a_forgotten_queue_ends_after_the_present_move(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.queue(token, [WayPoint(4.0), WayPoint(-20.0), WayPoint(20.0)])
+            await bridge.core.timing.sleep(0.1)
+            assert await axis.clear_queue(token) == 2
+            await until(bridge, lambda: axis.motion.activity.over != "")
+            assert axis.state().load_target_deg == pytest.approx(4.0)
+
+    play(story())
+
+
+def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(tmp_path: Path) -> None:
+    async def story(service: Service) -> None:
+        async with service.enabled() as (bridge, token):
+            axis, timing = bridge.axes["axis1"], bridge.core.timing
+            await axis.move(token, 60.0, velocity_deg_s=15.0, wait=False)
+            await until(bridge, lambda: bridge.lease.holder is None)
+            assert not axis.state().at_rest
+            await until(bridge, lambda: axis.state().at_rest)
+            assert axis.state().load_target_deg == pytest.approx(60.0)
+
+            again = bridge.lease.take("test")
+            await axis.queue(again, [WayPoint(0.0, 10.0), WayPoint(60.0)])
+            await timing.sleep(1.5)
+            await until(bridge, lambda: axis.state().at_rest, 2.0)
+            stopped_deg = axis.state().load_target_deg
+            assert 10.0 < stopped_deg < 55.0
+            await timing.sleep(2.0)
+            assert axis.state().load_target_deg == stopped_deg
+            assert axis.state().state == "enabled"
+            told = [each.text for each in bridge.events().events if each.kind == "note"]
+            assert "a queue of moves was stopped: the lease of its client has ended" in told
+
+    with stepped_service(tmp_path, lease_s=1.0) as service:
+        play(story(service))
+
+
+def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.jog(token, 10.0, timeout_s=5.0)
+            await bridge.core.timing.sleep(0.2)
+            bridge.lease.take("other", force=True)
+            await until(bridge, lambda: axis.state().at_rest, 1.0)
+            with pytest.raises(LeaseError, match="'other'"):
+                await axis.jog(token, 10.0)
+
+    play(story())
+
+
+def sine(count: int, period_s: float = 0.05, amplitude_deg: float = 3.0) -> list[StreamPoint]:
+    times = [period_s * number for number in range(count)]
+    whole = times[-1]
+    return [
+        StreamPoint(time_s, 0.5 * amplitude_deg * (1.0 - math.cos(2.0 * math.pi * time_s / whole)))
+        for time_s in times
+    ]
+
+
+def test_a_stream_follows_its_set_points(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 0.0)
+            reader = service.daemon.memory.reader()
+            points = sine(41)
+            async with await axis.stream(token) as stream:
+                for place in range(0, len(points), 7):
+                    await stream.put(points[place : place + 7])
+                assert stream.buffered_s > 0.5
+            state = axis.state()
+            assert state.at_rest
+            assert state.mode == "hold"
+            samples, _ = reader.read()
+            target = samples["axes"][:, 0]["load_target_deg"]
+            moving = target[np.flatnonzero(np.diff(target))[0] :]
+            times = service.daemon.period_s * np.arange(len(moving))
+            wanted = np.interp(
+                times, [each.time_s for each in points], [each.position_deg for each in points]
+            )
+            assert np.max(np.abs(moving - wanted)) < 0.01  # the cubic is not the chord
+            with pytest.raises(RefusedError, match="over"):
+                await stream.put([StreamPoint(9.0, 0.0)])
+
+    play(story())
+
+
+def test_a_stream_that_dries_up_brakes_and_says_so(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 0.0)
+            stream = await axis.stream(token)
+            await stream.put([StreamPoint(0.1 * number, 0.05 * number * number) for number in range(6)])
+            await until(bridge, lambda: axis.state().underrun, 2.0)
+            await until(bridge, lambda: axis.state().at_rest, 2.0)
+            with pytest.raises(RefusedError, match="ran out"):
+                await stream.put([StreamPoint(1.0, 2.0)])
+
+    play(story())
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([StreamPoint(0.0, 5.0)], "begins at 5 deg"),
+        ([StreamPoint(0.1, 0.0), StreamPoint(0.1, 0.1)], "later"),
+        ([StreamPoint(0.1, math.inf)], "finite"),
+        ([StreamPoint(-0.1, 0.0)], "begins at 0"),
+        ([StreamPoint(0.0, 0.0, 1.0)], "begin at rest"),
+    ],
+)
+def test_bad_set_points_are_refused_before_anything_moves(
+    service: Service, points: list[StreamPoint], words: str
+) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 0.0)
+            stream = await axis.stream(token)
+            with pytest.raises(InputError, match=words):
+                await stream.put(points)
+            await bridge.core.timing.sleep(0.5)
+            assert axis.state().load_target_deg == 0.0
+
+    play(story())
+
+
+def test_set_points_beyond_the_limits_end_the_stream_braking(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 0.0)
+            stream = await axis.stream(token)
+            await stream.put([StreamPoint(0.2, 0.5), StreamPoint(0.4, 1.0), StreamPoint(0.41, 300.0)])
+            with pytest.raises((InputError, RefusedError), match="deg/s"):
+                await stream.end()
+            await until(bridge, lambda: axis.state().at_rest, 2.0)
+            assert axis.state().state == "enabled"
+            assert axis.state().load_target_deg < 10.0
+
+    play(story())
+
+
+def test_two_axes_arrive_together(tmp_path: Path) -> None:
+    async def story(service: Service) -> None:
+        async with service.enabled() as (bridge, token):
+            reader = service.daemon.memory.reader()
+            before = [each.state().load_target_deg for each in bridge.axes.values()]
+            await bridge.coordinated(token, {"axis1": 20.0, "axis2": -5.0})
+            assert [each.state().load_target_deg for each in bridge.axes.values()] == pytest.approx(
+                [20.0, -5.0]
+            )
+            samples, _ = reader.read()
+            targets = samples["axes"]["load_target_deg"]
+            way = (targets - before) / (np.array([20.0, -5.0]) - before)
+            assert np.max(np.abs(way[:, 0] - way[:, 1])) < 1e-6
+            with pytest.raises(InputError, match="'axis3'"):
+                await bridge.coordinated(token, {"axis1": 0.0, "axis3": 1.0})
+            with pytest.raises(InputError, match="limits"):
+                await bridge.coordinated(token, {"axis1": 0.0, "axis2": 1e5})
+
+    with stepped_service(tmp_path, axes=2) as service:
+        play(story(service))
+
+
+def test_one_axis_stopped_stops_the_coordinated_move(tmp_path: Path) -> None:
+    async def story(service: Service) -> None:
+        async with service.enabled() as (bridge, token):
+            await bridge.coordinated(token, {"axis1": 80.0, "axis2": -80.0}, wait=False)
+            await bridge.core.timing.sleep(0.5)
+            await bridge.axes["axis2"].stop()
+            await until(bridge, lambda: all(each.state().at_rest for each in bridge.axes.values()), 3.0)
+            assert bridge.axes["axis1"].state().load_target_deg < 75.0
+
+    with stepped_service(tmp_path, axes=2) as service:
+        play(story(service))

@@ -1,0 +1,136 @@
+"""The daemon's service on a stepped control loop: one thread, virtual time, asyncio where it waits."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shutil
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock
+from hdbridge.daemon.machine import Axis, Machine
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.jobwork import Told, Work, run
+from hdbridge.daemon.service.rigs import DaemonRig
+from hdbridge.files.profile import Profile
+from hdbridge.model import TransmissionModel
+from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
+
+Params = ParamSpec("Params")
+Result = TypeVar("Result")
+
+
+class SteppedTiming:
+    """Whoever waits turns the loop; what blocks is called where it is."""
+
+    def __init__(self, daemon: SteppedDaemon) -> None:
+        self._daemon = daemon
+        self.clock: Clock = daemon.service_clock
+
+    async def sleep(self, duration_s: float) -> None:
+        end_s = self.clock.now() + duration_s
+        await asyncio.sleep(0)
+        while self.clock.now() < end_s:
+            self._daemon.turn()
+            await asyncio.sleep(0)
+
+    async def work(
+        self, function: Callable[Params, Result], *args: Params.args, **kwargs: Params.kwargs
+    ) -> Result:
+        return function(*args, **kwargs)
+
+
+def in_this_thread(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
+    """A job without a process of its own."""
+    return run(work, rig, told)
+
+
+def article_profiles(folder: Path, count: int) -> list[Profile]:
+    """Profiles that a test may change: so many axes of the article's kind on one bus, nodes 1, 2, ..."""
+    made = []
+    for node in range(1, count + 1):
+        own = folder / f"axis{node}"
+        shutil.copytree(PROFILE, own)
+        text = (own / "axis.yaml").read_text()
+        text = re.sub(r"(?m)^name: .*$", f"name: axis{node}", text)
+        text = re.sub(r"(?m)^  node_id: .*$", f"  node_id: {node}", text)
+        eds = AxisConfig.load(PROFILE).eds_path
+        text = re.sub(r"(?m)^  eds: .*$", f"  eds: {eds}", text)
+        (own / "axis.yaml").write_text(text)
+        model = TransmissionModel.load(own / "model.yaml")
+        model.bound_to(AxisConfig.load(own)).save(own / "model.yaml")
+        made.append(Profile.find(str(own)))
+    return made
+
+
+class Service:
+    """A stepped daemon, and bridges on it."""
+
+    def __init__(self, daemon: SteppedDaemon, machine: Machine, folder: Path) -> None:
+        self.daemon = daemon
+        self.machine = machine
+        self.folder = folder
+        self.timing = SteppedTiming(daemon)
+
+    def bridge(self, **options: Any) -> ServiceBridge:
+        """A service that begins now."""
+        options = {"runner": in_this_thread, "runtime": self.folder, **options}
+        return ServiceBridge(self.machine, self.daemon.memory, self.timing, **options)
+
+    @asynccontextmanager
+    async def ready(self, **options: Any) -> AsyncIterator[ServiceBridge]:
+        """A bridge whose axes are verified."""
+        async with self.bridge(**options) as bridge:
+            await until(
+                bridge, lambda: all(each.state().state == "disabled" for each in bridge.axes.values())
+            )
+            yield bridge
+
+    @asynccontextmanager
+    async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, str]]:
+        """A bridge whose axes are enabled, and the token of the lease."""
+        async with self.ready(**options) as bridge:
+            token = bridge.lease.take("test")
+            for axis in bridge.axes.values():
+                await axis.enable(token)
+            yield bridge, token
+
+
+async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    """Turn the loop until ``done``."""
+    timing = bridge.core.timing
+    end_s = timing.clock.now() + timeout_s
+    while not done():
+        bridge.core.observer.poll()
+        states = {name: each.state().state for name, each in bridge.axes.items()}
+        told = [each.text for each in bridge.events().events[-5:]]
+        assert timing.clock.now() < end_s, f"not within {timeout_s} s: {states}, {told}"
+        await timing.sleep(0.02)
+
+
+@contextmanager
+def stepped_service(folder: Path, axes: int = 1, lease_s: float = 10.0, **options: Any) -> Iterator[Service]:
+    """A control loop with simulated drives, nothing verified yet, and the machine that it is."""
+    files = article_profiles(folder, axes)
+    configs = [AxisConfig.load(each.axis) for each in files]
+    with stepped_daemon(configs, **options) as daemon:
+        machine = replace(
+            Machine.of_profile(str(files[0].folder)),
+            axes=tuple(Axis(config, profile) for config, profile in zip(configs, files, strict=True)),
+            lease_s=lease_s,
+        )
+        yield Service(daemon, machine, folder)
+
+
+def play(coroutine: Coroutine[Any, Any, Result] | Awaitable[Result]) -> Result:
+    """Run a test's coroutine to its end."""
+
+    async def main() -> Result:
+        return await coroutine
+
+    return asyncio.run(main())
