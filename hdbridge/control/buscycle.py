@@ -27,7 +27,7 @@ from typing import Final
 
 from hdbridge.clock import Clock
 from hdbridge.control.axiscycle import AxisCycle
-from hdbridge.control.busmembers import check_members
+from hdbridge.control.busroutes import Slot, check_members, routes
 from hdbridge.control.latency import Histogram
 from hdbridge.drive.busload import FRAME_BITS
 from hdbridge.drive.fastlink import fast_link
@@ -50,9 +50,6 @@ FLUSH_MAXIMUM: Final = 10_000
 """Frames thrown away when the cycle begins."""
 _HEARTBEAT_DATA: Final = bytes([NmtState.OPERATIONAL])
 
-_Slot = tuple[int, Callable[[bytes], None], AxisCycle]
-"""A TPDO: its bit among those of a turn, what takes its data, and whose it is."""
-
 
 class BusCycle:
     """Runs the axes of one bus over a link, one `exchange` per period.
@@ -63,11 +60,44 @@ class BusCycle:
     """
 
     __slots__ = (
-        "_all", "_beginning", "_bits", "_bits_of_turn", "_bus_faults", "_changed", "_deadline",
-        "_discarded", "_early", "_heartbeat_id", "_heartbeat_period_s", "_heartbeat_s", "_late_s", "_link",
-        "_listeners", "_listening", "_per_bit", "_rested", "_slots", "_speaking", "_window_s", "axes",
-        "busy_s", "clock", "count", "down", "faults", "histogram", "late_s", "on_frame", "outgoing",
-        "overruns", "period_s", "refused", "skipped", "woke_s",
+        "_awaited",
+        "_beginning",
+        "_bits",
+        "_bits_of_turn",
+        "_bus_faults",
+        "_changed",
+        "_deadline",
+        "_discarded",
+        "_dropped",
+        "_early",
+        "_heartbeat_id",
+        "_heartbeat_period_s",
+        "_heartbeat_s",
+        "_late_s",
+        "_listeners",
+        "_listening",
+        "_per_bit",
+        "_recv",
+        "_rested",
+        "_send",
+        "_slots",
+        "_speaking",
+        "_window_s",
+        "axes",
+        "busy_s",
+        "clock",
+        "count",
+        "down",
+        "faults",
+        "histogram",
+        "late_s",
+        "on_frame",
+        "outgoing",
+        "overruns",
+        "period_s",
+        "refused",
+        "skipped",
+        "woke_s",
     )  # fmt: skip
 
     def __init__(
@@ -111,12 +141,12 @@ class BusCycle:
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
         self._per_bit = 1.0 / (bitrate_bps * period_s) if bitrate_bps is not None else math.nan
-        self._slots: dict[int, _Slot] = {}
+        self._slots: dict[int, Slot] = {}
         self._listeners: dict[int, AxisCycle] = {}
         self._speaking: tuple[AxisCycle, ...] = ()
         self._listening: tuple[AxisCycle, ...] = ()
         self._beginning: list[AxisCycle] = []
-        self._all = self._early = 0
+        self._awaited = self._early = 0
         self._bits = self._bits_of_turn = FRAME_BITS[0]
         self._heartbeat_id = 0
         self._heartbeat_period_s = math.inf
@@ -163,7 +193,8 @@ class BusCycle:
 
         The axes stay latched: each has to be verified, released (`AxisCycle.reset`) and begun.
         """
-        self._link = fast_link(link)
+        fast = fast_link(link)
+        self._send, self._recv, self._dropped = fast.send, fast.recv, fast.dropped
         self.restart()
 
     def exchange(self) -> None:
@@ -181,7 +212,7 @@ class BusCycle:
         try:
             read = self._drain(now)
             try:
-                self._link.send(COB_SYNC, b"")
+                self._send(COB_SYNC, b"")
             except TransmitBufferFull as error:
                 self._everybody(Fault.TRANSMIT_FULL, f"SYNC: {error}")
                 got = 0
@@ -194,7 +225,7 @@ class BusCycle:
                 data = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
                 if data is not None:
                     try:
-                        self._link.send(axis.rpdo_id, data)
+                        self._send(axis.rpdo_id, data)
                     except TransmitBufferFull as error:
                         # Stale set-points are worse than none: it is not sent again, and the axes stop.
                         self._no_room(f"RPDO: {error}")
@@ -252,7 +283,7 @@ class BusCycle:
 
     def _drain(self, now: float) -> bool:
         """Read what waited; whether that was all of it."""
-        recv, slots = self._link.recv, self._slots
+        recv, slots = self._recv, self._slots
         self._early = 0
         most = DRAIN_MAXIMUM
         if self._rested:
@@ -274,14 +305,14 @@ class BusCycle:
                 return False
         if self._rested:
             self._rested = False
-            self._discarded = self._link.dropped.total
+            self._discarded = self._dropped.total
         if self._beginning:
             for axis in self._beginning:
                 axis.rested = False
             self._beginning.clear()
         return True
 
-    def _before_sync(self, frame: Frame, slot: _Slot) -> None:
+    def _before_sync(self, frame: Frame, slot: Slot) -> None:
         """A TPDO out of its window: stale, unless nobody waits for it."""
         bit, accept, axis = slot
         if axis.awaited:
@@ -297,10 +328,10 @@ class BusCycle:
 
     def _receive(self, window_end_s: float) -> int:
         """Take this cycle's TPDOs until all are there or the window closes; the bits of those that came."""
-        recv, slots, everything = self._link.recv, self._slots, self._all
+        recv, slots, awaited = self._recv, self._slots, self._awaited
         got = self._early
         spoilt: dict[int, int] | None = None
-        while got & everything != everything:
+        while got & awaited != awaited:
             frame = recv(window_end_s)
             if frame is None:
                 break
@@ -321,12 +352,12 @@ class BusCycle:
                 spoilt[can_id] = len(data)
                 continue
             got |= bit
-        dropped = self._link.dropped
+        dropped = self._dropped
         discarded = dropped.remote + dropped.extended + dropped.error + dropped.fd
         if discarded != self._discarded:
             self._discarded = discarded
             self._everybody(Fault.DISCARDED_FRAME, "remote, extended, FD or error frame")
-        if spoilt is not None or got & everything != everything:
+        if spoilt is not None or got & awaited != awaited:
             self._note_missing(got, spoilt or {})
         return got
 
@@ -370,7 +401,7 @@ class BusCycle:
             self._heartbeat_s = now + self._heartbeat_period_s
         self._bits_of_turn += FRAME_BITS[1]
         try:
-            self._link.send(self._heartbeat_id, _HEARTBEAT_DATA)
+            self._send(self._heartbeat_id, _HEARTBEAT_DATA)
         except TransmitBufferFull as error:
             self._no_room(f"heartbeat: {error}")
 
@@ -383,7 +414,7 @@ class BusCycle:
             return
         self._bits_of_turn += FRAME_BITS[len(frame[1])]
         try:
-            self._link.send(*frame)
+            self._send(*frame)
         except TransmitBufferFull:
             self.refused += 1
 
@@ -432,33 +463,15 @@ class BusCycle:
         self._changed = True
 
     def _rebuild(self, now: float) -> None:
-        """Sort the axes and their identifiers anew: a turn looks up, and decides nothing."""
+        """Sort the axes and their identifiers anew, and start those that begin."""
         self._changed = False
-        self._speaking = tuple(axis for axis in self.axes if not axis.silent)
-        self._listening = tuple(axis for axis in self.axes if axis.silent)
-        slots: dict[int, _Slot] = {}
-        listeners: dict[int, AxisCycle] = {}
-        everything, bits = 0, FRAME_BITS[0]
-        for axis in self.axes:
-            image = axis.image
-            tpdos, channels = axis.route()
-            axis.needed = 0
-            for can_id in (*tpdos, *channels):
-                bit = 1 << len(slots)
-                slots[can_id] = (bit, image.handler(can_id), axis)
-                if can_id in tpdos:
-                    axis.needed |= bit
-                if axis.awaited:
-                    everything |= bit
-                    bits += FRAME_BITS[image.length_of(can_id)]
-            if not axis.silent:
-                bits += FRAME_BITS[image.rpdo.length]
-                if axis.rested:
-                    axis.start(now, self.count)
-                    self._beginning.append(axis)
-            listeners.update(dict.fromkeys(axis.identifiers, axis))
-        self._slots, self._listeners = slots, listeners
-        self._all, self._bits = everything, bits
+        self._speaking, self._listening, self._slots, self._listeners, self._awaited, self._bits = routes(
+            self.axes
+        )
+        for axis in self._speaking:
+            if axis.rested:
+                axis.start(now, self.count)
+                self._beginning.append(axis)
 
 
 def _nobody() -> None:

@@ -70,30 +70,39 @@ class NeverSleeping:
         """Return at once."""
 
 
-def answers(node_id: int) -> tuple[can.Message, can.Message]:
-    """The two TPDOs of an enabled drive that stands at zero."""
-    return (
-        can.Message(
-            arbitration_id=0x180 + node_id, is_extended_id=False, data=TPDO1.pack(STATUS_ENABLED, 0, 0)
-        ),
-        can.Message(arbitration_id=0x280 + node_id, is_extended_id=False, data=TPDO2.pack(0, 0)),
+def answers(*node_ids: int) -> tuple[can.Message, ...]:
+    """The two TPDOs of each of some enabled drives that stand at zero."""
+    data = {0x180: TPDO1.pack(STATUS_ENABLED, 0, 0), 0x280: TPDO2.pack(0, 0)}
+    return tuple(
+        can.Message(arbitration_id=base + node_id, is_extended_id=False, data=data[base])
+        for node_id in node_ids
+        for base in data
+    )
+
+
+def heartbeats(*node_ids: int) -> tuple[can.Message, ...]:
+    """The heartbeats of these drives."""
+    return tuple(
+        can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
+        for node_id in node_ids
     )
 
 
 class AnsweringBus(VirtualBus):
-    """The master's end of a virtual bus with a second node on it that answers SYNC at once."""
+    """The master's end of a virtual bus with other nodes on it that answer SYNC at once."""
 
-    def __init__(self, node_id: int) -> None:
+    def __init__(self, *node_ids: int) -> None:
         super().__init__(channel=self)
         self.listener = VirtualBus(channel=self)
-        self.replies = answers(node_id)
-        self.heartbeat = can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
+        self.replies = answers(*node_ids)
+        self.heartbeats = heartbeats(*node_ids)
         self.count = 0
 
     def answer(self) -> None:
         self.count += 1
         if self.count % 12 == 0:
-            self.queue.put(self.heartbeat)
+            for heartbeat in self.heartbeats:
+                self.queue.put(heartbeat)
         for reply in self.replies:
             self.queue.put(reply)
         self.listener.queue.queue.clear()
@@ -111,7 +120,7 @@ class AnsweringBus(VirtualBus):
 class LoopbackSocket:
     """Looks like the CAN socket of a master; a second UDP socket answers its SYNC at once."""
 
-    def __init__(self, node_id: int) -> None:
+    def __init__(self, *node_ids: int) -> None:
         self.master = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.drive = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         for each in (self.master, self.drive):
@@ -120,9 +129,8 @@ class LoopbackSocket:
         self.drive.connect(self.master.getsockname())
         self.master.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self.recv, self.recvmsg, self.fileno = self.master.recv, self.master.recvmsg, self.master.fileno
-        self.replies = [build_can_frame(reply) for reply in answers(node_id)]
-        alive = can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
-        self.heartbeat = build_can_frame(alive)
+        self.replies = [build_can_frame(reply) for reply in answers(*node_ids)]
+        self.heartbeats = [build_can_frame(alive) for alive in heartbeats(*node_ids)]
         self.count = 0
 
     def send(self, frame: bytes, flags: int = 0) -> int:
@@ -134,7 +142,8 @@ class LoopbackSocket:
     def answer(self) -> None:
         self.count += 1
         if self.count % 12 == 0:
-            self.drive.send(self.heartbeat)
+            for heartbeat in self.heartbeats:
+                self.drive.send(heartbeat)
         for reply in self.replies:
             self.drive.send(reply)
         with suppress(BlockingIOError):
@@ -163,10 +172,10 @@ def loopback_bus(sock: LoopbackSocket) -> SocketcanBus:
 
 
 @contextmanager
-def answering_kernel(channel: str, node_id: int) -> Iterator[None]:
-    """The kernel's CAN gateway answers SYNC with both TPDOs, and the master's heartbeat with the drive's."""
-    rules = [("080", f"{reply.arbitration_id:X}.8.{reply.data.hex()}") for reply in answers(node_id)]
-    rules.append(("77F", f"{0x700 + node_id:X}.1.0500000000000000"))
+def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
+    """The kernel's CAN gateway answers SYNC with the TPDOs, and the master's heartbeat with the drives'."""
+    rules = [("080", f"{reply.arbitration_id:X}.8.{reply.data.hex()}") for reply in answers(*node_ids)]
+    rules += [("77F", f"{0x700 + node_id:X}.1.0500000000000000") for node_id in node_ids]
     commands = [
         ["-s", channel, "-d", channel, "-e", "-i", "-f", f"{can_id}:7FF", "-m", f"SET:ILD:{reply}"]
         for can_id, reply in rules

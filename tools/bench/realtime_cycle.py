@@ -7,6 +7,8 @@ Runs on the kernel of `tools/realtime/run.sh`, on which an instruction is a nano
 one commit can be compared with another. The exchanges are those of `cycle.py` and one in C (`master.c`). The
 kernel's gateway answers as the drive. Each has SCHED_FIFO, locked memory and absolute deadlines.
 
+Then six axes on one bus, compensated, at 250 Hz (`buscycle.py`).
+
   late    from the deadline to the first instruction of the cycle
   busy    from there to its last one, system calls included
   missed  cycles that began more than half a period late or were busy beyond the next deadline
@@ -25,6 +27,7 @@ from pathlib import Path
 
 import can
 import numpy as np
+from buscycle import COMPENSATED, Axes
 from cycle import PROFILE, Variants, answering_kernel
 
 from hdbridge.axis import AxisConfig
@@ -32,6 +35,8 @@ from hdbridge.control.realtime import prepare_realtime
 from hdbridge.model import TransmissionModel
 
 WARM_UP = 50
+AXES = 6
+KINDS = ("bare", "cycle", "compensated", "canopen", "axes")
 
 
 class Waking:
@@ -96,9 +101,25 @@ def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
     return Figures.of("a master in C", 1e-3 * late_ns, 1e-3 * busy_ns, 1e6 * period_s)
 
 
+def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) -> tuple[Figures, float]:
+    """Several axes at the cycle of the profile, and that cycle in seconds."""
+    with (
+        answering_kernel(channel, *range(1, AXES + 1)),
+        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
+        prepare_realtime(),
+    ):
+        axes = Axes(bus, AXES, model, clock)
+        axes.start(COMPENSATED)
+        figures = timed(f"{AXES} axes, compensated", axes.cycle.exchange, clock, cycles, axes.period_s)
+        axes.check()
+        if axes.cycle.skipped:
+            raise SystemExit(f"{axes.cycle.skipped} periods were skipped")
+    return figures, axes.period_s
+
+
 def table(figures: list[Figures], period_s: float) -> str:
-    """One line for each, the ratios to the bare exchange."""
-    bare = next(each for each in figures if each.name.startswith("bare"))
+    """One line for each, the ratios to the bare exchange where that was measured."""
+    bare = next((each for each in figures if each.name.startswith("bare")), None)
     head = (
         f"{'':<28} {'busy us':>8} {'99.9 %':>8} {'most':>8} {'late 99.9 %':>12} {'missed':>14} {'x bare':>7}"
     )
@@ -106,7 +127,7 @@ def table(figures: list[Figures], period_s: float) -> str:
     lines += [
         f"{each.name:<28} {each.busy_median_us:>8.1f} {each.busy_999_us:>8.1f} {each.busy_most_us:>8.1f} "
         f"{each.late_999_us:>12.1f} {f'{each.missed} of {each.cycles}':>14} "
-        f"{each.busy_median_us / bare.busy_median_us:>7.2f}"
+        + (f"{each.busy_median_us / bare.busy_median_us:>7.2f}" if bare is not None else "")
         for each in figures
     ]
     return "\n".join(lines)
@@ -119,6 +140,7 @@ def main() -> int:
     parser.add_argument("--channel", default="vcan0")
     parser.add_argument("--cycles", type=int, default=20_000)
     parser.add_argument("--master", type=Path, help="the compiled master.c")
+    parser.add_argument("--only", choices=KINDS, action="append", help="measure these only")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -128,25 +150,33 @@ def main() -> int:
     period_s, node_id = axis.drive.cycle_s, axis.drive.node_id
     clock = Waking()
     figures: list[Figures] = []
+    wanted = options.only or KINDS
     with (
         answering_kernel(options.channel, node_id),
         can.Bus(interface="socketcan", channel=options.channel, ignore_config=True) as bus,
     ):
         variants = Variants(bus, axis, model, clock)
-        loops: dict[str, Callable[[], object]] = {
-            "bare python-can exchange": variants.bare,
-            "hdbridge cycle": variants.plain,
-            "hdbridge cycle, compensated": variants.compensated,
-            "canopen's PDO objects": variants.with_canopen,
+        loops: dict[str, tuple[str, Callable[[], object]]] = {
+            "bare": ("bare python-can exchange", variants.bare),
+            "cycle": ("hdbridge cycle", variants.plain),
+            "compensated": ("hdbridge cycle, compensated", variants.compensated),
+            "canopen": ("canopen's PDO objects", variants.with_canopen),
         }
-        for name, loop in loops.items():
+        for kind, (name, loop) in loops.items():
+            if kind not in wanted:
+                continue
             with prepare_realtime():
                 variants.start()
                 figures.append(timed(name, loop, clock, options.cycles, period_s))
             print(f"measured: {name}", flush=True)
         if options.master is not None:
             figures.append(in_c(options.master, options.channel, options.cycles, period_s))
-    print(table(figures, period_s))
+    if figures:
+        print(table(figures, period_s), flush=True)
+    if "axes" in wanted:
+        several, several_s = of_axes(options.channel, model, clock, options.cycles)
+        print(table([several], several_s))
+        figures.append(several)
     if options.json is not None:
         options.json.write_text(json.dumps([asdict(each) for each in figures], indent=2) + "\n")
     return 0

@@ -1,0 +1,276 @@
+"""What the control cycle of n axes costs in CPU time, and one axis before a change and after it.
+
+    python tools/bench/buscycle.py [--before FOLDER] [--interface virtual|loopback]... [--json FILE]
+
+One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
+
+  before       one axis through `Cycle` as another checkout (FOLDER, made with ``git worktree add``) has it
+  now          one axis through `Cycle` as it is here
+  n axes       `BusCycle` with 1, 2, 4 and 6 axes
+
+each with the target held, and compensated. Both checkouts have a process of their own, kept alive for the
+whole run; only one of them works at a time. The buses are those of `cycle.py`, and what the answering nodes
+cost is subtracted. Of n axes the cost for each axis and for one axis more is printed: what is linear in n has
+both constant or falling.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cycle import PROFILE, AnsweringBus, LoopbackSocket, NeverSleeping, Variants, block_us, loopback_bus
+
+from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.drive.feedback import Feedback
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Supervision
+from hdbridge.errors import SafetyStop
+from hdbridge.model import TransmissionModel
+
+AXES = (1, 2, 4, 6)
+HELD, COMPENSATED = "held", "compensated"
+HERE = Path(__file__).resolve().parents[2]
+
+
+class Busy(Exception):  # noqa: N818 - what happened
+    """The machine stalled within a block, and the cycle made a fault of it."""
+
+
+class Axes:
+    """Some axes on one bus, enabled, each on its own slow sine."""
+
+    def __init__(self, bus: Any, count: int, model: TransmissionModel, clock: Clock | None = None) -> None:
+        # Only here: the checkout before the change may not have them.
+        from hdbridge.control.axiscycle import AxisCycle  # noqa: PLC0415
+        from hdbridge.control.buscycle import BusCycle  # noqa: PLC0415
+
+        self.bus = bus
+        self.clock = clock if clock is not None else NeverSleeping()
+        axis = AxisConfig.load(PROFILE)
+        self.period_s = axis.drive.cycle_s
+        self.cycle = BusCycle(Link(bus, self.clock), self.clock, self.period_s, bitrate_bps=1_000_000)
+        self.answers: list[Callable[[Feedback], int]] = []
+        for node_id in range(1, count + 1):
+            drive = axis.drive.model_copy(update={"node_id": node_id})
+            image = ProcessImage(axis.model_copy(update={"drive": drive}))
+            each = AxisCycle(image, Supervision())
+            self.cycle.join(each)
+            each.begin()
+            self.answers.append(self._answer(image, model, float(node_id)))
+
+    def _answer(
+        self, image: ProcessImage, model: TransmissionModel, phase: float
+    ) -> Callable[[Feedback], int]:
+        compensation = Compensation(model, CompensationLimits(), self.period_s)
+        compensation.engage()
+        sin, command, counts_for = math.sin, compensation.command, image.target_counts_for
+        return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
+
+    def start(self, kind: str) -> None:
+        """Before a block: everything released, power on."""
+        while self.bus.recv(0.0) is not None:
+            pass
+        for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
+            axis.reset(verified=True)
+            axis.begin()
+            axis.command = answer if kind == COMPENSATED else 0
+        self.cycle.restart()
+        for _ in range(20):
+            self.cycle.exchange()
+            if all(axis.feedback.fresh for axis in self.cycle.axes):
+                break
+        for axis in self.cycle.axes:
+            axis.image.power.go(State.OPERATION_ENABLED)
+
+    def check(self) -> None:
+        """Raise `Busy` where an axis was stopped within the block."""
+        if any(axis.supervision.stop is not None for axis in self.cycle.axes):
+            raise Busy
+
+
+def _bus(interface: str, count: int) -> tuple[Any, Callable[[], object]]:
+    """A bus on which so many drives answer, and what answering costs by itself."""
+    node_ids = range(1, count + 1)
+    if interface == "virtual":
+        bus = AnsweringBus(*node_ids)
+        return bus, bus.answer
+    sock = LoopbackSocket(*node_ids)
+    return loopback_bus(sock), sock.answer_nobody
+
+
+class Worker:
+    """The cycles of one checkout, measured block by block."""
+
+    def __init__(self) -> None:
+        self.model = TransmissionModel.load(PROFILE / "model.yaml")
+        self.axis = AxisConfig.load(PROFILE)
+        self.singles: dict[str, tuple[Variants, Callable[[], object]]] = {}
+        self.several: dict[tuple[str, int], tuple[Axes, Callable[[], object]]] = {}
+
+    def block(self, interface: str, count: int, kind: str, cycles: int) -> float:
+        """Own cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
+        for _ in range(20):
+            with suppress(SafetyStop, Busy):
+                return (
+                    self._single(interface, kind, cycles)
+                    if not count
+                    else self._bus(interface, count, kind, cycles)
+                )
+        raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+
+    def _single(self, interface: str, kind: str, cycles: int) -> float:
+        if interface not in self.singles:
+            bus, answer = _bus(interface, 1)
+            self.singles[interface] = Variants(bus, self.axis, self.model), answer
+        variants, answer = self.singles[interface]
+        variants.start()
+        loop = variants.plain if kind == HELD else variants.compensated
+        block_us(loop, 20)
+        return block_us(loop, cycles) - self._cost(variants.bus, answer, cycles)
+
+    def _bus(self, interface: str, count: int, kind: str, cycles: int) -> float:
+        if (interface, count) not in self.several:
+            bus, answer = _bus(interface, count)
+            self.several[interface, count] = Axes(bus, count, self.model), answer
+        axes, answer = self.several[interface, count]
+        axes.start(kind)
+        block_us(axes.cycle.exchange, 20)
+        own_us = block_us(axes.cycle.exchange, cycles)
+        axes.check()
+        return own_us - self._cost(axes.bus, answer, cycles)
+
+    @staticmethod
+    def _cost(bus: Any, answer: Callable[[], object], cycles: int) -> float:
+        """What the answering nodes cost in one cycle; nothing that they sent stays on the bus."""
+        cost_us = block_us(answer, cycles)
+        while bus.recv(0.0) is not None:
+            pass
+        return cost_us
+
+    def serve(self) -> None:
+        """A line of JSON in, a line out, to the end of the input."""
+        for line in sys.stdin:
+            print(json.dumps(self.block(*json.loads(line))), flush=True)
+
+
+class Checkout:
+    """A worker in a process of its own, with the hdbridge of ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(folder)}
+        command = [sys.executable, str(Path(__file__).resolve()), "--worker"]
+        self.process = subprocess.Popen(
+            command, env=environment, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def block(self, *what: object) -> float:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(what) + "\n")
+        self.process.stdin.flush()
+        return float(json.loads(self.process.stdout.readline()))
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def measure(interface: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Medians by kind and variant, and of the ratios of neighbouring blocks; us."""
+    now = Checkout(HERE)
+    before = Checkout(options.before) if options.before is not None else None
+    times: dict[tuple[str, str], list[float]] = {}
+    for _ in range(options.blocks):
+        for kind in (HELD, COMPENSATED):
+            if before is not None:
+                times.setdefault((kind, "before"), []).append(
+                    before.block(interface, 0, kind, options.cycles)
+                )
+            times.setdefault((kind, "now"), []).append(now.block(interface, 0, kind, options.cycles))
+            for count in AXES:
+                own_us = now.block(interface, count, kind, max(options.cycles // count, 50))
+                times.setdefault((kind, str(count)), []).append(own_us)
+    for each in (now, before):
+        if each is not None:
+            each.close()
+    result: dict[str, dict[str, float]] = {HELD: {}, COMPENSATED: {}}
+    for (kind, name), values in times.items():
+        result[kind][name] = statistics.median(values)
+    for kind, figures in result.items():
+        if before is not None:
+            pairs = zip(times[kind, "now"], times[kind, "before"], strict=True)
+            figures["now / before"] = statistics.median(a / b for a, b in pairs)
+        pairs = zip(times[kind, "1"], times[kind, "now"], strict=True)
+        figures["bus of one / now"] = statistics.median(a / b for a, b in pairs)
+    return result
+
+
+def report(result: dict[str, dict[str, float]], where: str) -> str:
+    lines = [f"CPU time of one cycle on {where}, medians, us:", "", f"{'':<28} {HELD:>10} {COMPENSATED:>12}"]
+
+    def row(label: str, *values: float) -> None:
+        lines.append(f"  {label:<26} {values[0]:>10.2f} {values[1]:>12.2f}")
+
+    for name, label in (
+        ("before", "one axis, before"),
+        ("now", "one axis, now"),
+        ("now / before", "  now / before"),
+        ("bus of one / now", "  BusCycle / Cycle"),
+    ):
+        if name in result[HELD]:
+            row(label, *(figures[name] for figures in result.values()))
+    for place, count in enumerate(AXES):
+        row(f"{count} axes", *(figures[str(count)] for figures in result.values()))
+        row("  for each axis", *(figures[str(count)] / count for figures in result.values()))
+        if place:
+            less = AXES[place - 1]
+            more = [(each[str(count)] - each[str(less)]) / (count - less) for each in result.values()]
+            row("  for one axis more", *more)
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--interface", choices=("virtual", "loopback"), action="append")
+    parser.add_argument("--before", type=Path, help="another checkout of hdbridge")
+    parser.add_argument("--blocks", type=int, default=41, help="blocks per variant")
+    parser.add_argument("--cycles", type=int, default=400, help="cycles per block, for one axis")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    if options.worker:
+        Worker().serve()
+        return 0
+    began_s = time.monotonic()
+    results = {}
+    for interface in options.interface or ["virtual", "loopback"]:
+        results[interface] = measure(interface, options)
+        print(report(results[interface], interface), end="\n\n")
+    print(f"{time.monotonic() - began_s:.0f} s")
+    if options.json is not None:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
