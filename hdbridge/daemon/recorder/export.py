@@ -19,10 +19,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
 from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.reading import Flight, ModelUsed
-from hdbridge.daemon.recorder.wire import STATES
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
@@ -31,8 +31,8 @@ GAP_CYCLES: Final = 5
 """Within so few missing cycles the motor does not reverse and come back unnoticed."""
 PART_SAMPLES: Final = 50
 """A shorter part is left out."""
-ENABLED: Final = (STATES.index("ENABLED"), STATES.index("STOPPING"))
-UNSEATED: Final = (STATES.index("UNVERIFIED"), STATES.index("LENT"))
+ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
+UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
 """Afterwards the encoders' zeros may be others: the drive was booted, or homed."""
 MEASURED: Final = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 SAME_RUN_S: Final = 0.5

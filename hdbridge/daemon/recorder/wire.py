@@ -18,6 +18,7 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
 from numpy.typing import NDArray
 
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
@@ -26,10 +27,6 @@ from hdbridge.motion.modes import MotionMode
 
 PACKAGE: Final = "hdbridge"
 Bytes = NDArray[np.void]
-STATES: Final = (
-    "UNVERIFIED", "DISABLED", "ENABLING", "ENABLED", "STOPPING", "LENT", "QUICK_STOPPED", "LATCHED",
-)  # fmt: skip
-"""Of an axis in the loop, by their numbers in the shared memory."""
 _FIXED: Final = {
     "f8": (FieldDescriptorProto.TYPE_DOUBLE, 1),
     "f4": (FieldDescriptorProto.TYPE_FLOAT, 5),
@@ -57,7 +54,7 @@ def _names(values: Iterable[Enum]) -> dict[int, str]:
 
 
 _ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
-    "state": dict(enumerate(STATES)),
+    "state": {int(each): each.name for each in AxisState},
     "mode": {int(each): each.name for each in MotionMode},
     "power": _names(State),
     "fault": _names(Fault) | {NO_FAULT: "NONE"},

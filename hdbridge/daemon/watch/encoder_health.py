@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.axis import AxisConfig
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray
 from hdbridge.daemon.watch.residual import Residuals, joined, residuals
 from hdbridge.daemon.watch.signs import (
@@ -41,8 +42,8 @@ from hdbridge.model import TransmissionModel
 from hdbridge.observations.reading import jitter_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
-UNSEATED = (0, 5)
-"""`AxisState` UNVERIFIED and LENT: afterwards the encoders' zeros may be others."""
+UNSEATED = (AxisState.UNVERIFIED, AxisState.LENT)
+"""Afterwards the encoders' zeros may be others."""
 TAIL = 64
 """Samples that are looked at again with the next batch."""
 LOOK_S = 0.1

@@ -14,14 +14,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray, SampleFlag
 from hdbridge.effects import FloatArray
 from hdbridge.units import ARCSEC_PER_DEG
 
 BoolArray = NDArray[np.bool_]
 
-DRIVEN: Final = (3, 4)
-"""`AxisState` ENABLED and STOPPING: the motor follows the issued targets."""
+DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)
+"""The motor follows the issued targets."""
 LONGEST_LAG_S: Final = 0.05
 """A motor that is later than this does not follow."""
 STANDING_DEG_S: Final = 1e-6
