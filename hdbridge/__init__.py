@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import fit
+    from hdbridge.client import AsyncClient, Client
     from hdbridge.control.bench import Bench
     from hdbridge.control.compensation import Compensation, Inverse
     from hdbridge.diagnose import diagnose
@@ -44,10 +45,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AsyncClient",
     "AxisConfig",
     "Bench",
     "BusError",
     "BusInUseError",
+    "Client",
     "Compensation",
     "DaemonError",
     "Drive",
@@ -75,8 +78,10 @@ __all__ = [
 
 _MODULES: Final = MappingProxyType(
     {
+        "AsyncClient": "client",
         "AxisConfig": "axis",
         "Bench": "control.bench",
+        "Client": "client",
         "Compensation": "control.compensation",
         "Drive": "drive",
         "Inverse": "control.compensation",

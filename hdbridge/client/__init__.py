@@ -1,4 +1,35 @@
 """What talks to the daemon from outside: the messages, and the clients that exchange them.
 
-Imports nothing of the daemon. `messages` needs pydantic only, the clients the extra ``hdbridge[daemon]``.
+Imports nothing of the daemon. `messages` needs pydantic only, the clients the extra ``hdbridge[daemon]``;
+they are loaded when they are used.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.client.aio import AsyncClient
+    from hdbridge.client.sync import Client
+
+__all__ = ["AsyncClient", "Client"]
+_MODULES: Final = {"AsyncClient": "aio", "Client": "sync"}
+_EXTRA: Final = frozenset({"httpx", "websockets"})
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'hdbridge.client' has no attribute '{name}'")
+    try:
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    except ModuleNotFoundError as problem:
+        package = str(problem.name).partition(".")[0]
+        if package not in _EXTRA:
+            raise
+        raise InputError(
+            f"{name} needs the package {package}, which is not installed; "
+            "install the extra: pip install 'hdbridge[daemon]'"
+        ) from None

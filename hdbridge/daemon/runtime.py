@@ -7,6 +7,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
+from hdbridge.client.address import session_folder
 from hdbridge.errors import InputError
 
 
@@ -19,7 +20,7 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
     given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if given:
         return Path(given)  # the service manager has made it, with the mode that its unit asks for
-    folder = default_folder(environment)
+    folder = session_folder(environment)
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
@@ -32,14 +33,6 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
             f"{folder}: is not a folder of this user alone (mode 700); remove it, or set XDG_RUNTIME_DIR"
         )
     return folder
-
-
-def default_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where a daemon of this user has its socket, and where a client looks for it; it need not exist."""
-    session = environment.get("XDG_RUNTIME_DIR")
-    if session and Path(session).is_dir():
-        return Path(session) / "hdbridge"
-    return Path(f"/tmp/hdbridge-{os.geteuid()}")
 
 
 def socket_path(name: str, folder: Path, given: Path | None = None) -> Path:

@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from hdbridge.client.messages.problem import Problem
 from hdbridge.client.messages.requests import AXES_MAXIMUM, StreamPoint
 from hdbridge.client.messages.values import Name, Real, Report, Request
 
@@ -117,4 +118,4 @@ class StreamAnswer(Report):
     """The answer to each message of a stream."""
 
     accepted: int = Field(ge=0, description="points taken of the message")
-    detail: str | None = Field(None, description="why no more; the axis then stops within its limits")
+    problem: Problem | None = Field(None, description="why no more; the axis then stops within its limits")

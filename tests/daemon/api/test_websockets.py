@@ -221,7 +221,7 @@ def test_nobody_streams_without_the_lease(api, lease, first):
         connection.send(first)
         answer = told(connection)
         assert answer.accepted == 0
-        assert answer.detail
+        assert answer.problem
         with pytest.raises(ConnectionClosed):
             connection.recv(timeout=30)
     assert api.bridge.streams == []
@@ -232,7 +232,7 @@ def test_an_axis_that_is_not_enabled_or_not_there_is_told(api, lease):
     for axis, words in (("joint-2", "enable it first"), ("joint-9", "joint-1, joint-2")):
         with stream(api, axis) as connection:
             begin(connection, lease)
-            assert words in told(connection).detail
+            assert words in told(connection).problem.detail
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def test_a_wrong_point_ends_the_stream_and_says_why(api, lease, wrong):
         begin(connection, lease)
         told(connection)
         connection.send(wrong)
-        assert told(connection).detail
+        assert told(connection).problem
         with pytest.raises(ConnectionClosed):
             connection.recv(timeout=30)
     (given,) = api.bridge.streams
@@ -263,7 +263,7 @@ def test_the_lease_that_another_client_took_ends_the_stream(api, lease):
         told(connection)
         api.bridge.lease.take("another", force=True)
         connection.send(points(0.0))
-        assert "another" in told(connection).detail
+        assert "another" in told(connection).problem.detail
 
 
 def test_a_streaming_client_that_dies_ends_its_stream(api, lease):

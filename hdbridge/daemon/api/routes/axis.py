@@ -156,7 +156,7 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
 
 
 def _add_objects(routes: APIRouter, bridge: Bridge) -> None:
-    @routes.get("/objects/{name}", tags=["Drive"], responses=refusals((*LOOKING, 409, 502, 503)))
+    @routes.get("/objects/{name:path}", tags=["Drive"], responses=refusals((*LOOKING, 409, 502, 503)))
     async def read_object(axis: AxisName, name: str) -> messages.SdoValue:
         """Read an object of the drive by SDO: its number (6064h, 0x1018:4) or its name in the EDS."""
         found, value = await port(bridge, axis).sdo_read(name)
@@ -164,7 +164,7 @@ def _add_objects(routes: APIRouter, bridge: Bridge) -> None:
             index=found.index, subindex=found.sub, name=found.name, type=found.type_name, value=value
         )
 
-    @routes.put("/objects/{name}", tags=["Drive"], responses=refusals(MOVING))
+    @routes.put("/objects/{name:path}", tags=["Drive"], responses=refusals(MOVING))
     async def write_object(
         axis: AxisName, name: str, write: messages.SdoWrite, holder: Holder = ""
     ) -> messages.SdoValue:

@@ -13,7 +13,7 @@ from typing import Final, TypeVar
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel, ValidationError
 
-from hdbridge.client.messages import LiveOptions, StreamAnswer, StreamBegin, StreamPoints
+from hdbridge.client.messages import LiveOptions, Problem, StreamAnswer, StreamBegin, StreamPoints
 from hdbridge.daemon.api.columns import columns
 from hdbridge.daemon.api.policy import SUBPROTOCOL
 from hdbridge.daemon.api.routes.parts import port
@@ -62,9 +62,10 @@ def socket_routes(bridge: Bridge) -> APIRouter:
             try:
                 await _stream(bridge, websocket, axis)
             except (HdbridgeError, TimeoutError) as problem:
-                reason = str(problem) or f"nothing came within {BEGIN_S:g} s; expected StreamBegin"
-                await _send(websocket, StreamAnswer(accepted=0, detail=reason))
-                await _close(websocket, reason)
+                late = InputError(f"nothing came within {BEGIN_S:g} s; expected StreamBegin")
+                error = problem if isinstance(problem, HdbridgeError) else late
+                await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
+                await _close(websocket, str(error))
 
     return routes
 

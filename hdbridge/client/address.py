@@ -1,0 +1,119 @@
+"""Where a daemon is, and how it is found by itself: one daemon on this machine needs no address."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import stat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hdbridge.errors import DaemonError, InputError
+
+SYSTEM_FOLDER = Path("/run/hdbridge")
+"""Where daemons that the service manager started have their sockets, each in a folder of its own."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A Unix socket, or a URL and the token that it asks for."""
+
+    socket: Path | None = None
+    url: str = "http://hdbridge"
+    """``http://`` or ``https://``, without a path."""
+    token: str | None = None
+
+    def __str__(self) -> str:
+        return str(self.socket) if self.socket is not None else self.url
+
+    @property
+    def websocket_url(self) -> str:
+        """The same for a WebSocket."""
+        return "ws" + self.url.removeprefix("http")
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """What every request shows."""
+        return {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
+
+
+def find(
+    text: str | Path | None = None, token: str | None = None, environment: Mapping[str, str] = os.environ
+) -> Address:
+    """The daemon at an address: a socket, a URL, a machine's name, or nothing for the one that there is.
+
+    Without ``text`` ``$HDBRIDGE_SOCKET`` counts, then ``$HDBRIDGE_URL`` (its token is ``$HDBRIDGE_TOKEN``),
+    then the sockets of this user's daemons and of the service manager's. DaemonError where there is none, or
+    more than one to choose from; InputError for what is no address.
+    """
+    given = str(text or environment.get("HDBRIDGE_SOCKET") or environment.get("HDBRIDGE_URL") or "")
+    token = token or environment.get("HDBRIDGE_TOKEN") or None
+    if given.startswith(("http://", "https://")):
+        return _url(given, token)
+    if "/" in given or given.endswith(".sock"):
+        return Address(socket=Path(given))
+    if given and not _NAME.fullmatch(given):
+        raise InputError(
+            f"{given!a}: expected a socket (/run/hdbridge/cell/cell.sock), a URL, or a machine's name"
+        )
+    there = [each for each in _sockets(environment) if not given or each.stem == given]
+    if len(there) == 1:
+        return Address(socket=there[0])
+    if there:
+        raise DaemonError(
+            f"{len(there)} daemons run: {', '.join(map(str, there))}; name one, or set HDBRIDGE_SOCKET"
+        )
+    what = f"no daemon of the name {given!r} runs" if given else "no daemon runs"
+    raise DaemonError(
+        f"{what} on this machine that this user may ask; start one with 'hdbridge run', or set "
+        "HDBRIDGE_SOCKET or HDBRIDGE_URL"
+    )
+
+
+def session_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where a daemon of this user has its socket, and where a client looks for it; it need not exist."""
+    session = environment.get("XDG_RUNTIME_DIR")
+    if session and Path(session).is_dir():
+        return Path(session) / "hdbridge"
+    return Path(f"/tmp/hdbridge-{os.geteuid()}")
+
+
+def _url(given: str, token: str | None) -> Address:
+    match = re.fullmatch(r"(https?://(?:\[[0-9a-fA-F:.]+\]|[^/?#@:\s\[\]]+)(?::\d{1,5})?)/?", given)
+    if match is None:
+        raise InputError(
+            f"{given!a}: expected http://HOST:PORT or https://HOST:PORT, without a path or a user"
+        )
+    return Address(url=match[1], token=token)
+
+
+def _sockets(environment: Mapping[str, str]) -> Iterator[Path]:
+    """The sockets that somebody listens at, in folders that no stranger can write to."""
+    for folder in (session_folder(environment), SYSTEM_FOLDER):
+        if _is_trusted(folder):
+            for path in sorted({*folder.glob("*.sock"), *folder.glob("*/*.sock")}):
+                if _listens(path):
+                    yield path
+
+
+def _is_trusted(folder: Path) -> bool:
+    """Whether what lies there is ours or the system's: below /tmp anybody can make a folder of any name."""
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    own = found.st_uid in {os.geteuid(), 0}
+    return stat.S_ISDIR(found.st_mode) and own and not found.st_mode & stat.S_IWOTH
+
+
+def _listens(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(os.fspath(path))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,240 @@
+"""The client for asyncio: the same names as `hdbridge.client.sync`, to be awaited.
+
+async with AsyncClient() as client, client.lease():
+    await client.axis("joint-3").move(30)
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any, Self
+
+import httpx
+from pydantic import BaseModel
+from websockets.asyncio.client import ClientConnection, connect, unix_connect
+
+from hdbridge.client import sockets, transport
+from hdbridge.client.address import Address, find
+from hdbridge.client.aioaxis import AsyncAxis
+from hdbridge.client.axis import POLL_S
+from hdbridge.client.calls import A, Call, M, MachineCalls
+from hdbridge.client.messages import (
+    Event,
+    Events,
+    Job,
+    JobState,
+    LeaseGrant,
+    LeaseState,
+    LiveOptions,
+    MachineState,
+    Samples,
+)
+from hdbridge.client.sync import RENEWALS
+from hdbridge.errors import DaemonError, LeaseError
+
+
+class AsyncClient:
+    """A daemon, wherever it is. Close it, or use it as an asynchronous context manager.
+
+    ``address`` is a Unix socket, a URL or a machine's name; without it `hdbridge.client.address.find` looks
+    for the one that there is. ``token`` is what TCP asks for, ``certificate`` what HTTPS trusts in place of
+    the system's. ``name`` is shown to others while it holds the lease. Several tasks may use it.
+    """
+
+    def __init__(
+        self,
+        address: str | Path | None = None,
+        *,
+        token: str | None = None,
+        certificate: Path | str | None = None,
+        name: str = "",
+        timeout_s: float = 10.0,
+    ) -> None:
+        self.address: Address = find(address, token)
+        self.name = name
+        self._tls = transport.tls_context(self.address, certificate)
+        self._timeout_s = timeout_s
+        self._lock = asyncio.Lock()
+        self._holding = 0
+        self._grant: LeaseGrant | None = None
+        under = httpx.AsyncHTTPTransport(**transport.under(self.address, self._tls))
+        self._http = httpx.AsyncClient(transport=under, **transport.settings(self.address))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    def axis(self, name: str) -> AsyncAxis:
+        """One axis; whether there is one of that name shows when it is asked for something."""
+        return AsyncAxis(self, name)
+
+    async def axes(self) -> dict[str, AsyncAxis]:
+        """Every axis of the machine by its name."""
+        return {each.name: AsyncAxis(self, each.name) for each in (await self.state()).axes}
+
+    async def state(self) -> MachineState:
+        """Everything about the machine and its axes."""
+        return await self.do(MachineCalls.state())
+
+    async def events(self, since: int = 0) -> Events:
+        """What happened since an event."""
+        return await self.do(MachineCalls.events(since))
+
+    async def mark(self, text: str) -> list[Event]:
+        """A remark for the flight recorder."""
+        return (await self.do(MachineCalls.mark(text))).events
+
+    async def stop(self) -> MachineState:
+        """Brake every axis to rest; needs no lease."""
+        return await self.do(MachineCalls.stop_all())
+
+    async def quick_stop(self) -> MachineState:
+        """Stop every axis at once, latched until a reset; needs no lease."""
+        return await self.do(MachineCalls.quick_stop_all())
+
+    async def coordinated(
+        self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
+    ) -> MachineState:
+        """Move axes so that all begin and end together; ``speed`` is a share of their limits."""
+        return await self.do(MachineCalls.coordinated(targets_deg, speed, wait))
+
+    async def jobs(self) -> list[Job]:
+        """The procedures that run or ran."""
+        return await self.do(MachineCalls.jobs())
+
+    async def job(self, id_: str) -> Job:
+        """One of them."""
+        return await self.do(MachineCalls.job(id_))
+
+    async def cancel_job(self, id_: str) -> Job:
+        """Stop its axis in order; what was measured is kept."""
+        return await self.do(MachineCalls.cancel_job(id_))
+
+    async def wait_for_job(self, id_: str) -> Job:
+        """The job when it is over; what it failed by is raised."""
+        while (found := await self.job(id_)).state is JobState.RUNNING:
+            await asyncio.sleep(POLL_S)
+        if found.problem is not None:
+            raise found.problem.error()
+        return found
+
+    async def lease_state(self) -> LeaseState:
+        """Who may move."""
+        return await self.do(MachineCalls.lease())
+
+    @asynccontextmanager
+    async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
+        """Hold the right to move within the block; a task renews it while the event loop turns.
+
+        Within a block that holds it already it is that one. LeaseError where another client has it.
+        """
+        async with self._held(force) as grant:
+            renewing = asyncio.ensure_future(self._renew(grant))
+            try:
+                yield grant
+            finally:
+                renewing.cancel()
+                await asyncio.wait([renewing])
+
+    @property
+    def holds_lease(self) -> bool:
+        """Whether this client has the right to move now."""
+        return self._grant is not None
+
+    async def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> AsyncIterator[Samples]:
+        """Samples as they come, of one cycle in ``every``; a reader that is slow loses some and is told."""
+        wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
+        async with self.connected("/live") as link:
+            await link.send(wanted)
+            while True:
+                yield await link.receive(Samples)
+
+    @asynccontextmanager
+    async def connected(self, path: str) -> AsyncIterator[AsyncLink]:
+        """A WebSocket of the API."""
+        url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
+        uds = transport.socket_of(self.address)
+        async with AsyncExitStack() as stack:
+            transport.check(self.address)
+            try:
+                opened = connect(url, **options) if uds is None else unix_connect(uds, url, **options)
+                connection: Any = await stack.enter_async_context(opened)
+            except sockets.FAILURES as problem:
+                raise sockets.error_of(problem, self.address) from None
+            yield AsyncLink(connection, self.address)
+
+    async def do(self, call: Call[A]) -> A:
+        """Carry out a call, with the lease where it needs it."""
+        if not call.moving:
+            return await self._send(call)
+        async with self._held():
+            return await self._send(call)
+
+    @asynccontextmanager
+    async def _held(self, force: bool = False) -> AsyncIterator[LeaseGrant]:
+        """The lease, taken by the first that needs it and given back by the last."""
+        async with self._lock:
+            if self._grant is None:
+                self._grant = await self._send(MachineCalls.take_lease(self.name, force))
+            self._holding += 1
+            grant = self._grant
+        try:
+            yield grant
+        finally:
+            async with self._lock:
+                self._holding -= 1
+                if self._holding == 0:
+                    with suppress(DaemonError):  # lost, or the daemon is: it is not held any more
+                        await self._send(MachineCalls.release_lease())
+                    self._grant = None
+
+    async def _send(self, call: Call[A]) -> A:
+        wanted = transport.request(call, self._grant, self._timeout_s)
+        transport.check(self.address)
+        try:
+            response = await self._http.request(**wanted)
+        except httpx.TransportError as problem:
+            raise transport.unreachable(self.address, problem) from None
+        return transport.answer(call, response)
+
+    async def _renew(self, grant: LeaseGrant) -> None:
+        while True:
+            await asyncio.sleep(grant.timeout_s / RENEWALS)
+            try:
+                await self._send(MachineCalls.renew_lease())
+            except LeaseError:
+                return
+            except DaemonError:
+                continue
+
+
+class AsyncLink:
+    """A WebSocket whose failures are errors of hdbridge."""
+
+    def __init__(self, connection: ClientConnection, address: Address) -> None:
+        self._connection = connection
+        self._address = address
+
+    async def send(self, message: BaseModel) -> None:
+        """A message."""
+        try:
+            await self._connection.send(message.model_dump_json())
+        except sockets.FAILURES as problem:
+            raise sockets.error_of(problem, self._address) from None
+
+    async def receive(self, kind: type[M]) -> M:
+        """The next one."""
+        try:
+            text = await self._connection.recv()
+        except sockets.FAILURES as problem:
+            raise sockets.error_of(problem, self._address) from None
+        return sockets.read(kind, text)

@@ -1,0 +1,256 @@
+"""The client without asyncio.
+
+    from hdbridge import Client
+
+    Client().axis("joint-3").move(30)
+
+    with Client() as client, client.lease():
+        axis = client.axis("joint-3")
+        axis.enable()
+        for target_deg in (10, 20, 30):
+            print(axis.move(target_deg).error_arcsec)
+
+What moves needs the lease. A method that moves takes it for as long as it runs, where it is not held by
+`Client.lease` already. Every error is one of `hdbridge.errors`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final, Self
+
+import httpx
+from pydantic import BaseModel
+from websockets.sync.client import ClientConnection, connect, unix_connect
+
+from hdbridge.client import sockets, transport
+from hdbridge.client.address import Address, find
+from hdbridge.client.axis import POLL_S, Axis
+from hdbridge.client.calls import A, Call, M, MachineCalls
+from hdbridge.client.messages import (
+    Event,
+    Events,
+    Job,
+    JobState,
+    LeaseGrant,
+    LeaseState,
+    LiveOptions,
+    MachineState,
+    Samples,
+)
+from hdbridge.errors import DaemonError, LeaseError
+
+RENEWALS: Final = 3
+"""How often a lease is renewed within its time-out."""
+
+
+class Client:
+    """A daemon, wherever it is. Close it, or use it as a context manager.
+
+    ``address`` is a Unix socket, a URL or a machine's name; without it `hdbridge.client.address.find` looks
+    for the one that there is. ``token`` is what TCP asks for, ``certificate`` what HTTPS trusts in place of
+    the system's. ``name`` is shown to others while it holds the lease. Several threads may use it.
+    """
+
+    def __init__(
+        self,
+        address: str | Path | None = None,
+        *,
+        token: str | None = None,
+        certificate: Path | str | None = None,
+        name: str = "",
+        timeout_s: float = 10.0,
+    ) -> None:
+        self.address: Address = find(address, token)
+        self.name = name
+        self._tls = transport.tls_context(self.address, certificate)
+        self._timeout_s = timeout_s
+        self._lock = threading.Lock()
+        self._holding = 0
+        self._grant: LeaseGrant | None = None
+        under = httpx.HTTPTransport(**transport.under(self.address, self._tls))
+        self._http = httpx.Client(transport=under, **transport.settings(self.address))
+        weakref.finalize(self, self._http.close)  # of a client that lives for one line only
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def axis(self, name: str) -> Axis:
+        """One axis; whether there is one of that name shows when it is asked for something."""
+        return Axis(self, name)
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """Every axis of the machine by its name."""
+        return {each.name: Axis(self, each.name) for each in self.state().axes}
+
+    def state(self) -> MachineState:
+        """Everything about the machine and its axes."""
+        return self.do(MachineCalls.state())
+
+    def events(self, since: int = 0) -> Events:
+        """What happened since an event."""
+        return self.do(MachineCalls.events(since))
+
+    def mark(self, text: str) -> list[Event]:
+        """A remark for the flight recorder."""
+        return self.do(MachineCalls.mark(text)).events
+
+    def stop(self) -> MachineState:
+        """Brake every axis to rest; needs no lease."""
+        return self.do(MachineCalls.stop_all())
+
+    def quick_stop(self) -> MachineState:
+        """Stop every axis at once, latched until a reset; needs no lease."""
+        return self.do(MachineCalls.quick_stop_all())
+
+    def coordinated(
+        self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
+    ) -> MachineState:
+        """Move axes so that all begin and end together; ``speed`` is a share of their limits."""
+        return self.do(MachineCalls.coordinated(targets_deg, speed, wait))
+
+    def jobs(self) -> list[Job]:
+        """The procedures that run or ran."""
+        return self.do(MachineCalls.jobs())
+
+    def job(self, id_: str) -> Job:
+        """One of them."""
+        return self.do(MachineCalls.job(id_))
+
+    def cancel_job(self, id_: str) -> Job:
+        """Stop its axis in order; what was measured is kept."""
+        return self.do(MachineCalls.cancel_job(id_))
+
+    def wait_for_job(self, id_: str) -> Job:
+        """The job when it is over; what it failed by is raised."""
+        while (found := self.job(id_)).state is JobState.RUNNING:
+            time.sleep(POLL_S)
+        if found.problem is not None:
+            raise found.problem.error()
+        return found
+
+    def lease_state(self) -> LeaseState:
+        """Who may move."""
+        return self.do(MachineCalls.lease())
+
+    @contextmanager
+    def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
+        """Hold the right to move within the block; a thread renews it while this process runs.
+
+        Within a block that holds it already it is that one. LeaseError where another client has it.
+        """
+        with self._held(force) as grant:
+            ended = threading.Event()
+            renewing = threading.Thread(target=self._renew, args=(grant, ended), name="lease", daemon=True)
+            renewing.start()
+            try:
+                yield grant
+            finally:
+                ended.set()
+                renewing.join()
+
+    @property
+    def holds_lease(self) -> bool:
+        """Whether this client has the right to move now."""
+        return self._grant is not None
+
+    def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> Iterator[Samples]:
+        """Samples as they come, of one cycle in ``every``; a reader that is slow loses some and is told."""
+        wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
+        with self.connected("/live") as link:
+            link.send(wanted)
+            while True:
+                yield link.receive(Samples)
+
+    @contextmanager
+    def connected(self, path: str) -> Iterator[Link]:
+        """A WebSocket of the API."""
+        url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
+        uds = transport.socket_of(self.address)
+        with ExitStack() as stack:
+            transport.check(self.address)
+            try:
+                opened = connect(url, **options) if uds is None else unix_connect(uds, url, **options)
+                connection: Any = stack.enter_context(opened)
+            except sockets.FAILURES as problem:
+                raise sockets.error_of(problem, self.address) from None
+            yield Link(connection, self.address)
+
+    def do(self, call: Call[A]) -> A:
+        """Carry out a call, with the lease where it needs it."""
+        if not call.moving:
+            return self._send(call)
+        with self._held():
+            return self._send(call)
+
+    @contextmanager
+    def _held(self, force: bool = False) -> Iterator[LeaseGrant]:
+        """The lease, taken by the first that needs it and given back by the last."""
+        with self._lock:
+            if self._grant is None:
+                self._grant = self._send(MachineCalls.take_lease(self.name, force))
+            self._holding += 1
+            grant = self._grant
+        try:
+            yield grant
+        finally:
+            with self._lock:
+                self._holding -= 1
+                if self._holding == 0:
+                    with suppress(DaemonError):  # lost, or the daemon is: it is not held any more
+                        self._send(MachineCalls.release_lease())
+                    self._grant = None
+
+    def _send(self, call: Call[A]) -> A:
+        wanted = transport.request(call, self._grant, self._timeout_s)
+        transport.check(self.address)
+        try:
+            response = self._http.request(**wanted)
+        except httpx.TransportError as problem:
+            raise transport.unreachable(self.address, problem) from None
+        return transport.answer(call, response)
+
+    def _renew(self, grant: LeaseGrant, ended: threading.Event) -> None:
+        while not ended.wait(grant.timeout_s / RENEWALS):
+            try:
+                self._send(MachineCalls.renew_lease())
+            except LeaseError:
+                return
+            except DaemonError:
+                continue
+
+
+class Link:
+    """A WebSocket whose failures are errors of hdbridge."""
+
+    def __init__(self, connection: ClientConnection, address: Address) -> None:
+        self._connection = connection
+        self._address = address
+
+    def send(self, message: BaseModel) -> None:
+        """A message."""
+        try:
+            self._connection.send(message.model_dump_json())
+        except sockets.FAILURES as problem:
+            raise sockets.error_of(problem, self._address) from None
+
+    def receive(self, kind: type[M]) -> M:
+        """The next one."""
+        try:
+            text = self._connection.recv()
+        except sockets.FAILURES as problem:
+            raise sockets.error_of(problem, self._address) from None
+        return sockets.read(kind, text)

@@ -1,0 +1,79 @@
+"""The HTTP under both clients: its settings, one request, and what its failures are."""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from hdbridge.client.address import Address
+from hdbridge.client.calls import PREFIX, A, Call
+from hdbridge.client.messages import LeaseGrant
+from hdbridge.errors import DaemonError, InputError
+
+
+def tls_context(address: Address, certificate: Path | str | None) -> ssl.SSLContext | None:
+    """That trusts this certificate, or the system's; None without TLS. InputError where it is none."""
+    if address.socket is not None or not address.url.startswith("https"):
+        return None
+    try:
+        return ssl.create_default_context(cafile=certificate)
+    except OSError as problem:
+        raise InputError(
+            f"{certificate}: cannot be read as a certificate (PEM): {problem.strerror}"
+        ) from None
+
+
+def settings(address: Address) -> dict[str, Any]:
+    """What the client of httpx is made with; nothing of it comes from the environment."""
+    return {"base_url": address.url + PREFIX, "headers": address.headers, "trust_env": False}
+
+
+def under(address: Address, tls: ssl.SSLContext | None) -> dict[str, Any]:
+    """What a transport of httpx is made with."""
+    uds = None if address.socket is None else str(address.socket)
+    return {"uds": uds, "verify": False if tls is None else tls}  # without TLS it loads no certificates
+
+
+def socket_of(address: Address) -> str | None:
+    """The Unix socket, for a WebSocket."""
+    return None if address.socket is None else str(address.socket)
+
+
+def request(call: Call[A], grant: LeaseGrant | None, timeout_s: float) -> dict[str, Any]:
+    """What a call is to httpx."""
+    headers = {"Content-Type": "application/json"} if call.body is not None else {}
+    if grant is not None:
+        headers["X-Lease"] = grant.token
+    return {
+        "method": call.method,
+        "url": call.path,
+        "content": call.content,
+        "headers": headers,
+        "params": call.query,
+        "timeout": httpx.Timeout(timeout_s, read=None if call.waits else timeout_s),
+    }
+
+
+def answer(call: Call[A], response: httpx.Response) -> A:
+    """What came back, or the error that it is."""
+    return call.read(response.status_code, response.headers.get("content-type", ""), response.content)
+
+
+def check(address: Address) -> None:
+    """DaemonError where there is no socket: said in one way, whatever asks."""
+    if address.socket is not None and not address.socket.is_socket():
+        raise DaemonError(f"{address}: there is no such socket; start the daemon with 'hdbridge run'")
+
+
+def unreachable(address: Address, problem: Exception) -> DaemonError:
+    """The daemon is not there, or went away in the middle."""
+    if isinstance(problem, httpx.ConnectError):
+        return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
+    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
+    return DaemonError(
+        f"{address}: the daemon {what} ({problem or type(problem).__name__}); whether it was done is not "
+        "known: look at the state first"
+    )

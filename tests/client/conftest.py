@@ -1,0 +1,29 @@
+"""A machine of two axes, served, and clients of it."""
+
+import pytest
+from support.api import TOKEN, served
+from support.fake_bridge import FakeBridge
+
+from hdbridge import Client
+from hdbridge.client import messages
+
+
+@pytest.fixture(scope="session")
+def place(tmp_path_factory):
+    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
+        yield place
+
+
+@pytest.fixture
+def api(place):
+    """The machine as it comes up, its first axis enabled."""
+    place.bridge.__init__()
+    place.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
+    return place
+
+
+@pytest.fixture(params=["socket", "tcp"])
+def client(api, request):
+    address = api.socket if request.param == "socket" else f"http://127.0.0.1:{api.port}"
+    with Client(address, token=TOKEN, name="the tests") as client:
+        yield client

@@ -1,0 +1,267 @@
+"""The client without asyncio, against the API as it is served."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from support.api import TOKEN
+
+from hdbridge import Client, DaemonError, InputError, LeaseError, RefusedError, SafetyStop
+from hdbridge.client import messages
+
+
+def test_one_line_moves_an_axis_and_gives_the_right_to_move_back(api, monkeypatch):
+    monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
+    assert Client().axis("joint-1").move(30).load_target_deg == 30.0
+    assert api.bridge.moved == [("joint-1", "move", 30.0, None)]
+    assert not api.bridge.state().lease.held
+
+
+def test_the_state_is_typed(client):
+    state = client.state()
+    assert state.name == "cell"
+    assert state.axes[0].limits.velocity_deg_s == 60.0
+    assert list(client.axes) == ["joint-1", "joint-2"]
+    assert client.axis("joint-2").state().state is messages.ControlState.DISABLED
+
+
+def test_what_moves_is_asked_for_as_it_was_given(client, api):
+    axis = client.axis("joint-1")
+    with client.lease():
+        axis.move(5, velocity_deg_s=10, wait=False)
+        axis.jog(-3.0)
+        axis.queue([1.0, messages.QueueItem(target_deg=2.0, dwell_s=1.0)], wait=False)
+        axis.clear_queue()
+        axis.compensate("both")
+        axis.activate_model("pending")
+        axis.load_loop(True)
+        axis.adapt("observe")
+        axis.adaptation_back()
+        axis.write("6041h", 1)
+        axis.disable()
+        axis.home(37, offset_deg=1.0)
+        axis.reset()
+        axis.enable()
+    assert [each[1:] for each in api.bridge.moved] == [
+        ("move", 5.0, 10.0), ("jog", -3.0, 0.5), ("queue", 2), ("clear queue",), ("compensate", "both"),
+        ("model", "pending"), ("load loop", True), ("adapt", "observe"), ("adaptation back",),
+        ("write", "6041h", "1"), ("disable",), ("home", 37), ("reset",), ("enable",),
+    ]  # fmt: skip
+
+
+def test_stopping_needs_no_lease(client, api):
+    api.bridge.lease.take("somebody else")
+    client.axis("joint-2").stop()
+    client.axis("joint-2").quick_stop()
+    client.stop()
+    client.quick_stop()
+    assert len(api.bridge.stopped) == 6
+    assert api.bridge.moved == []
+
+
+def test_a_coordinated_move_and_an_object_and_marks(client, api):
+    client.axis("joint-2").enable()
+    client.coordinated({"joint-1": 1, "joint-2": 2}, speed=0.5)
+    assert [each.load_target_deg for each in client.state().axes] == [1.0, 2.0]
+    assert client.axis("joint-1").read("Statusword").value == 0x1237
+    (event,) = client.mark("coupling tightened")
+    assert client.events(event.sequence).events == []
+
+
+def test_the_lease_is_held_in_the_block_and_renewed_meanwhile(api):
+    api.bridge.lease = type(api.bridge.lease)(0.3, api.bridge.lease._now)
+    with Client(api.socket, name="patience") as client:
+        with client.lease() as grant:
+            time.sleep(1.0)
+            assert api.bridge.lease.ended() == ()
+            assert client.lease_state().client == "patience"
+            client.axis("joint-1").move(1)
+            with client.lease() as inner:
+                assert inner.token == grant.token
+        assert not client.lease_state().held
+
+
+def test_another_client_waits_or_takes_it_by_force(api):
+    with Client(api.socket, name="one") as one, Client(api.socket, name="two") as two:
+        with one.lease():
+            with pytest.raises(LeaseError, match="'one'"):
+                two.axis("joint-1").move(1)
+            with two.lease(force=True):
+                two.axis("joint-1").move(2)
+                with pytest.raises(LeaseError, match="'two'"):
+                    one.axis("joint-1").move(3)
+        two.axis("joint-1").move(4)
+    assert [each[2] for each in api.bridge.moved] == [2.0, 4.0]
+
+
+def test_threads_share_the_lease_of_a_client(api):
+    api.bridge.axes["joint-2"].at = messages.ControlState.ENABLED
+    for each in api.bridge.axes.values():
+        each.moving_s = 0.2
+    with Client(api.socket) as client:
+        threads = [
+            threading.Thread(target=client.axis(name).move, args=(7,)) for name in ("joint-1", "joint-2")
+        ]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+    assert sorted(each[0] for each in api.bridge.moved) == ["joint-1", "joint-2"]
+    assert not api.bridge.state().lease.held
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda c: c.axis("joint-9").state(), InputError, "joint-1, joint-2"),
+        (lambda c: c.axis("joint-2").move(1), RefusedError, "enable it first"),
+        (lambda c: c.axis("joint-1").move(181), InputError, "-180 to 180"),
+        (lambda c: c.axis("joint-1").move(float("nan")), InputError, "target_deg"),
+        (lambda c: c.axis("joint-1").move("30"), InputError, "target_deg: found '30'"),
+        (lambda c: c.axis("joint-1").compensate("bth"), InputError, "scheme"),
+        (lambda c: c.axis("../../lease").state(), InputError, "joint-1, joint-2|Not Found"),
+        (lambda c: c.axis("joint-1").jog(1.0), LeaseError, "client.lease"),
+        (lambda c: c.axis("joint-1").queue([1.0], wait=False), LeaseError, "client.lease"),
+        (lambda c: c.job("step-9"), InputError, "no job"),
+    ],
+)
+def test_what_is_refused_is_the_error_that_it_is_in_the_library(client, api, call, error, words):
+    with pytest.raises(error, match=words):
+        call(client)
+    assert api.bridge.moved == []
+    assert not api.bridge.state().lease.held
+
+
+def test_a_jog_of_some_time_is_repeated_and_ends_in_a_stop(client, api):
+    client.axis("joint-1").jog(5.0, duration_s=0.4)
+    assert len(api.bridge.moved) >= 2
+    assert api.bridge.stopped == [("joint-1", "stop")]
+
+
+def test_a_queue_is_waited_for_until_nothing_waits(client, api):
+    axis = api.bridge.axes["joint-1"]
+    reached = threading.Timer(0.3, axis.queued.clear)
+    reached.start()
+    client.axis("joint-1").queue([1.0, 2.0])
+    reached.join()
+    assert axis.queued == []
+
+
+def test_a_stop_ends_the_waiting_with_its_reason(client, api):
+    stopping = threading.Timer(
+        0.2, setattr, (api.bridge.axes["joint-1"], "at", messages.ControlState.QUICK_STOPPED)
+    )
+    stopping.start()
+    with pytest.raises(SafetyStop, match="a TPDO is missing; check the cable"):
+        client.axis("joint-1").queue([1.0, 2.0])
+    stopping.join()
+
+
+def test_a_path_is_streamed_and_the_lease_given_back(client, api):
+    with client.axis("joint-1").stream(timeout_s=0.2) as stream:
+        stream.put([(0.0, 0.0), (0.1, 0.5, 5.0)])
+        stream.put(messages.StreamPoint(time_s=0.2 + 0.01 * n, position_deg=1.0) for n in range(450))
+    (given,) = api.bridge.streams
+    assert len(given.points) == 452
+    assert given.ended
+    assert not api.bridge.state().lease.held
+
+
+def test_a_refused_point_and_an_error_of_ones_own_leave_the_stream(client, api):
+    with (
+        pytest.raises(InputError, match="-180 to 180"),
+        client.axis("joint-1").stream() as stream,
+    ):
+        stream.put([(0.0, 999.0)])
+    with pytest.raises(OSError, match="mine"), client.axis("joint-1").stream():
+        raise OSError("mine")
+    with pytest.raises(RefusedError, match="enable it first"), client.axis("joint-2").stream():
+        pass
+    assert not api.bridge.state().lease.held
+
+
+def test_samples_are_read_as_they_come(client):
+    cycles: list[int] = []
+    for samples in client.live(every=5, axes=["joint-2"]):
+        if set(samples.axes) == {"joint-2"}:  # as asked for, once that has arrived
+            cycles += samples.cycle
+        if len(cycles) > 10:
+            break
+    assert all(each % 5 == 0 for each in cycles)
+
+
+def test_a_job_is_waited_for_and_its_failure_raised(client, api):
+    problem = messages.Problem.of(SafetyStop("cycle 7: a TPDO is missing; check the cable"))
+
+    def end(**how):
+        while not api.bridge.ran:
+            time.sleep(0.01)
+        api.bridge.ran[-1] = api.bridge.ran[-1].model_copy(update=how)
+
+    for how in ({"state": messages.JobState.DONE}, {"state": messages.JobState.FAILED, "problem": problem}):
+        api.bridge.ran.clear()
+        ending = threading.Thread(target=end, kwargs=how)
+        ending.start()
+        if "problem" in how:
+            with pytest.raises(SafetyStop, match="check the cable"):
+                client.axis("joint-1").job("step", count=60)
+        else:
+            assert client.axis("joint-1").job("step", count=60).state is messages.JobState.DONE
+        ending.join()
+    assert api.bridge.moved[0] == ("joint-1", "job", "step", {"count": 60})
+
+
+def test_without_a_daemon_it_says_how_to_start_one(tmp_path, monkeypatch):
+    for name in ("HDBRIDGE_SOCKET", "HDBRIDGE_URL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(DaemonError, match="hdbridge run"):
+        Client("no-such-cell")
+    with Client(tmp_path / "gone.sock") as client, pytest.raises(DaemonError, match="hdbridge run"):
+        client.state()
+
+
+def test_a_wrong_token_is_said(api):
+    with (
+        Client(f"http://127.0.0.1:{api.port}", token="not-the-token-at-all") as client,
+        pytest.raises(DaemonError, match="token"),
+    ):
+        client.state()
+    with (
+        Client(f"http://127.0.0.1:{api.port}", token="not-the-token-at-all") as client,
+        pytest.raises(DaemonError, match="token"),
+    ):
+        next(client.live())
+
+
+def test_the_token_comes_from_the_environment(api, monkeypatch):
+    monkeypatch.delenv("HDBRIDGE_SOCKET", raising=False)
+    monkeypatch.setenv("HDBRIDGE_URL", f"http://127.0.0.1:{api.port}/")
+    monkeypatch.setenv("HDBRIDGE_TOKEN", TOKEN)
+    with Client() as client:
+        assert client.state().name == "cell"
+
+
+def test_neither_client_nor_messages_import_the_daemon():
+    program = (
+        "import hdbridge, sys\nfrom hdbridge.client import messages\n"
+        "assert 'httpx' not in sys.modules\nhdbridge.Client, hdbridge.AsyncClient\n"
+        "print([m for m in sys.modules if m.startswith(('hdbridge.daemon', 'fastapi', 'numpy', 'can'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("missing", ["httpx", "websockets"])
+def test_without_the_extra_it_says_what_to_install(missing):
+    program = (
+        f"import sys\nsys.modules[{missing!r}] = None\nimport hdbridge\n"
+        "try:\n    hdbridge.Client\nexcept hdbridge.InputError as error:\n    print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env={**os.environ}
+    )
+    assert "pip install 'hdbridge[daemon]'" in done.stdout
