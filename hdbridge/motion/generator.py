@@ -23,6 +23,12 @@ _MISS_DEG = 1e-6
 _ROUNDING_DEG = 1e-9
 
 
+_NEAR_END = 0.999
+"""Share of a path's time at which it still comes from where it has been last."""
+_HALVINGS = 30
+_At = Callable[[float], tuple[list[float], list[float], list[float]]]
+
+
 class Kinematics(NamedTuple):
     """Position, velocity and acceleration of the set-point, at the load."""
 
@@ -44,7 +50,7 @@ class Plan(NamedTuple):
     begin_deg: float
     end_deg: float
     duration_s: float
-    at: Callable[[float], tuple[list[float], list[float], list[float]]]
+    at: _At
     """Position (from ``begin_deg``), velocity and acceleration of one degree of freedom."""
 
     def state(self, time_s: float) -> Kinematics:
@@ -53,6 +59,24 @@ class Plan(NamedTuple):
             return Kinematics(self.end_deg, 0.0, 0.0)
         position, velocity, acceleration = self.at(time_s)
         return Kinematics(self.begin_deg + position[0], velocity[0], acceleration[0])
+
+
+def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
+    """Where a path that begins at this velocity turns back, from its beginning; 0 where it does not.
+
+    Ruckig's own extremes miss it where the acceleration at the beginning is beyond the plan's limit.
+    """
+    later = _NEAR_END * duration_s
+    if not velocity_deg_s or velocity_deg_s * at(later)[1][0] >= 0.0:
+        return 0.0
+    before = 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (before + later)
+        if velocity_deg_s * at(middle)[1][0] > 0.0:
+            before = middle
+        else:
+            later = middle
+    return float(at(later)[0][0])
 
 
 class Generator:
@@ -115,9 +139,11 @@ class Generator:
                 continue
             extremes = trajectory.position_extrema[0]
             position, velocity, _ = trajectory.at_time(duration_s)
+            turn_deg = begin_deg + _turn(now.velocity_deg_s, trajectory.at_time, duration_s)
             if (
                 begin_deg + extremes.min >= bounds.lower_deg - _ROUNDING_DEG
                 and begin_deg + extremes.max <= bounds.upper_deg + _ROUNDING_DEG
+                and bounds.lower_deg - _ROUNDING_DEG <= turn_deg <= bounds.upper_deg + _ROUNDING_DEG
                 and abs(velocity[0]) <= _MISS_DEG
             ):
                 return Plan(begin_deg, begin_deg + float(position[0]), duration_s, trajectory.at_time)

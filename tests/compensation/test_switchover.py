@@ -135,6 +135,16 @@ def test_while_nothing_changes_it_is_the_compensation_itself():
     assert correction.command != compensation.command
 
 
+def test_a_change_takes_the_ramps_time():
+    correction = Correction(made(model(offset=10.0)))
+    correction.change(Compensation(model(), LIMITS, PERIOD))
+    periods = 0
+    while correction.changing:
+        correction.command(0.0)
+        periods += 1
+    assert periods == pytest.approx(LIMITS.ramp_s / PERIOD, abs=1)
+
+
 def test_a_change_during_a_change_and_another_gear_are_refused():
     correction = Correction(made(model()))
     with pytest.raises(InputError, match="ratio 80"):

@@ -90,6 +90,9 @@ def follow(
         assert abs(position - last) <= limits.velocity_deg_s * period_s * (1.0 + 2e-6) + grain
         assert abs(set_point.velocity_deg_s) <= limits.velocity_deg_s * (1.0 + 2e-6)
         assert abs(set_point.acceleration_deg_s2) <= 1.05 * limits.acceleration_deg_s2 * (1.0 + 1e-5)
+        # Velocity is that of the positions: what is cut off at a limit is rounding and no more.
+        drift = abs(position - last - set_point.velocity_deg_s * period_s)
+        assert drift <= 1.1 * limits.acceleration_deg_s2 * period_s**2 + 1e-8
         if check_jerk and MotionMode.STREAM not in {mode, set_point.mode}:
             change = abs(set_point.acceleration_deg_s2 - last_acceleration)
             assert change <= limits.jerk_deg_s3 * period_s * (1.0 + 1e-6) + 1e-6 * limits.acceleration_deg_s2
@@ -150,6 +153,16 @@ def test_a_move_from_rest_or_in_motion_is_never_refused_within_the_limits(moves)
     for target, wait_s in moves:
         set_point.goto(target)
         follow(set_point, LIMITS, PERIOD_S, int(wait_s / PERIOD_S))
+
+
+def test_a_gentle_move_in_motion_brakes_as_hard_as_it_must_to_stay_within_the_limits():
+    set_point = SetPoint(LIMITS, PERIOD_S)
+    set_point.goto(LIMITS.position_max_deg)
+    while set_point.position_deg < 112.0:
+        follow(set_point, LIMITS, PERIOD_S, 1)
+    set_point.goto(0.0, acceleration_deg_s2=20.0)
+    follow(set_point, LIMITS, PERIOD_S, 3000)
+    assert set_point.position_deg == 0.0
 
 
 def test_a_target_in_motion_is_taken_over_without_a_stop():

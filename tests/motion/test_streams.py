@@ -85,6 +85,29 @@ def test_at_a_knot_at_rest_it_waits_and_goes_on_from_there():
         set_point.knot(2.0, 0.0, 0.0)
 
 
+def test_a_rest_between_two_periods_costs_no_time_of_the_knots_behind_it():
+    set_point = streaming()
+    set_point.knot(0.0, 0.0, 0.0)
+    set_point.knot(0.4019, 1.0, 0.0)
+    for _ in range(110):
+        set_point.step()
+    set_point.knot(0.8019, 0.0, 0.0)
+    for _ in range(50):
+        set_point.step()
+    assert set_point.position_deg == pytest.approx(0.5, abs=1e-9)
+
+
+def test_out_of_knots_between_two_periods_it_goes_on_at_its_speed():
+    set_point = streaming()
+    end_s = 0.2021
+    set_point.knot(0.0, 0.0, 0.0)
+    set_point.knot(end_s, 1.0, 10.0)
+    position = before = 0.0
+    while not set_point.underrun:
+        before, position = position, set_point.step()
+    assert position - before == pytest.approx(10.0 * PERIOD_S, abs=200.0 * PERIOD_S**2)
+
+
 def test_time_begins_only_when_it_is_told_to():
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.stream(1.0)
@@ -175,6 +198,24 @@ def test_a_coordinated_plan_is_taken_and_arrives_at_once(limits, first, second, 
             set_point.knot(*knot)
         for knot in knots[:4000].tolist():
             assert set_point.step() == knot[1]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from([0.5, 5.0, 60.0]),
+    st.sampled_from([50.0, 200.0, 5000.0]),
+    st.sampled_from([1e4, 1e5, 1e7]),
+    st.floats(0.01, 20.0),
+)
+def test_cubics_through_the_knots_of_a_plan_keep_to_the_limits_however_much_jerk(
+    speed, acceleration, jerk, way
+):
+    limits = MotionLimits(-90.0, 120.0, speed, acceleration, jerk)
+    knots = coordinated({"a": 0.0}, [{"a": way}], {"a": limits}, PERIOD_S).knots["a"]
+    set_point = SetPoint(limits, PERIOD_S)
+    set_point.stream(0.1)
+    for knot in knots[:4000].tolist():
+        set_point.knot(*knot)
 
 
 def test_axes_of_a_coordinated_plan_go_straight_and_arrive_together():
