@@ -268,6 +268,10 @@ class Effect(BaseModel, ABC):
     """Its non-linear parameters; all others are spoken for by `columns`."""
     typical: ClassVar[Mapping[str, Any]] = {}
     """Parameters of typical size, for `candidate`."""
+    drifting: ClassVar[tuple[str, ...]] = ()
+    """The parameters that wear and temperature move in months of work, and that no fault of the load encoder
+    alone imitates: all of those that `columns` speaks for, or none.
+    """
 
     @abstractmethod
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

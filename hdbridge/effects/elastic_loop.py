@@ -62,6 +62,8 @@ class ElasticLoop(Effect):
     )
     typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
     """A published gear of ratio 50."""
+    drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
+    """Preload settles, grease and friction change; width and exponent keep their shape."""
 
     offset_arcsec: Annotated[
         float,

@@ -26,6 +26,8 @@ class MotorOrders(OrderSeries):
         size="0.3-3 arcsec; often k = 3, 5, 7, 10, 12",
     )
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
+    drifting: ClassVar[tuple[str, ...]] = ("orders",)
+    """As the synchronous part's."""
 
     def turns_per_motor_turn(self) -> float:
         """One: it counts on the motor angle itself."""

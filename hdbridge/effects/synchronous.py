@@ -36,6 +36,8 @@ class Synchronous(OrderSeries):
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
     typical: ClassVar[Mapping[str, Any]] = {"orders": TYPICAL_ORDERS}
     """The published gear."""
+    drifting: ClassVar[tuple[str, ...]] = ("orders",)
+    """Teeth and the wave generator's bearing wear."""
 
     def turns_per_motor_turn(self) -> float:
         """One: it counts on the motor angle itself."""

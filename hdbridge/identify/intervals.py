@@ -117,7 +117,7 @@ def effect_intervals(solution: Solution, index: int, cov: FloatArray) -> list[In
                 other = effect.fitted(changed)
             either.append(dict(leaves(other.parameters())))
         for name in base:
-            slopes[name][number] = _difference(name, either[0][name], either[1][name]) / (2.0 * step)
+            slopes[name][number] = difference(name, either[0][name], either[1][name]) / (2.0 * step)
     own = cov[np.ix_(mine, mine)]
     shapes = {each.name: each for each in effect.shape}
     result = []
@@ -171,8 +171,8 @@ def _joined(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def _difference(name: str, low: float, high: float) -> float:
-    """Of two values; phases the short way round."""
+def difference(name: str, low: float, high: float) -> float:
+    """Of two values of a parameter with this path (`leaves`); phases the short way round."""
     if re.search(r"phase_deg$", name):
         return (high - low + 180.0) % 360.0 - 180.0
     return high - low

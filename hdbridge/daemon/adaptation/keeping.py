@@ -1,0 +1,93 @@
+"""What an adaptation leaves on disk: its state, which a restart goes on from, and its history.
+
+``AXIS.json`` is replaced as a whole, ``AXIS.log.jsonl`` is only ever appended to. The state belongs to one
+committed model: with another one the adaptation begins anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hdbridge.daemon.adaptation.adaptation import Memory
+from hdbridge.daemon.adaptation.proposal import Entry
+from hdbridge.errors import OutputError
+from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.model import TransmissionModel
+
+SCHEMA = "hdbridge.adaptation/1"
+
+
+class StateFile(BaseModel):
+    """``AXIS.json``."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    schema_: Literal["hdbridge.adaptation/1"] = Field(alias="schema")
+    model: str
+    """Fingerprint of the committed model and of what is followed of it."""
+    saved: datetime
+    estimate: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    applied: tuple[float, ...]
+    windows: int = Field(ge=0)
+
+
+class Keeping:
+    """The files of one axis. Raises OutputError where they cannot be written."""
+
+    def __init__(self, folder: Path, axis: str, now: Callable[[], datetime]) -> None:
+        """The folder is made where it is missing."""
+        make_folder(folder)
+        self._state = folder / f"{axis}.json"
+        self._log = folder / f"{axis}.log.jsonl"
+        self.now = now
+        """The time of day."""
+
+    def load(self, fingerprint: str) -> Memory | None:
+        """What was kept of this model; None where there is nothing, or it is another model's.
+
+        What cannot be read is told in the history and begun anew.
+        """
+        try:
+            file = StateFile.model_validate_json(self._state.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as problem:
+            self.log({"event": "began anew", "reason": f"{self._state.name} cannot be read: {problem}"})
+            return None
+        if file.model != fingerprint:
+            self.log({"event": "began anew", "reason": "another model was committed"})
+            return None
+        self.log({"event": "restored", "windows": file.windows, "saved": file.saved.isoformat()})
+        return Memory(file.estimate, file.covariance, file.applied, file.windows)
+
+    def save(self, fingerprint: str, memory: Memory) -> None:
+        """Keep this."""
+        file = StateFile(schema=SCHEMA, model=fingerprint, saved=self.now(), **asdict(memory))
+        write_atomically(self._state, file.model_dump_json(by_alias=True))
+
+    def log(self, entry: Entry) -> None:
+        """A line more of the history, with the time of day."""
+        line = json.dumps({"time": self.now().isoformat(), **entry}, allow_nan=False)
+        try:
+            with self._log.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as problem:
+            raise OutputError(f"{self._log}: cannot be written: {problem.strerror}") from None
+
+
+def fingerprint_of(model: TransmissionModel, parameters: tuple[str, ...] | None) -> str:
+    """Of the committed model's numbers and of what is followed; where they come from does not matter."""
+    text = replace(model, provenance={}).dump() + json.dumps(parameters)
+    return hashlib.sha256(text.encode()).hexdigest()

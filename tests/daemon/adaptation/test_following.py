@@ -1,0 +1,97 @@
+"""A simulated axis whose gear changes while it works, over real frames: followed, and never made worse.
+
+The change of an hour is packed into minutes, with rates and intervals to match; `test_hour` takes the hour.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+from support.adapting import AXIS, FLOOR_ARCSEC, Work, at_work, truth_of
+
+from hdbridge.daemon.adaptation.settings import AdaptationSettings, Standing
+
+QUICK = AdaptationSettings(mode="on", half_life_turns=5.0, rate_arcsec_per_hour=1200.0, interval_s=4.0)
+CHANGING = truth_of(200.0, growth=0.1, second_order_arcsec=1.5)
+WORKED_S = 110.0
+FAULT_S, FAULTY_UNTIL_S = 30.0, 60.0
+COUNT_ARCSEC = AXIS.load_encoder.resolution_arcsec
+OFFSET, SECOND = 12, slice(2, 4)
+
+Misreading = Callable[[int], int]
+
+
+@pytest.fixture(scope="module")
+def left_alone() -> list[float]:
+    """Three sigma over neighbouring tests without adaptation; the load encoder has no part in that."""
+    with at_work(CHANGING, None) as work:
+        work.until(WORKED_S)
+        return work.three_sigma_arcsec()
+
+
+def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -> None:
+    with at_work(CHANGING, QUICK) as work:
+        work.until(WORKED_S)
+        adapted = work.three_sigma_arcsec()
+        estimate = work.adaptation.estimate_arcsec
+        events = {each["event"] for each in work.history}
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+    assert left_alone[-1] > 2.0 * FLOOR_ARCSEC
+    share = WORKED_S / 200.0
+    assert estimate[OFFSET] == pytest.approx(share * 4.0, abs=0.8)
+    assert float((estimate[SECOND] ** 2).sum() ** 0.5) == pytest.approx(share * 1.5, abs=0.5)
+    assert events == {"changed"}
+    assert work.disbelieved == []
+
+
+def drifts(work: Work) -> Misreading:
+    """By half an arcsec a second."""
+    begun_s = work.time_s
+    return lambda counts: counts + round(0.5 * (work.time_s - begun_s) / COUNT_ARCSEC)
+
+
+def freezes(work: Work) -> Misreading:
+    stuck: list[int] = []
+
+    def reading(counts: int) -> int:
+        stuck.append(counts)
+        return stuck[0]
+
+    return reading
+
+
+def jumps(work: Work) -> Misreading:
+    return lambda counts: counts + round(100.0 / COUNT_ARCSEC)
+
+
+def scatters(work: Work) -> Misreading:
+    """Ten times as much as it did."""
+    noise = random.Random(1)
+    return lambda counts: counts + round(noise.gauss(0.0, 3.0) / COUNT_ARCSEC)
+
+
+@pytest.mark.parametrize("fault", [drifts, freezes, jumps, scatters])
+def test_a_load_encoder_that_fails_freezes_the_adaptation(
+    fault: Callable[[Work], Misreading], left_alone: list[float]
+) -> None:
+    with at_work(CHANGING, QUICK) as work:
+        work.until(FAULT_S)
+        work.faults.load_reading = fault(work)
+        begun_s, before = work.time_s, work.adaptation.used_arcsec
+        work.until(FAULTY_UNTIL_S)
+        report = work.adaptation.report()
+        frozen = [each for each in work.history if each["event"] == "frozen"]
+        adapted = work.three_sigma_arcsec()
+    assert report.standing is Standing.FROZEN
+    assert report.reason
+    assert len(frozen) == 1
+    assert begun_s <= frozen[0]["axis_time_s"]
+    assert not [each for each in work.history[work.history.index(frozen[0]) :] if each["event"] == "changed"]
+    # What was learnt of the fault before it was seen is within what the rate allows, and harmless.
+    rate = QUICK.rate_arcsec_per_hour / 3600.0
+    blind_s = frozen[0]["axis_time_s"] - begun_s + 2.0 * QUICK.interval_s
+    assert abs(work.adaptation.used_arcsec - before).max() <= rate * blind_s + 1e-9
+    assert all(on <= 1.05 * off for on, off in zip(adapted, left_alone, strict=False))
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC

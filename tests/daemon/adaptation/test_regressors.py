@@ -1,0 +1,63 @@
+"""The columns of what is followed: the effects' own, on line as over a whole record."""
+
+import numpy as np
+import pytest
+from support.adapting import MODEL, wandering, work
+
+from hdbridge.daemon.adaptation.regressors import Regressors
+from hdbridge.effects import CATALOGUE, Moment, Motion, Start
+from hdbridge.errors import InputError
+
+
+@pytest.mark.parametrize("name", [name for name, kind in CATALOGUE.items() if kind.drifting])
+def test_what_drifts_is_spoken_for_by_columns_of_the_motor_angle_alone(name):
+    effect = CATALOGUE[name].candidate(50.0)
+    assert set(effect.drifting) <= set(type(effect).model_fields)
+    assert not effect.needs()
+    assert len(effect.coefficients())
+    assert effect.is_compensable()
+
+
+def test_what_a_load_encoder_may_do_by_itself_does_not_drift():
+    assert not any(CATALOGUE[name].drifting for name in ("load_order", "zero_drift", "count_loss"))
+
+
+def test_columns_on_line_are_those_of_a_record():
+    regressors = Regressors(MODEL)
+    _, samples = work(MODEL, [0.0, *wandering(20, seed=3)])
+    motor = samples["motor_target_deg"]
+    states = []
+    known = []
+    for angle in motor.tolist():
+        regressors.advance(angle, Moment())
+        states.append(regressors.state())
+        known.append(regressors.known())
+    rows = regressors.rows(motor, np.array(states))
+    after = known.index(True)
+    assert 0 < after < len(motor) // 2
+    for start in (Start.FORWARD, Start.BACKWARD):
+        for each in regressors.terms:
+            expected = each.effect.columns(Motion(motor), start)
+            assert rows[after:, each.columns] == pytest.approx(expected[after:], abs=1e-9)
+    predicted = rows[:, : regressors.followed] @ regressors.committed
+    assert predicted[after:] == pytest.approx(MODEL.predict(Motion(motor), Start.FORWARD)[after:], abs=1e-9)
+
+
+def test_a_changed_model_differs_by_the_columns():
+    regressors = Regressors(MODEL)
+    change = np.random.default_rng(1).normal(size=regressors.followed)
+    motion = Motion(work(MODEL, [0.0, *wandering(10)])[1]["motor_target_deg"])
+    columns = np.hstack([each.effect.columns(motion, Start.FORWARD) for each in regressors.terms])
+    difference = regressors.changed(change).predict(motion, Start.FORWARD)
+    difference -= MODEL.predict(motion, Start.FORWARD)
+    assert difference == pytest.approx(columns @ change, abs=1e-9)
+
+
+def test_only_what_is_asked_for_is_followed():
+    assert [each.effect.name for each in Regressors(MODEL, ["hysteresis.offset_arcsec"]).terms] == [
+        "hysteresis"
+    ]
+    with pytest.raises(InputError, match=r"did you mean 'hysteresis.offset_arcsec'\?"):
+        Regressors(MODEL, ["hysteresis.ofset_arcsec"])
+    with pytest.raises(InputError, match=r"nothing that wear or temperature moves"):
+        Regressors(MODEL, ["hysteresis.width_deg"])

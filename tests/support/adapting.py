@@ -1,0 +1,233 @@
+"""An axis at work under an adaptation: the simulated drive over real frames, its gear changing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.daemon.adaptation.adaptation import Adaptation
+from hdbridge.daemon.adaptation.proposal import Entry
+from hdbridge.daemon.adaptation.regressors import Regressors
+from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
+from hdbridge.daemon.watch.encoder_health import EncoderHealth
+from hdbridge.drive import Drive
+from hdbridge.effects import Moment, Motion, Start
+from hdbridge.evaluation.stepping import Scatter, quantisation_floor_arcsec
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.record import Record
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+from hdbridge.units import ARCSEC_PER_DEG
+
+ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
+AXIS = AxisConfig.load(ARTICLE / "axis.yaml")
+MODEL = TransmissionModel.load(ARTICLE / "model.yaml")
+FLOOR_ARCSEC = quantisation_floor_arcsec(AXIS.motor_encoder.counts_per_turn, AXIS.gear.ratio)
+ENABLED = 3
+PERIOD_S = AXIS.drive.cycle_s
+GOLDEN = 0.6180339887
+SPAN_DEG = 60.0
+
+
+def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
+    """The article's axis, whose loop and second order grow within that time; a usual load encoder."""
+    data = yaml.safe_load((ARTICLE / "truth.yaml").read_text())
+    data["gear"]["ageing"] = {
+        "duration_s": duration_s,
+        "hysteresis_growth": growth,
+        "motor_orders": [{"order": 2, "amplitude_arcsec": second_order_arcsec, "phase_deg": 20.0}],
+    }
+    data["load"]["encoder"]["noise_arcsec"] = 0.3
+    return Truth.model_validate(data)
+
+
+def work(
+    truth: TransmissionModel,
+    targets_deg: Sequence[float],
+    *,
+    begun_s: float = 0.0,
+    before_deg: Sequence[float] = (),
+    noise_arcsec: float = 0.1,
+    zero_arcsec: float = 0.0,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Moves of the motor from target to target with stands of 0.12 s, as times (n,) and AXIS_SAMPLE (n,).
+
+    Not simulated: the load is where ``truth`` says, without dynamics. ``before_deg`` are targets before
+    these, which the samples do not show; the last of them is where the first move begins.
+    """
+    shown = len(before_deg)
+    targets_deg = [*before_deg, *targets_deg]
+    demand: list[np.ndarray] = []
+    begin = 0
+    for number, (here, there) in enumerate(pairwise(targets_deg), 1):
+        if number == shown:
+            begin = 30 + sum(map(len, demand))
+        moving = max(round(abs(there - here) / (20.0 * AXIS.gear.ratio * PERIOD_S)), 5)
+        demand += [np.linspace(here, there, moving + 1)[1:], np.full(30, there)]
+    motor = np.concatenate([np.full(30, targets_deg[0]), *demand])
+    error = truth.predict(Motion(motor), Start.FORWARD) + zero_arcsec
+    error = error + np.random.default_rng(seed).normal(0.0, noise_arcsec, len(motor))
+    samples = np.zeros(len(motor), AXIS_SAMPLE)
+    samples["state"], samples["fault"] = ENABLED, NO_FAULT
+    samples["flags"] = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
+    samples["motor_target_deg"] = samples["motor_position_deg"] = motor
+    samples["load_position_deg"] = motor / AXIS.gear.ratio + error / ARCSEC_PER_DEG
+    samples["load_target_deg"] = motor / AXIS.gear.ratio
+    samples["velocity_deg_s"] = np.diff(motor, prepend=motor[0]) / PERIOD_S / AXIS.gear.ratio
+    samples["reading0"] = samples["reading1"] = np.nan
+    return begun_s + PERIOD_S * np.arange(len(motor) - begin), samples[begin:]
+
+
+def wandering(stands: int, seed: int = 0, span_deg: float = 2000.0) -> list[float]:
+    """Motor angles of a machine at work: small moves and large ones, both ways."""
+    steps = np.random.default_rng(seed).normal(0.0, 150.0, stands)
+    folded = np.abs(np.mod(np.cumsum(steps) + span_deg, 2 * span_deg) - span_deg)
+    return np.round(folded, 3).tolist()
+
+
+def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> TransmissionModel:
+    """The article's model, its offset and the cosine of its second order changed by so much."""
+    regressors = Regressors(MODEL)
+    change = np.zeros(regressors.followed)
+    for each in regressors.terms:
+        change[each.columns.start + (0 if each.memory else 2)] = (
+            offset_arcsec if each.memory else second_order_arcsec
+        )
+    return regressors.changed(change)
+
+
+class Sampler:
+    """Records as the control process would have written them, one after the other."""
+
+    def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
+        self.axis = axis
+        self._cycle = 0
+        self._demand = np.zeros(0)
+        self.use(model)
+
+    def use(self, model: TransmissionModel) -> None:
+        """Another model predicts from here on; it has followed the path."""
+        self._tracker = model.tracker(Start.VIRGIN)
+        for angle in self._demand.tolist():
+            self._tracker.advance(angle, Moment())
+
+    def samples(self, record: Record) -> SampleArray:
+        """All samples of a record, shape (n,); time goes on where the last one ended."""
+        columns, ratio = record.columns, self.axis.gear.ratio
+        demand = columns["motor_target_deg"]
+        count, period_s = len(demand), self.axis.drive.cycle_s
+        found = np.zeros(count, sample_dtype(1))
+        found["cycle"] = found["sequence"] = self._cycle + np.arange(count)
+        found["time_ns"] = np.round(1e9 * period_s * found["cycle"])
+        axis = found["axes"][:, 0]
+        axis["state"], axis["fault"] = ENABLED, NO_FAULT
+        axis["flags"] = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN | SampleFlag.COMPENSATING
+        axis["motor_target_deg"] = axis["issued_deg"] = demand
+        axis["motor_position_deg"] = columns["motor_position_deg"]
+        axis["load_position_deg"] = columns["load_position_deg"]
+        axis["load_target_deg"] = demand / ratio
+        axis["velocity_deg_s"] = np.gradient(demand) / period_s / ratio
+        axis["reading0"] = axis["reading1"] = np.nan
+        axis["predicted_arcsec"] = [self._tracker.advance(each, Moment()) for each in demand.tolist()]
+        self._cycle += count
+        self._demand = demand
+        return found
+
+
+class Work:
+    """The axis, test by test; the adaptation hears what was measured and may change the model."""
+
+    def __init__(self, drive: Drive, node: SimulatedDrive, settings: AdaptationSettings | None) -> None:
+        self.history: list[Entry] = []
+        self.adaptation = settings and Adaptation(MODEL, settings, reading_of(AXIS), self.history.append)
+        self.health = EncoderHealth(AXIS, MODEL)
+        self.disbelieved: list[str] = []
+        """Why the load encoder was not believed, each reason once."""
+        self.errors_arcsec: list[list[float]] = []
+        """Where the load *really* stood, less its target; one list per test."""
+        self.faults = node.faults
+        self._drive = drive
+        self._machine = node.firmware.motion.machine
+        self._loads_deg: list[float] = []
+        self._sampler = Sampler(AXIS, MODEL)
+        self._use(MODEL)
+
+    @property
+    def time_s(self) -> float:
+        """Since the axis was switched on."""
+        return self._drive.link.clock.now()
+
+    def step(self, count: int = 16, step_deg: float = 43.56) -> None:
+        """A stepping test. Each begins elsewhere: the same angles again and again show no single order."""
+        start_deg = SPAN_DEG * math.fmod(GOLDEN * len(self.errors_arcsec), 1.0)
+        self._loads_deg.clear()
+        run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))
+        ends = [each.end_s for each in run.segments if each.kind == "settle"]
+        rows = np.searchsorted(run.record.columns["time_s"], np.array(ends) - 1e-9)
+        targets = [each.target_deg for each in (*run.outcome.cw, *run.outcome.ccw)]
+        self.errors_arcsec.append(
+            [
+                (self._loads_deg[row] - target) * ARCSEC_PER_DEG
+                for row, target in zip(rows.tolist(), targets, strict=True)
+            ]
+        )
+        self._adapt(self._sampler.samples(run.record))
+
+    def until(self, time_s: float) -> None:
+        """Stepping tests up to that time."""
+        while self.time_s < time_s:
+            self.step()
+
+    def three_sigma_arcsec(self, tests: int = 4) -> list[float]:
+        """Of the true load's errors, over so many neighbouring tests each."""
+        errors = self.errors_arcsec
+        return [
+            Scatter.of([each for test in errors[at : at + tests] for each in test]).three_sigma_arcsec
+            for at in range(len(errors) - tests + 1)
+        ]
+
+    def _use(self, model: TransmissionModel) -> None:
+        def look() -> bool:
+            self._loads_deg.append(self._machine.true_load_deg)
+            return False
+
+        self._bench = Bench(self._drive, model, interrupted=look)
+        self._sampler.use(model)
+
+    def _adapt(self, samples: SampleArray) -> None:
+        times_s = 1e-9 * samples["time_ns"].astype(float)
+        for part in np.array_split(np.arange(len(samples)), max(len(samples) // 125, 1)):  # half a second
+            judgement = self.health.take(samples[part])
+            why = "" if judgement.believed else judgement.why
+            if why and why not in self.disbelieved:
+                self.disbelieved.append(why)
+            if self.adaptation is None:
+                continue
+            proposal = self.adaptation.take(times_s[part], samples["axes"][part, 0], why)
+            if proposal is not None and proposal.apply:
+                self._use(proposal.model)
+                self.health.use(proposal.model)
+
+
+@contextmanager
+def at_work(truth: Truth, settings: AdaptationSettings | None) -> Iterator[Work]:
+    """A booted axis with the article's model in use; without settings nothing is adapted."""
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 1) as (bus, clock, node),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        yield Work(drive, node, settings)
