@@ -117,7 +117,7 @@ export function axis(state) {
     : [["model", "none: this axis is not compensated"]];
   rows.push(
     ["compensation", state.compensating ? `${state.scheme}${state.changing ? ", changing" : ""}${state.limited ? ", at its limit" : ""}` : "off"],
-    ["hysteresis state", state.memory_known ? "known" : "not known until the axis has turned both ways"],
+    ["hysteresis state", state.memory_known ? "known" : "not known until the axis has turned far enough"],
     ["load-side loop", state.load_loop.on ? `on, ${number(state.load_loop.correction_arcsec, 1)} arcsec` : "off"],
     ["adaptation", adaptation(state.adaptation)],
   );
