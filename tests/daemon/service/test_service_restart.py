@@ -1,0 +1,77 @@
+"""The service dies and another takes its place; the control process dies; the axes are found as they are."""
+
+from pathlib import Path
+
+import pytest
+from support.service import Service, play, stepped_service, until
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import Cell, CommandKind
+from hdbridge.errors import LeaseError
+from hdbridge.evaluation.stepping import Scheme
+
+
+@pytest.fixture
+def service(tmp_path: Path):
+    with stepped_service(tmp_path) as made:
+        yield made
+
+
+def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
+    async def first() -> str:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.compensate(token, Scheme.SYNCHRONOUS)
+            await axis.move(token, 30.0, wait=False)
+            await bridge.core.timing.sleep(0.3)
+            return token
+
+    token = play(first())
+    service.daemon.run(3.0)  # nobody is there; the move goes to its end
+    assert service.daemon.states == [AxisState.ENABLED]
+
+    async def second() -> None:
+        async with service.bridge() as bridge:
+            axis = bridge.axes["axis1"]
+            await until(bridge, lambda: axis.commissioning.report is not None)
+            state = axis.state()
+            assert state.state == "enabled"
+            assert state.load_target_deg == pytest.approx(30.0)
+            assert state.scheme == "synchronous"
+            with pytest.raises(LeaseError):
+                await axis.move(token, 0.0)
+            own = bridge.lease.take("another")
+            await axis.move(own, 31.0)
+            await axis.disable(own)
+
+    play(second())
+
+
+def test_what_was_lent_is_taken_back(service: Service) -> None:
+    async def story() -> None:
+        async with service.ready() as bridge:
+            await bridge.axes["axis1"].link.do(CommandKind.LEND)
+        async with service.bridge() as bridge:
+            axis = bridge.axes["axis1"]
+            await until(bridge, lambda: axis.state().state == "disabled")
+            token = bridge.lease.take("test")
+            await axis.enable(token)
+            await axis.move(token, 1.0)
+
+    play(story())
+
+
+def test_the_choice_is_forgotten_with_the_control_process(service: Service) -> None:
+    async def first() -> None:
+        async with service.enabled() as (bridge, token):
+            await bridge.axes["axis1"].compensate(token, Scheme.NONE)
+
+    play(first())
+    service.daemon.memory.status.set(Cell.LOOP_PID, 4711)
+
+    async def second() -> None:
+        async with service.bridge() as bridge:
+            await bridge.core.timing.sleep(0.5)
+            assert bridge.axes["axis1"].state().scheme == "extended"
+
+    play(second())

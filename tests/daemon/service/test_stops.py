@@ -1,0 +1,210 @@
+"""After each kind of stop: what a client is told, and what leads back. Never to power by itself."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.daemon import SteppedDaemon
+from support.service import Service, play, stepped_service, until
+
+from hdbridge.drive.supervision import Fault
+from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
+
+
+@pytest.fixture
+def service(tmp_path: Path):
+    with stepped_service(tmp_path) as made:
+        yield made
+
+
+def lost_tpdos(daemon: SteppedDaemon) -> None:
+    daemon.nodes[0].faults.drop_tpdos = 4
+
+
+def drive_fault(daemon: SteppedDaemon) -> None:
+    daemon.nodes[0].faults.raise_error(0x3210)
+
+
+def encoder_jump(daemon: SteppedDaemon) -> None:
+    daemon.nodes[0].faults.load_jump_counts = 100_000
+
+
+def foreign_sync(daemon: SteppedDaemon) -> None:
+    daemon.interfere(0x080)
+
+
+def no_room(daemon: SteppedDaemon) -> None:
+    daemon.bus.no_room_for = 0x201
+
+
+LATCHED = [
+    (lost_tpdos, Fault.LOST_TPDO),
+    (drive_fault, Fault.DRIVE_FAULT),
+    (encoder_jump, Fault.ENCODER_JUMP),
+    (foreign_sync, Fault.FOREIGN_SYNC),
+    (no_room, Fault.TRANSMIT_FULL),
+]
+
+
+@pytest.mark.parametrize(("spoil", "fault"), LATCHED, ids=[each.name.lower() for _, each in LATCHED])
+def test_a_quick_stop_is_latched_until_a_reset(
+    service: Service, spoil: Callable[[SteppedDaemon], None], fault: Fault
+) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(1.0)
+            spoil(service.daemon)
+            with pytest.raises(SafetyStop, match=fault.value):
+                await axis.move(token, 150.0)
+            state = axis.state()
+            assert state.state == "quick-stopped"
+            assert state.fault is not None
+            assert state.fault.name == fault.name
+            assert state.fault.hint
+            assert not state.fault.needs_verification
+            with pytest.raises(RefusedError, match="reset"):
+                await axis.move(token, 0.0)
+            with pytest.raises(RefusedError, match="reset"):
+                await axis.enable(token)
+            await axis.reset(token)
+            state = axis.state()
+            assert state.state == "disabled"
+            assert state.fault is None
+            place_deg = state.load_position_deg
+            await bridge.core.timing.sleep(1.0)
+            assert axis.state().load_position_deg == pytest.approx(place_deg, abs=0.01)
+            await axis.enable(token)
+            await axis.move(token, place_deg + 1.0)
+
+    play(story())
+
+
+def boot_up(daemon: SteppedDaemon) -> None:
+    daemon.nodes[0].faults.boot_up()
+
+
+def pre_operational(daemon: SteppedDaemon) -> None:
+    daemon.interfere(0x000, bytes((0x80, 1)))
+
+
+@pytest.mark.parametrize("spoil", [boot_up, pre_operational])
+def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
+    service: Service, spoil: Callable[[SteppedDaemon], None]
+) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(1.0)
+            spoil(service.daemon)
+            with pytest.raises(SafetyStop):
+                await axis.move(token, 150.0)
+            await until(bridge, lambda: axis.state().state == "disabled")
+            told = [each.text for each in bridge.events().events if each.kind == "note"]
+            assert "the drive was verified; the axis is disabled" in told
+            await bridge.core.timing.sleep(1.0)
+            assert axis.state().power == "switch on disabled"
+            with pytest.raises(RefusedError, match="enable it first"):
+                await axis.move(token, 0.0)
+            await axis.enable(token)
+            await axis.move(token, axis.state().load_target_deg + 1.0)
+
+    play(story())
+
+
+def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(0.5)
+            service.daemon.bus.down = True
+            with pytest.raises(HdbridgeError):
+                await axis.move(token, 150.0)
+            await bridge.core.timing.sleep(1.0)
+            assert not bridge.state().bus.up
+            assert any("bus is down" in each for each in bridge.state().warnings)
+            assert axis.state().state == "latched"
+            assert axis.state().fault.needs_verification
+            service.daemon.bus.down = False
+            await until(bridge, lambda: axis.state().state == "disabled")
+            assert bridge.state().bus.up
+            await axis.enable(token)
+            await axis.move(token, axis.state().load_target_deg + 1.0)
+
+    play(story())
+
+
+def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> None:
+    async def story() -> None:
+        service.daemon.nodes[0].faults.silent = True
+        async with service.bridge() as bridge:
+            axis = bridge.axes["axis1"]
+            await until(
+                bridge, lambda: any("does not answer" in each.text for each in bridge.events().events)
+            )
+            assert axis.state().state == "unverified"
+            service.daemon.nodes[0].faults.silent = False
+            await until(bridge, lambda: axis.state().state == "disabled", 60.0)
+
+    play(story())
+
+
+def test_everybody_may_stop(service: Service) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(0.5)
+            await axis.stop()
+            await until(bridge, lambda: axis.state().at_rest, 2.0)
+            assert axis.state().state == "enabled"
+            assert axis.state().load_target_deg < 50.0
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(0.5)
+            await bridge.quick_stop()
+            await until(bridge, lambda: axis.state().state == "quick-stopped", 2.0)
+            assert axis.state().fault.name == "COMMAND"
+            await until(bridge, lambda: abs(axis.state().motor_torque_nm or 0.0) < 10.0, 2.0)
+            await bridge.core.timing.sleep(1.0)
+            await axis.reset(token)
+            assert axis.state().state == "disabled"
+
+    play(story())
+
+
+def test_homes_and_stays_disabled(service: Service) -> None:
+    async def story() -> None:
+        async with service.ready() as bridge:
+            axis = bridge.axes["axis1"]
+            token = bridge.lease.take("test")
+            await axis.enable(token)
+            await axis.move(token, 5.0)
+            await axis.disable(token)
+            await axis.home(token, 35)
+            assert axis.state().state == "disabled"
+            await bridge.core.timing.sleep(0.1)
+            assert axis.state().motor_position_deg == pytest.approx(0.0, abs=1.0)
+            await axis.enable(token)
+            await axis.move(token, 1.0)
+            with pytest.raises(RefusedError):
+                await axis.home(token, 35)
+
+    play(story())
+
+
+def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
+    async def story() -> None:
+        async with service.ready() as bridge:
+            axis = bridge.axes["axis1"]
+            token = bridge.lease.take("test")
+            with pytest.raises(HdbridgeError):
+                await axis.home(token, 1)
+            await until(bridge, lambda: axis.state().state == "disabled")
+            assert axis.state().power == "switch on disabled"
+            await axis.enable(token)
+            await axis.move(token, 1.0)
+
+    play(story())
