@@ -19,8 +19,8 @@ import can
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
-from hdbridge.daemon.loop.axisloop import AxisSetup
 from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
 from hdbridge.drive.drive import Drive
@@ -281,5 +281,5 @@ def stepped_daemon(
 
         controller = Controller(cycle, setups, memory, reopen)
         daemon = SteppedDaemon(controller, memory, clock, spoilt, nodes, intruder)
+        stack.callback(daemon._relay.shutdown)
         yield daemon
-        daemon._relay.shutdown()

@@ -1,8 +1,8 @@
-"""One axis in the control loop: its state, its set-point, what compensates it, what it tells.
+"""One axis in the control loop: its state, the commands that it takes, what it tells.
 
 `AxisLoop.command` takes the service's commands, between two turns. `AxisCycle` asks for a target in each
-turn in which the drive is enabled; whom it asks (`_enabling`, `_follow` or nobody) changes with the state, so
-that the turn itself decides nothing. `AxisLoop.after` looks at what the turn has left behind.
+turn in which the drive is enabled; whom it asks (`_enabling`, `Follower.follow` or nobody) changes with the
+state, so that the turn itself decides nothing. `AxisLoop.after` looks at what the turn has left behind.
 """
 
 from __future__ import annotations
@@ -10,69 +10,32 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
-from hdbridge.axis import AxisConfig
 from hdbridge.control.axiscycle import AxisCycle
-from hdbridge.control.bench import axis_view
 from hdbridge.control.compensation import Compensation
-from hdbridge.control.loadloop import LoadLoop
-from hdbridge.control.sensed import Sensed
-from hdbridge.control.switchover import Correction
+from hdbridge.daemon.loop.axissample import AxisSampler
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
+from hdbridge.daemon.loop.follower import AxisSetup, Follower
+from hdbridge.daemon.loop.knotfeed import KnotFeed
 from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
-from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory.blob import Blob
 from hdbridge.daemon.memory.knots import KnotQueue
-from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, SampleFlag
+from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.supervision import Fault, Reaction, Supervision
+from hdbridge.drive.supervision import Reaction, Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
-from hdbridge.effects import Moment, Observer
 from hdbridge.errors import HdbridgeError, InputError, TransitionError
-from hdbridge.motion import MotionMode, SetPoint
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.motion import MotionMode
 
-KNOTS_A_TURN: Final = 4
-"""Knots handed to the set-point before each turn."""
-STALE_KNOTS_A_TURN: Final = 64
-"""Knots of another stream thrown away before each turn."""
-TOLD_EVERY_S: Final = 1.0
-"""A fault that changes nothing is told no more often than this."""
-ROUNDING_COUNTS: Final = 2
-"""By which a target may exceed the fastest motion: both ends of a step are rounded."""
-
-_AT_REST: Final = Moment()
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
-_POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
-FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
-"""The numbers of faults in events and samples."""
-
-
-class Tell(Protocol):
-    """How an axis tells the service something."""
-
-    def __call__(
-        self,
-        axis: int,
-        kind: EventKind,
-        id: int = 0,  # noqa: A002
-        code: int = 0,
-        text: str = "",
-    ) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class AxisSetup:
-    """What an axis begins with."""
-
-    config: AxisConfig
-    compensation: Compensation
-    compensating: bool = True
-    """Whether the correction is faded in when the axis is enabled."""
-    load_loop: LoadLoopSettings | None = None
+_NOT_A_PICKLE: Final = (
+    pickle.UnpicklingError, AttributeError, ImportError, EOFError, IndexError, KeyError, TypeError,
+    ValueError,
+)  # fmt: skip
+_UNDER_COMMAND: Final = (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING)
 
 
 class AxisLoop:
@@ -80,47 +43,36 @@ class AxisLoop:
 
     def __init__(self, index: int, setup: AxisSetup, knots: KnotQueue, blobs: Blob, tell: Tell) -> None:
         config = setup.config
-        view = axis_view(config)
         self.index = index
         self.config = config
         self.state = AxisState.UNVERIFIED
         self.image = ProcessImage(config)
         self.supervision = Supervision()
         self.cycle = AxisCycle(self.image, self.supervision, name=config.name)
-        self.set_point = SetPoint(view.limits, config.drive.cycle_s)
-        self.correction = Correction(setup.compensation)
+        self.follower = Follower(setup, self.image)
+        self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
         """The axes (indices) that its stream began with; they stop when it does."""
+        self.broken: frozenset[int] = frozenset()
+        """The group of a stream that this axis has left before its end: the others are to stop."""
 
-        self._knots, self._blobs, self._tell = knots, blobs, tell
-        self._ratio, self._limits = view.ratio, view.limits
+        self._blobs, self._tell = blobs, tell
+        self._feed = KnotFeed(knots, self.set_point)
+        self._faults = FaultLog(index, self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
-        self._sensed = Sensed(config)
-        self._observer = Observer()
-        self._needs = bool(self.correction.needs)
-        self._compensating = setup.compensating
-        self._load_loop = self._made(setup.load_loop)
-        self._load_loop_on = setup.load_loop is not None
-        self._target_deg = 0.0
-        self._loop_arcsec = 0.0
-        self._issued = 0
-        self._most = self._fastest_counts(setup)
-        self._limited = self._limited_before = 0
-
+        self._follow = self.follower.follow
+        self._sampler = AxisSampler(self.cycle, self.follower)
+        self._changing = self._underrun = False
+        """What was told last of the change of the compensation, and of the stream."""
         self._enable_id = self._disable_id = self._motion_id = 0
         self._mode = MotionMode.HOLD
-        self._stream = 0
-        self._stream_ending = False
-        self._underrun = self._changing = False
         self._powering_off = False
         self._left = 0
         """Turns until the drive has taken too long."""
         self._why = ""
         """Why the axis stops, where that is no fault of the supervision's."""
         self._stop_told = True
-        self._noted = self.supervision.noted
-        self._told: dict[Fault, int] = {}
-        self._handlers: dict[int, Callable[[Command], None]] = {
+        self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
             CommandKind.LEND: self._silence,
@@ -132,27 +84,12 @@ class AxisLoop:
             CommandKind.MOVE: self._move,
             CommandKind.JOG: self._jog,
             CommandKind.STOP: self._stop,
-            CommandKind.STREAM_END: self._end_stream,
-            CommandKind.COMPENSATE: self._compensate,
+            CommandKind.STREAM_END: lambda _: self._feed.end(),
+            CommandKind.COMPENSATE: lambda command: self.follower.engage(bool(command.i)),
             CommandKind.CHANGE: self._change,
-            CommandKind.LOAD_LOOP: self._switch_load_loop,
-            CommandKind.DRIVE_FAULT_RESET: self._reset_drive_fault,
+            CommandKind.LOAD_LOOP: lambda command: self.follower.switch_load_loop(bool(command.i)),
+            CommandKind.DRIVE_FAULT_RESET: lambda _: self.image.power.reset_fault(),
         }
-
-    def _made(self, settings: LoadLoopSettings | None) -> LoadLoop | None:
-        if settings is None:
-            return None
-        return LoadLoop(settings.gain_1_s, settings.maximum_arcsec, settings.slew_arcsec_s, self._period_s)
-
-    def _fastest_counts(self, setup: AxisSetup) -> int:
-        """Most that a target may differ from the last one: what velocity and slew limits allow together."""
-        config = self.config
-        slew_arcsec_s = config.compensation.slew_arcsec_s
-        if setup.load_loop is not None:
-            slew_arcsec_s += setup.load_loop.slew_arcsec_s
-        load_deg = (config.limits.velocity_deg_s + slew_arcsec_s / ARCSEC_PER_DEG) * self._period_s
-        counts = load_deg * self._ratio * config.motor_encoder.counts_per_turn / DEG_PER_TURN
-        return math.ceil(1.000_01 * counts) + ROUNDING_COUNTS
 
     # ---------------------------------------------------------------- commands, between two turns
 
@@ -168,6 +105,7 @@ class AxisLoop:
         target = target_of(self.state, kind)
         assert target is not None
         if kind is CommandKind.DISABLE and target is AxisState.STOPPING:
+            self._refuse_waiting(CommandKind.DISABLE, "another one came")
             self._disable_id = command.id
         elif kind is not CommandKind.ENABLE:
             self._done(command.id)
@@ -183,9 +121,7 @@ class AxisLoop:
 
         InputError in motion, or for a bad time-out.
         """
-        self.set_point.stream(command.a)
-        self.set_point.begin_stream()
-        self._stream, self._stream_ending = command.j, False
+        self._feed.begin(command.j, command.a)
         self._motion_id = command.id
         self.group = group
 
@@ -193,9 +129,14 @@ class AxisLoop:
         """Brake to rest within the limits."""
         self.set_point.stop()
 
+    def verification_lost(self) -> None:
+        """The bus is down: an axis that is lent has to be verified again, too."""
+        self._why = "the bus went down while the axis was lent"
+        self._happened(Happening.VERIFICATION_LOST)
+
     def _done(self, id_: int) -> None:
         if id_:
-            self._tell(self.index, EventKind.DONE, id_)
+            self._tell(self.index, EventKind.DONE, id_, 0)
 
     def _happened(self, cause: Cause) -> bool:
         """Go where ``cause`` leads; whether that is somewhere else."""
@@ -213,7 +154,7 @@ class AxisLoop:
         self.state = state
         if state is AxisState.STOPPING and before is not AxisState.ENABLED:
             self._power_off()
-        if state not in (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING):
+        if state not in _UNDER_COMMAND:
             self._stand()
         if state in (AxisState.QUICK_STOPPED, AxisState.LATCHED):
             self.image.power.quick_stop()  # whatever it aimed at: nothing leads back to power but ENABLE
@@ -225,30 +166,38 @@ class AxisLoop:
     def _answer_waiting(self, state: AxisState) -> None:
         """Who waits for power on or off learns what came of it."""
         if self._enable_id and state is not AxisState.ENABLING:
-            id_, self._enable_id = self._enable_id, 0
             if state is AxisState.ENABLED:
-                self._done(id_)
-            else:
-                self._tell(self.index, EventKind.REFUSED, id_, CommandKind.ENABLE, self._stop_words())
+                self._done(self._enable_id)
+                self._enable_id = 0
+            self._refuse_waiting(CommandKind.ENABLE, self._stop_words())
         if self._disable_id and state is not AxisState.STOPPING:
-            id_, self._disable_id = self._disable_id, 0
             if state is AxisState.DISABLED:
-                self._done(id_)
-            else:
-                self._tell(self.index, EventKind.REFUSED, id_, CommandKind.DISABLE, self._stop_words())
+                self._done(self._disable_id)
+                self._disable_id = 0
+            self._refuse_waiting(CommandKind.DISABLE, self._stop_words())
+
+    def _refuse_waiting(self, kind: CommandKind, why: str) -> None:
+        """What was begun and not answered yet has come to nothing."""
+        if kind is CommandKind.ENABLE:
+            id_, self._enable_id = self._enable_id, 0
+        else:
+            id_, self._disable_id = self._disable_id, 0
+        if id_:
+            self._tell(self.index, EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
         """Nothing is followed any more."""
         self.cycle.command = None
         self._powering_off = False
         self._mode = MotionMode.HOLD
-        self._leave_stream()
+        self._feed.leave()
+        self._break_group()
         self.set_point.reset(self.set_point.position_deg)
 
-    def _leave_stream(self) -> None:
-        if self._stream:
-            self._stream = 0
-            self._knots.clear()
+    def _break_group(self) -> None:
+        """It does not go on with the others."""
+        if self.group:
+            self.broken, self.group = self.group, frozenset()
 
     def _turns(self, time_s: float) -> int:
         return math.ceil(time_s / self._period_s)
@@ -293,7 +242,7 @@ class AxisLoop:
             self._why = "it was disabled before it was enabled"
 
     def _quick_stop(self, _: Command) -> None:
-        if self.state in (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING, AxisState.LENT):
+        if self.state in (*_UNDER_COMMAND, AxisState.LENT):
             self._why = "quick stop by command: latched; reset it when the axis may move again"
         if self.state is AxisState.LENT:
             # What the service does by SDO is overruled by the next RPDO.
@@ -301,24 +250,22 @@ class AxisLoop:
             self.cycle.begin()
 
     def _reset(self, command: Command) -> None:
-        if self.state is AxisState.QUICK_STOPPED:
-            self._check_standing()
-        elif self.state is AxisState.LATCHED and not command.i:
+        quick_stopped = self.state is AxisState.QUICK_STOPPED
+        if quick_stopped and (self.cycle.riding or self.image.power.state is State.OPERATION_ENABLED):
+            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
+        if self.state is AxisState.LATCHED and not command.i:
             raise TransitionError(
                 f"{self.config.name}: boot and verify the drive again before this latch is released"
             )
         self.cycle.reset(verified=bool(command.i))
-        if self.state is AxisState.QUICK_STOPPED:
+        if quick_stopped:
             self.cycle.begin()
-
-    def _check_standing(self) -> None:
-        if self.cycle.riding or self.image.power.state is State.OPERATION_ENABLED:
-            raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
 
     def _move(self, command: Command) -> None:
         velocity = None if math.isnan(command.b) else command.b
         acceleration = None if math.isnan(command.c) else command.c
         self.set_point.goto(command.a, velocity, acceleration)
+        # One to where it stands is over within a turn, and its end is told, too.
         self._motion_id, self._mode = command.id, MotionMode.GOTO
 
     def _jog(self, command: Command) -> None:
@@ -329,40 +276,18 @@ class AxisLoop:
         if self.state is AxisState.ENABLED:
             self.set_point.stop()
 
-    def _end_stream(self, _: Command) -> None:
-        self._stream_ending = True
-
-    def _compensate(self, command: Command) -> None:
-        self._compensating = bool(command.i)
-        self._engage()
-
-    def _engage(self) -> None:
-        if self._compensating:
-            self.correction.engage()
-        else:
-            self.correction.disengage()
-
     def _change(self, command: Command) -> None:
-        new = pickle.loads(self._blobs.get(command.i))
+        try:
+            new = pickle.loads(self._blobs.get(command.i))
+        except _NOT_A_PICKLE as error:
+            raise InputError(f"{self.config.name}: what was sent cannot be loaded: {error}") from error
         if not isinstance(new, Compensation):
             raise InputError(f"{self.config.name}: {type(new).__name__} is no compensation")
-        new.model.check_bound_to(self.config)
-        if self.state in (AxisState.ENABLED, AxisState.STOPPING):
-            self.correction.change(new)
-            self._changing = True
-        else:
-            self.correction = Correction(new)
-            self._changing = False
-            self._tell(self.index, EventKind.CHANGED)
-        self._needs = bool(self.correction.needs)
-
-    def _switch_load_loop(self, command: Command) -> None:
-        if self._load_loop is None:
-            raise InputError(f"{self.config.name}: has no load loop; give the axis one in the machine file")
-        self._load_loop_on = bool(command.i)
-
-    def _reset_drive_fault(self, _: Command) -> None:
-        self.image.power.reset_fault()
+        moving = self.state in (AxisState.ENABLED, AxisState.STOPPING)
+        self.follower.change(new, moving=moving)
+        self._changing = moving
+        if not moving:
+            self._tell(self.index, EventKind.CHANGED, command.id, 0)
 
     # ---------------------------------------------------------------- power
 
@@ -382,141 +307,46 @@ class AxisLoop:
     def _enabling(self, feedback: Feedback) -> int | None:
         """Operation is enabled: stand until every channel has told something, then begin from here."""
         waiting = [each for each in self.image.channels if each.value is None]
-        if waiting or not feedback.fresh:
-            if waiting and waiting[0].lost:
-                self._why = (
-                    f"{self.config.where(waiting[0].key)}: no reading came that can be believed "
-                    f"({waiting[0].why}); check the sensor, or leave the key out"
-                )
-                self._left = 0
-            return None
-        self.image.check_target(feedback.motor_counts)
-        motor_deg = self.image.motor_deg(feedback.motor_counts)
-        place_deg = motor_deg / self._ratio
-        self.set_point.reset(place_deg)
-        self._target_deg = place_deg
-        self._issued = self.image.target_counts
-        self._observer = Observer()
-        self._sensed.reset()
-        self._sensed.take(feedback)
-        self.correction.know(self._sensed.known)
-        self.correction.reset(
-            motor_deg,
-            Moment(time_s=feedback.time_s, measured=self._sensed.measured(feedback), load_deg=place_deg),
-        )
-        self._engage()
-        self._needs = bool(self.correction.needs)
-        if self._load_loop is not None:
-            self._load_loop.reset()
-        self._loop_arcsec = 0.0
-        self._limited = self.correction.limited
-        self._underrun = False
-        self.cycle.command = self._follow
+        if waiting and waiting[0].lost:
+            self._why = (
+                f"{self.config.where(waiting[0].key)}: no reading came that can be believed "
+                f"({waiting[0].why}); check the sensor, or leave the key out"
+            )
+            self._left = 0
+        if not waiting and feedback.fresh:
+            self.follower.begin(feedback)
+            self._underrun = False
+            self.cycle.command = self._follow
         return None
-
-    # ---------------------------------------------------------------- the target of each turn
-
-    def _follow(self, feedback: Feedback) -> int:
-        """One step of the set-point, compensated: motor counts."""
-        target_deg = self._target_deg = self.set_point.step()
-        if self._load_loop is not None:
-            target_deg = self._trimmed(target_deg, feedback)
-        correction = self.correction
-        if self._needs:
-            sensed = self._sensed
-            if self.image.channels and sensed.take(feedback):
-                correction.know(sensed.known)
-            moment = self._observer.moment(
-                self._ratio * target_deg,
-                feedback.time_s,
-                measured=sensed.measured(feedback),
-                load_deg=target_deg,
-            )
-        else:
-            moment = _AT_REST
-        if feedback.fresh:
-            motor_deg = correction.command(target_deg, moment)
-        else:
-            motor_deg = correction.hold(target_deg, moment)
-        counts = self.image.target_counts_for(motor_deg)
-        if not -self._most <= counts - self._issued <= self._most:
-            raise InputError(
-                f"target of {counts} motor counts after {self._issued}: more than the {self._most} that the "
-                "limits of velocity and slew allow in a cycle; the target was not sent"
-            )
-        self._issued = counts
-        return counts
-
-    def _trimmed(self, target_deg: float, feedback: Feedback) -> float:
-        """The load target with the slow integral of the measured error; within the limits."""
-        assert self._load_loop is not None
-        error: float | None = None
-        if self._load_loop_on and feedback.fresh:
-            error = ARCSEC_PER_DEG * (target_deg - self.image.load_deg(feedback.load_counts))
-        self._loop_arcsec = self._load_loop.step(error, not self.set_point.at_rest)
-        least, greatest = self._limits.position_min_deg, self._limits.position_max_deg
-        trimmed = target_deg + self._loop_arcsec / ARCSEC_PER_DEG
-        # Where the axis stands outside of its limits the target says so; the loop adds nothing to that.
-        return min(max(trimmed, min(least, target_deg)), max(greatest, target_deg))
 
     # ---------------------------------------------------------------- before and after each turn
 
     def before(self) -> None:
         """What is to be ready when the turn begins: the next knots of a stream."""
-        if self._stream:
-            self._feed()
+        refusal_ = self._feed.feed()
+        if refusal_ is not None:
+            self._tell(self.index, EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
+            self._break_group()
 
-    def _feed(self) -> None:
-        set_point, knots = self.set_point, self._knots
-        taken = 0
-        for _ in range(STALE_KNOTS_A_TURN):
-            if taken == KNOTS_A_TURN or not set_point.room:
-                return
-            knot = knots.take()
-            if knot is None:
-                break
-            if knot.stream != self._stream:
-                continue
-            taken += 1
-            try:
-                set_point.knot(knot.time_s, knot.position_deg, knot.velocity_deg_s)
-            except InputError as error:
-                self._tell(self.index, EventKind.STREAM_REFUSED, self._motion_id, 0, str(error))
-                self._leave_stream()
-                set_point.stop()
-                return
-        if self._stream_ending and not taken and set_point.at_rest:
-            set_point.stop()
-
-    def after(self) -> bool:
-        """Look at what the turn has left behind; whether the axis has just been stopped by a fault."""
+    def after(self) -> None:
+        """Look at what the turn has left behind."""
+        self._faults.tell()
         supervision = self.supervision
-        if supervision.noted != self._noted:
-            self._tell_faults()
-        stopped = False
         if supervision.stop is not None:
             latched = supervision.reaction is Reaction.LATCH
-            stopped = self._happened(Happening.VERIFICATION_LOST if latched else Happening.STOP_LATCHED)
+            self._happened(Happening.VERIFICATION_LOST if latched else Happening.STOP_LATCHED)
         state = self.state
         if state is AxisState.ENABLED:
             self._after_motion()
         elif state is AxisState.ENABLING:
-            if self.cycle.command == self._follow:
+            if self.cycle.command is self._follow:
                 self._happened(Happening.POWERED)
             else:
-                self._overdue(
-                    f"the drive did not reach 'operation enabled' within {2 * ENABLE_TIMEOUT_S:g} s"
-                )
+                self._overdue(f"it did not reach 'operation enabled' within {2 * ENABLE_TIMEOUT_S:g} s")
         elif state is AxisState.STOPPING:
             self._after_stopping()
         elif not self._stop_told:
             self._after_stop()
-        return stopped
-
-    def verification_lost(self) -> None:
-        """The bus is down: an axis that is lent has to be verified again, too."""
-        self._why = "the bus went down while the axis was lent"
-        self._happened(Happening.VERIFICATION_LOST)
 
     def _after_motion(self) -> None:
         set_point = self.set_point
@@ -525,16 +355,19 @@ class AxisLoop:
             if mode is MotionMode.HOLD:
                 self._tell(self.index, EventKind.MOTION_ENDED, self._motion_id, self._mode)
             if mode is not MotionMode.STREAM:
-                self._leave_stream()
+                self._feed.leave()
+                if mode is not MotionMode.HOLD:
+                    self._break_group()
+                self.group = frozenset()
             self._mode = mode
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
-                self._tell(self.index, EventKind.UNDERRUN, self._motion_id)
-        if self._changing and not self.correction.changing:
+                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+        if self._changing and not self.follower.correction.changing:
             self._changing = False
-            self._needs = bool(self.correction.needs)
-            self._tell(self.index, EventKind.CHANGED)
+            self.follower.changed()
+            self._tell(self.index, EventKind.CHANGED, 0, 0)
 
     def _after_stopping(self) -> None:
         if not self._powering_off:
@@ -544,16 +377,18 @@ class AxisLoop:
         elif self.image.power.state in _OFF:
             self._happened(Happening.POWER_OFF)
         else:
-            self._overdue(f"the drive did not switch power off within {STOP_TIMEOUT_S:g} s")
+            self._overdue(f"it did not switch power off within {STOP_TIMEOUT_S:g} s")
 
     def _overdue(self, what: str) -> None:
         self._left -= 1
         if self._left > 0:
             return
-        state = self.image.power.state.value
-        self._why = (
-            self._why or f"{what}, it is in '{state}'; look at its enable input, its supply, its faults"
-        )
+        if not self._why:
+            state = self.image.power.state.value
+            self._why = (
+                f"{self.config.name}: the drive takes too long: {what}, it is in '{state}'; look at its "
+                "enable input, its supply and its fault history"
+            )
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
@@ -577,71 +412,6 @@ class AxisLoop:
         stop = self.cycle.stopped
         return str(stop) if stop is not None else self._why
 
-    def _tell_faults(self) -> None:
-        """Each fault that has a reaction, and of the others not too many."""
-        supervision, told = self.supervision, self._told
-        every = self._turns(TOLD_EVERY_S)
-        for event in supervision.since(self._noted):
-            last = told.get(event.fault)
-            if event.reaction is Reaction.GO and last is not None and event.cycle - last < every:
-                continue
-            told[event.fault] = event.cycle
-            self._tell(self.index, EventKind.FAULT, event.reaction, FAULT_INDEX[event.fault], event.detail)
-        self._noted = supervision.noted
-
-    # ---------------------------------------------------------------- the sample
-
     def sample(self) -> tuple[float, ...]:
         """The fields of `layout.Axis` for the turn that is over."""
-        image, feedback, correction, set_point = (
-            self.image,
-            self.cycle.feedback,
-            self.correction,
-            self.set_point,
-        )
-        driven = self.state is AxisState.ENABLED or self.state is AxisState.STOPPING
-        flags = int(SampleFlag.FRESH) if feedback.fresh else 0
-        reading0 = reading1 = math.nan
-        readings = feedback.readings
-        if readings:
-            if readings[0] is not None:
-                reading0 = readings[0]
-                flags |= 256
-            if len(readings) > 1 and readings[1] is not None:
-                reading1 = readings[1]
-                flags |= 512
-        motor_deg, load_deg = image.motor_deg, image.load_deg
-        position_deg = motor_deg(feedback.motor_counts)
-        stop = self.supervision.stop
-        if driven:
-            if self._compensating:
-                flags |= 2
-            limited = correction.limited
-            if limited != self._limited:
-                self._limited = limited
-                flags |= 4
-            if correction.memory_known:
-                flags |= 8
-            if self._changing:
-                flags |= 16
-            if set_point.at_rest:
-                flags |= 32
-            if self._underrun:
-                flags |= 64
-            target_deg = self._target_deg
-            corrections = (correction.correction_arcsec, correction.predicted_arcsec, self._loop_arcsec)
-            weight = correction.weight
-        else:
-            flags |= 32
-            target_deg = position_deg / self._ratio
-            corrections = (0.0, 0.0, 0.0)
-            weight = 0.0
-        return (
-            self.state, set_point.mode, _POWER_INDEX[image.power.state],
-            NO_FAULT if stop is None else FAULT_INDEX[stop.fault],
-            feedback.statusword, flags,
-            target_deg, motor_deg(feedback.demand_counts), position_deg, load_deg(feedback.load_counts),
-            feedback.torque_permille * self._sensed.torque_nm, set_point.velocity_deg_s,
-            *corrections, weight, reading0, reading1,
-            math.nan if self.cycle.silent else motor_deg(image.target_counts),
-        )  # fmt: skip
+        return self._sampler.take(self.state, changing=self._changing, underrun=self._underrun)

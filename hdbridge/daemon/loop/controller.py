@@ -13,10 +13,11 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from hdbridge.control.buscycle import BusCycle
-from hdbridge.daemon.loop.axisloop import AxisLoop, AxisSetup
+from hdbridge.daemon.loop.axisloop import AxisLoop
+from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
 from hdbridge.daemon.loop.states import AxisState, label
-from hdbridge.daemon.memory import Cell, Command, CommandKind, EventKind, Memory
+from hdbridge.daemon.memory import Command, CommandKind, EventKind, Memory
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
 from hdbridge.errors import BusError, HdbridgeError, InputError
@@ -97,7 +98,8 @@ class Controller:
         if cycle.down is not None or self._down:
             self._bus_down()
         for axis in axes:
-            if axis.after():
+            axis.after()
+            if axis.broken:
                 self._stop_group(axis)
         if self._ending:
             self._go_on_ending()
@@ -119,9 +121,7 @@ class Controller:
             values,
         )
         self._turns += 1
-        status = self.memory.status
-        status.set(Cell.LOOP_COUNT, self._turns)
-        status.set(Cell.LOOP_TIME_NS, self._monotonic_ns())
+        self.memory.status.turned(self._turns, self._monotonic_ns())
 
     def _tell(
         self,
@@ -184,13 +184,13 @@ class Controller:
         self._tell(command.axis, EventKind.DONE, command.id)
 
     def _stop_group(self, stopped: AxisLoop) -> None:
-        """The axes that move together with one that was stopped brake in order."""
-        for index in stopped.group:
+        """The axes that move together with one that does not go on brake in order."""
+        for index in stopped.broken:
             axis = self.axes[index]
-            if axis is not stopped and axis.group == stopped.group:
-                axis.stop()
+            if axis.group == stopped.broken:
                 axis.group = frozenset()
-        stopped.group = frozenset()
+                axis.stop()
+        stopped.broken = frozenset()
 
     # ---------------------------------------------------------------- the service's frames
 

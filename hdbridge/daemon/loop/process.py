@@ -19,8 +19,8 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
-from hdbridge.daemon.loop.axisloop import AxisSetup
 from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.interface import Interface, listen
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.memory import Cell, Memory

@@ -23,6 +23,10 @@ class Cell(IntEnum):
     STOP_ASKED = 6
 
 
+_LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE
+_LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
+
+
 class Status:
     """The cells by name. To read or write one is whole."""
 
@@ -65,6 +69,12 @@ class Status:
     def stop_asked(self) -> int:
         """Somebody wants the loop to end: 1 after it has stopped all axes in order, 2 after a quick stop."""
         return int(self._cells[Cell.STOP_ASKED * _STRIDE])
+
+    def turned(self, count: int, time_ns: int) -> None:
+        """The loop's turn is over."""
+        cells = self._cells
+        cells[_LOOP_COUNT] = count
+        cells[_LOOP_TIME] = time_ns
 
     def set(self, cell: Cell, value: int) -> None:
         """Write a cell; each has one writer (``STOP_ASKED``: anybody, and never back)."""

@@ -490,7 +490,7 @@ def test_a_loop_that_begins_anew_does_not_carry_out_what_was_posted_before(enabl
         cycle.leave(axis)
     setups = []
     for axis in enabled.axes:
-        from hdbridge.daemon.loop.axisloop import AxisSetup
+        from hdbridge.daemon.loop.follower import AxisSetup
 
         model = TransmissionModel(axis.config.gear.ratio)
         setups.append(AxisSetup(axis.config, compensation_for(axis.config, model)))

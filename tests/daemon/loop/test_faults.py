@@ -7,7 +7,7 @@ import struct
 import pytest
 from support.daemon import SteppedDaemon, stepped_daemon
 
-from hdbridge.daemon.loop.axisloop import FAULT_INDEX
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.drive.supervision import Fault, Reaction

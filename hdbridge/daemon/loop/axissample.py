@@ -1,0 +1,95 @@
+"""What a turn has left of one axis, as plain numbers for the ring of samples."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX
+from hdbridge.daemon.loop.follower import Follower
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory.layout import NO_FAULT, SampleFlag
+from hdbridge.drive.states import State
+
+_POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
+# As plain numbers: to combine the flags themselves costs more than the whole sample.
+_FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _KNOWN0, _KNOWN1 = map(
+    int, SampleFlag
+)
+
+
+class AxisSampler:
+    """Of one axis."""
+
+    __slots__ = (
+        "_cycle",
+        "_follower",
+        "_image",
+        "_limited",
+        "_load_deg",
+        "_motor_deg",
+        "_ratio",
+        "_supervision",
+    )
+
+    def __init__(self, cycle: AxisCycle, follower: Follower) -> None:
+        self._cycle, self._follower = cycle, follower
+        self._image, self._supervision = cycle.image, cycle.supervision
+        axis = cycle.image.axis
+        self._ratio = axis.gear.ratio
+        self._motor_deg = axis.motor_encoder.degrees(1)
+        self._load_deg = axis.load_encoder.degrees(1)
+        self._limited = 0
+
+    def take(self, state: AxisState, *, changing: bool, underrun: bool) -> tuple[float, ...]:
+        """The fields of `layout.Axis` for the turn that is over."""
+        image, feedback, follower = self._image, self._cycle.feedback, self._follower
+        set_point, motor_deg = follower.set_point, self._motor_deg
+        position_deg = motor_deg * feedback.motor_counts
+        stop = self._supervision.stop
+        flags = _FRESH if feedback.fresh else 0
+        reading0 = reading1 = math.nan
+        if feedback.readings:
+            flags, reading0, reading1 = _readings(flags, feedback.readings)
+        if state is AxisState.ENABLED or state is AxisState.STOPPING:
+            correction = follower.correction
+            correction_arcsec, predicted_arcsec = correction.correction_arcsec, correction.predicted_arcsec
+            target_deg, weight, loop_arcsec = follower.target_deg, correction.weight, follower.loop_arcsec
+            limited = correction.limited
+            if limited != self._limited:
+                self._limited = limited
+                flags |= _LIMITED
+            if follower.compensating:
+                flags |= _COMPENSATING
+            if correction.memory_known:
+                flags |= _MEMORY_KNOWN
+            if set_point.at_rest:
+                flags |= _AT_REST
+            if changing:
+                flags |= _CHANGING
+            if underrun:
+                flags |= _UNDERRUN
+        else:
+            flags |= _AT_REST
+            target_deg = position_deg / self._ratio
+            correction_arcsec = predicted_arcsec = weight = loop_arcsec = 0.0
+        return (
+            state, set_point.mode, _POWER_INDEX[image.power.state],
+            NO_FAULT if stop is None else FAULT_INDEX[stop.fault],
+            feedback.statusword, flags,
+            target_deg, motor_deg * feedback.demand_counts, position_deg,
+            self._load_deg * feedback.load_counts,
+            feedback.torque_permille * follower.sensed.torque_nm, set_point.velocity_deg_s,
+            correction_arcsec, predicted_arcsec, loop_arcsec, weight, reading0, reading1,
+            math.nan if self._cycle.silent else motor_deg * image.target_counts,
+        )  # fmt: skip
+
+
+def _readings(flags: int, readings: tuple[float | None, ...]) -> tuple[int, float, float]:
+    """The optional channels: which are known, and their values (NaN where not)."""
+    known = [each if each is not None else math.nan for each in (*readings, None)[:2]]
+    for value, bit in zip(known, (_KNOWN0, _KNOWN1), strict=True):
+        if not math.isnan(value):
+            flags |= bit
+    return flags, known[0], known[1]

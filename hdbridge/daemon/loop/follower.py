@@ -1,0 +1,183 @@
+"""What an enabled axis is told in each turn: set-point, slow integral at the load, compensation, counts.
+
+    load target -> + load loop -> inverse of the model -> motor counts -> checked against the last ones
+
+`Follower.begin` starts all of it from where the axis stands; `Follower.follow` is asked once per turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import axis_view
+from hdbridge.control.compensation import Compensation
+from hdbridge.control.loadloop import LoadLoop
+from hdbridge.control.sensed import Sensed
+from hdbridge.control.switchover import Correction
+from hdbridge.daemon.machinefile import LoadLoopSettings
+from hdbridge.drive.feedback import Feedback
+from hdbridge.drive.image import ProcessImage
+from hdbridge.effects import Moment, Observer
+from hdbridge.errors import InputError
+from hdbridge.motion import SetPoint
+from hdbridge.units import ARCSEC_PER_DEG
+
+ROUNDING_COUNTS: Final = 2
+"""By which a target may exceed the fastest motion: both ends of a step are rounded."""
+_AT_REST: Final = Moment()
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSetup:
+    """What an axis begins with."""
+
+    config: AxisConfig
+    compensation: Compensation
+    compensating: bool = True
+    """Whether the correction is faded in when the axis is enabled."""
+    load_loop: LoadLoopSettings | None = None
+
+
+class Follower:
+    """The target of one axis, turn by turn."""
+
+    __slots__ = (
+        "_axis", "_has_channels", "_image", "_issued", "_load_loop", "_load_loop_on", "_most",
+        "_needs", "_observer", "_ratio", "compensating", "correction", "loop_arcsec", "sensed",
+        "set_point", "target_deg",
+    )  # fmt: skip
+
+    def __init__(self, setup: AxisSetup, image: ProcessImage) -> None:
+        config = setup.config
+        view = axis_view(config)
+        self.set_point = SetPoint(view.limits, config.drive.cycle_s)
+        self.correction = Correction(setup.compensation)
+        self.compensating = setup.compensating
+        """Whether the correction is (being) faded in."""
+        self.target_deg = 0.0
+        """The load target of the last turn, without what the load loop adds."""
+        self.loop_arcsec = 0.0
+        """What the load loop adds."""
+        self.sensed = Sensed(config)
+        self._axis, self._image, self._ratio = config, image, view.ratio
+        self._has_channels = bool(image.channels)
+        self._observer = Observer()
+        self._needs = bool(self.correction.needs)
+        self._load_loop = _load_loop(setup)
+        self._load_loop_on = True
+        self._issued = 0
+        self._most = fastest_counts(setup)
+
+    # ---------------------------------------------------------------- what compensates
+
+    def engage(self, on: bool) -> None:
+        """Fade the correction in or out."""
+        self.compensating = on
+        if on:
+            self.correction.engage()
+        else:
+            self.correction.disengage()
+
+    def change(self, new: Compensation, *, moving: bool) -> None:
+        """Go over to another compensation: by a ramp, or at once where nothing moves. InputError: unfit."""
+        new.model.check_bound_to(self._axis)
+        if moving:
+            self.correction.change(new)
+        else:
+            self.correction = Correction(new)
+        self._needs = bool(self.correction.needs)
+
+    def switch_load_loop(self, on: bool) -> None:
+        """The slow integral on, or faded out. InputError where the axis has none."""
+        if self._load_loop is None:
+            raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
+        self._load_loop_on = on
+
+    # ---------------------------------------------------------------- turn by turn
+
+    def begin(self, feedback: Feedback) -> None:
+        """The axis stands here: everything starts anew. InputError where that is outside the limits."""
+        image = self._image
+        image.check_target(feedback.motor_counts)
+        motor_deg = image.motor_deg(feedback.motor_counts)
+        place_deg = self.target_deg = motor_deg / self._ratio
+        self.set_point.reset(place_deg)
+        self._issued = image.target_counts
+        self._observer = Observer()
+        sensed, correction = self.sensed, self.correction
+        sensed.reset()
+        sensed.take(feedback)
+        correction.know(sensed.known)
+        moment = Moment(time_s=feedback.time_s, measured=sensed.measured(feedback), load_deg=place_deg)
+        correction.reset(motor_deg, moment)
+        self.engage(self.compensating)
+        self._needs = bool(correction.needs)
+        if self._load_loop is not None:
+            self._load_loop.reset()
+        self.loop_arcsec = 0.0
+
+    def follow(self, feedback: Feedback) -> int:
+        """One step of the set-point, compensated: motor counts. InputError where they cannot be sent."""
+        target_deg = self.target_deg = self.set_point.step()
+        if self._load_loop is not None:
+            target_deg = self._trimmed(self._load_loop, target_deg, feedback)
+        correction = self.correction
+        if self._needs:
+            sensed = self.sensed
+            if self._has_channels and sensed.take(feedback):
+                correction.know(sensed.known)
+            moment = self._observer.moment(
+                self._ratio * target_deg,
+                feedback.time_s,
+                measured=sensed.measured(feedback),
+                load_deg=target_deg,
+            )
+        else:
+            moment = _AT_REST
+        follow = correction.command if feedback.fresh else correction.hold
+        counts = self._image.target_counts_for(follow(target_deg, moment))
+        if not -self._most <= counts - self._issued <= self._most:
+            raise InputError(
+                f"target of {counts} motor counts after {self._issued}: more than the {self._most} that the "
+                "limits of velocity and slew allow in a cycle; the target was not sent"
+            )
+        self._issued = counts
+        return counts
+
+    def changed(self) -> None:
+        """A change of the compensation is complete."""
+        self._needs = bool(self.correction.needs)
+
+    def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
+        """The load target with the slow integral of the measured error; within the limits."""
+        error: float | None = None
+        if self._load_loop_on and feedback.fresh:
+            error = ARCSEC_PER_DEG * (target_deg - self._image.load_deg(feedback.load_counts))
+        self.loop_arcsec = load_loop.step(error, not self.set_point.at_rest)
+        trimmed = target_deg + self.loop_arcsec / ARCSEC_PER_DEG
+        limits = self._axis.limits
+        # Where the axis stands outside of its limits the target says so; the loop adds nothing to that.
+        least, greatest = min(limits.position_min_deg, target_deg), max(limits.position_max_deg, target_deg)
+        return min(max(trimmed, least), greatest)
+
+
+def fastest_counts(setup: AxisSetup) -> int:
+    """Most that a target may differ from the last one: what velocity and slew limits allow together."""
+    config = setup.config
+    slew_arcsec_s = config.compensation.slew_arcsec_s
+    if setup.load_loop is not None:
+        slew_arcsec_s += setup.load_loop.slew_arcsec_s
+    load_deg = (config.limits.velocity_deg_s + slew_arcsec_s / ARCSEC_PER_DEG) * config.drive.cycle_s
+    counts = abs(config.motor_encoder.counts(load_deg * config.gear.ratio))
+    return math.ceil(1.000_01 * counts) + ROUNDING_COUNTS
+
+
+def _load_loop(setup: AxisSetup) -> LoadLoop | None:
+    settings = setup.load_loop
+    if settings is None:
+        return None
+    period_s = setup.config.drive.cycle_s
+    return LoadLoop(settings.gain_1_s, settings.maximum_arcsec, settings.slew_arcsec_s, period_s)

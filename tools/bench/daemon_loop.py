@@ -1,0 +1,267 @@
+"""What one turn of the daemon's control loop costs in CPU time, next to the bench's cycle on the same frames.
+
+    python tools/bench/daemon_loop.py [--axes 1,2,6] [--blocks 21] [--cycles 500] [--json FILE]
+
+One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) of
+
+  bench     `Cycle.tick` with the compensation of the article's model, as `Bench` runs it
+  loop N    `Controller.turn` for N enabled axes: set-point, compensation, states, sample into shared memory
+
+both on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
+run in the same thread; what they cost is measured in the same blocks and subtracted. Nobody sleeps.
+``--growth HOURS`` moves one simulated axis for so much axis time instead, and prints by how much the process
+and its Python objects have grown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import resource
+import statistics
+import sys
+import tracemalloc
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import can
+from can.interfaces.virtual import VirtualBus
+from cycle import PROFILE, NeverSleeping, answers, block_us
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.control.cycle import Cycle
+from hdbridge.control.sensed import Sensed
+from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.follower import AxisSetup
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Memory
+from hdbridge.drive.feedback import Feedback
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Supervision
+from hdbridge.effects import Moment, Observer
+from hdbridge.errors import SafetyStop
+from hdbridge.model import TransmissionModel
+from hdbridge.motion import SetPoint
+
+GOAL = 1.3
+STATUS_OFF, STATUS_READY, STATUS_ON = 0x0250, 0x0231, 0x0233
+NODES_HEARTBEAT_TURNS = 12
+
+
+class AnsweringNodes(VirtualBus):
+    """The master's end of a virtual bus, with nodes on it that answer SYNC at once and stand at zero."""
+
+    def __init__(self, nodes: int) -> None:
+        super().__init__(channel=self)
+        self.listener = VirtualBus(channel=self)
+        self.replies = [reply for node in range(1, nodes + 1) for reply in answers(node)]
+        self.heartbeats = [
+            can.Message(arbitration_id=0x700 + node, is_extended_id=False, data=b"\x05")
+            for node in range(1, nodes + 1)
+        ]
+        self.count = 0
+
+    def answer(self) -> None:
+        self.count += 1
+        if self.count % NODES_HEARTBEAT_TURNS == 0:
+            for heartbeat in self.heartbeats:
+                self.queue.put(heartbeat)
+        for reply in self.replies:
+            self.queue.put(reply)
+        self.listener.queue.queue.clear()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        super().send(msg, timeout)
+        if msg.arbitration_id == 0x80:
+            self.answer()
+
+    def shutdown(self) -> None:
+        self.listener.shutdown()
+        super().shutdown()
+
+
+def configs_of(count: int) -> list[AxisConfig]:
+    first = AxisConfig.load(PROFILE)
+    return [
+        first.model_copy(
+            update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
+        )
+        for node in range(1, count + 1)
+    ]
+
+
+def bench_cycle(bus: can.BusABC, model: TransmissionModel) -> Callable[[], None]:
+    """The bench's own cycle: `Bench._leg` without what keeps the samples."""
+    (axis,) = configs_of(1)
+    image = ProcessImage(axis)
+    cycle = Cycle(Link(bus, NeverSleeping()), NeverSleeping(), image, Supervision(), axis.drive.cycle_s)
+    compensation = compensation_for(axis, model.bound_to(axis))
+    compensation.engage()
+    observer, sensed = Observer(), Sensed(axis)
+    needs, at_rest = bool(compensation.needs), Moment()
+    # Its path: the set-point of the same move, so that both loops follow the same.
+    set_point = SetPoint(axis_view(axis).limits, axis.drive.cycle_s)
+    goal = 300.0
+    for _ in range(5):
+        cycle.tick()
+    image.power.go(State.OPERATION_ENABLED)
+    target_deg = 0.0
+
+    def answer(feedback: Feedback) -> int:
+        moment = at_rest
+        if needs:
+            moment = observer.moment(
+                50 * target_deg, feedback.time_s, measured=sensed.measured(feedback), load_deg=target_deg
+            )
+        follow = compensation.command if feedback.fresh else compensation.hold
+        return image.target_counts_for(follow(target_deg, moment))
+
+    def turn() -> None:
+        nonlocal target_deg, goal
+        if set_point.at_rest:
+            set_point.goto(goal, 2.0)
+            goal = -goal
+        target_deg = set_point.step()
+        feedback = cycle.tick(answer)
+        # What the bench keeps of each cycle, as numbers.
+        image.motor_deg(feedback.demand_counts)
+        image.motor_deg(feedback.motor_counts)
+        image.load_deg(feedback.load_counts)
+
+    return turn
+
+
+def controller_of(bus: can.BusABC, memory: Memory, model: TransmissionModel) -> Controller:
+    """A loop whose axes are enabled and on their way."""
+    configs = configs_of(memory.axes)
+    cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
+    setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
+    controller = Controller(cycle, setups, memory)
+    for axis in range(memory.axes):
+        memory.commands.post(CommandKind.VERIFIED, axis, k=STATUS_OFF)
+        memory.commands.post(CommandKind.ENABLE, axis, k=STATUS_OFF)
+        for _ in range(5):
+            controller.turn()
+    for axis in range(memory.axes):
+        memory.commands.post(CommandKind.MOVE, axis, a=300.0, b=2.0, c=float("nan"))
+        controller.turn()
+    return controller
+
+
+def loop_block(count: int, model: TransmissionModel, cycles: int) -> float:
+    """CPU time of a turn for so many axes, us; begun anew when a busy machine has stopped an axis in it."""
+    for _ in range(20):
+        with AnsweringNodes(count) as bus, Memory.create(count, 0.004) as memory:
+            controller = controller_of(bus, memory, model)
+            block_us(controller.turn, 50)
+            own = block_us(controller.turn, cycles)
+            if all(axis.state is AxisState.ENABLED for axis in controller.axes):
+                return own - block_us(bus.answer, cycles)
+    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+
+
+def bench_block(model: TransmissionModel, cycles: int) -> float:
+    """The same of the bench's cycle."""
+    for _ in range(20):
+        with suppress(SafetyStop), AnsweringNodes(1) as bus:
+            turn = bench_cycle(bus, model)
+            block_us(turn, 50)
+            own = block_us(turn, cycles)
+            return own - block_us(bus.answer, cycles)
+    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+
+
+def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
+    """Median CPU time of one cycle of each, us, without the answering nodes."""
+    model = TransmissionModel.load(PROFILE / "model.yaml")
+    times: dict[str, list[float]] = {}
+    for _ in range(blocks):
+        times.setdefault("bench", []).append(bench_block(model, cycles))
+        for count in counts:
+            times.setdefault(f"loop {count}", []).append(loop_block(count, model, cycles))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def report(result: dict[str, float]) -> str:
+    bench = result["bench"]
+    lines = ["CPU time of one cycle on the virtual bus, medians:", ""]
+    for name, value in result.items():
+        axes = int(name.split()[1]) if name != "bench" else 1
+        lines.append(
+            f"  {name:<8} {value:>8.1f} us  {value / bench:>6.2f} x bench  {value / axes:>8.1f} us/axis"
+        )
+    ratio = result.get("loop 1", 0.0) / bench
+    verdict = "reached" if ratio <= GOAL else "missed"
+    lines += ["", f"  goal: one axis at most {GOAL} x the bench's own cycle: {verdict} ({ratio:.2f} x)"]
+    return "\n".join(lines)
+
+
+def growth(hours: float) -> None:
+    """Axis time on a simulated drive, moving, with a service that reads; what has grown."""
+    sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+    from support.daemon import stepped_daemon  # noqa: PLC0415
+
+    with stepped_daemon() as daemon:
+        daemon.verify()
+        daemon.enable()
+        goal = 5.0
+
+        def run(turns: int) -> None:
+            nonlocal goal
+            for turn in range(turns):
+                if turn % 500 == 0:
+                    daemon.post(CommandKind.MOVE, 0, a=goal, b=float("nan"), c=float("nan"))
+                    goal = -goal
+                daemon.turn()
+                if turn % 100 == 0:
+                    daemon.samples.read()
+
+        run(20_000)
+        gc.collect()
+        rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        turns = round(3600.0 * hours / daemon.period_s)
+        run(turns - 5000)
+        tracemalloc.start()
+        run(2000)
+        before, _ = tracemalloc.get_traced_memory()
+        run(3000)
+        after, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - rss
+        print(f"{hours:g} h of axis time, {turns} turns, states {daemon.states}")
+        print(
+            f"  resident set {grown:+d} KiB; Python objects in the last 3000 turns {after - before:+d} bytes"
+        )
+        print(f"  skipped periods: {daemon.controller.cycle.skipped}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
+    parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
+    parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
+    parser.add_argument("--growth", type=float, metavar="HOURS", help="look for growth of memory instead")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    if options.growth is not None:
+        growth(options.growth)
+        return 0
+    result = measure([int(each) for each in options.axes.split(",")], options.blocks, options.cycles)
+    print(report(result))
+    if options.json is not None:
+        options.json.write_text(json.dumps({"unit": "us", **result}, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
