@@ -27,22 +27,21 @@ SIGMAS_AT_BOUND = 3.0
 
 
 def bounds_arcsec(regressors: Regressors, settings: AdaptationSettings) -> FloatArray:
-    """The most that each followed coefficient and the zero may differ from the committed, (followed + 1,).
+    """The most that each followed coefficient may differ from the committed one, (followed,).
 
     The share is that of the largest coefficient of the effect: a sine that happens to be zero may grow.
     """
-    bounds = np.empty(regressors.followed + 1)
+    bounds = np.empty(regressors.followed)
     for each in regressors.terms:
         largest = float(np.linalg.norm(each.effect.coefficients(), np.inf))
         bounds[each.columns] = max(settings.bound_share * largest, settings.least_bound_arcsec)
-    bounds[-1] = settings.zero_bound_arcsec
     return bounds
 
 
 def estimator_of(regressors: Regressors, settings: AdaptationSettings) -> Estimator:
     """An estimator that knows what the committed model's ``uncertainty`` says, and nothing of the zero."""
     scale = np.full(regressors.count, DISC_ARCSEC)
-    scale[: regressors.followed] = bounds_arcsec(regressors, settings)[:-1] / SIGMAS_AT_BOUND
+    scale[: regressors.followed] = bounds_arcsec(regressors, settings) / SIGMAS_AT_BOUND
     scale[regressors.zero] = ZERO_SCALE_ARCSEC
     covariance = np.diag(scale**2)
     for each in regressors.terms:

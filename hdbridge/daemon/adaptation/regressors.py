@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hdbridge.daemon.adaptation.settings import ZERO
 from hdbridge.effects import Effect, FloatArray, Moment, Motion, Start, Tracker, refreshed
 from hdbridge.effects.base import Memoryless
 from hdbridge.effects.orders import cosines_and_sines
@@ -145,7 +144,7 @@ def _terms(model: TransmissionModel, parameters: Sequence[str] | None) -> tuple[
     offered = {
         f"{each.name}.{name}": place for place, each in enumerate(model.effects) for name in each.drifting
     }
-    wanted = list(offered) if parameters is None else [each for each in parameters if each != ZERO]
+    wanted = list(offered) if parameters is None else parameters
     for each in wanted:
         if each not in offered:
             raise _unknown(each, offered)
@@ -169,7 +168,7 @@ def _unit(effect: Effect, number: int) -> Effect:
 def _unknown(name: str, offered: Iterable[str]) -> InputError:
     known = list(offered)
     close = nearest(name, known)
-    hint = f"did you mean '{close}'?" if close else f"expected {', '.join(known) or 'none'}, or zero"
+    hint = f"did you mean '{close}'?" if close else f"expected {', '.join(known) or 'none'}"
     return InputError(
         f"adaptation.parameters: '{name}' is nothing that wear or temperature moves in this model; {hint}"
     )

@@ -8,9 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Mode = Literal["off", "observe", "on"]
-ZERO = "zero"
-"""The name of the common zero of load and motor among the parameters."""
-Parameter = Annotated[str, Field(pattern=r"^(zero|[a-z_]+\.[a-z_]+)$")]
+Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
 class Standing(StrEnum):
@@ -50,8 +48,7 @@ class AdaptationSettings(BaseModel):
     )
     parameters: tuple[Parameter, ...] | None = Field(
         None,
-        description="what follows, as EFFECT.PARAMETER, or zero; without it all that wear and temperature "
-        "move, but not the zero",
+        description="what follows, as EFFECT.PARAMETER; without it all that wear and temperature move",
     )
     rate_arcsec_per_hour: float = Field(
         30.0, gt=0, le=36_000, description="fastest change of any one coefficient of the model"
@@ -60,7 +57,7 @@ class AdaptationSettings(BaseModel):
         60.0,
         gt=0,
         le=36_000,
-        description="fastest change of the zero; a zero that moves faster is a fault, and freezes all",
+        description="fastest change of the zero (told, never applied); a faster one is a fault",
     )
     bound_share: float = Field(
         0.5, gt=0, le=1, description="most that a coefficient may differ from the committed one, of its size"
@@ -68,7 +65,9 @@ class AdaptationSettings(BaseModel):
     least_bound_arcsec: float = Field(
         5.0, ge=0, le=3600, description="most that it may differ where that share is less than this"
     )
-    zero_bound_arcsec: float = Field(60.0, gt=0, le=3600, description="most that the zero may move")
+    zero_bound_arcsec: float = Field(
+        60.0, gt=0, le=3600, description="most that the zero may move since it was taken; more is a fault"
+    )
     half_life_turns: float = Field(
         40.0,
         ge=1,

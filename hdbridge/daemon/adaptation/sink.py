@@ -15,8 +15,9 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
-from hdbridge.daemon.adaptation.adaptation import Adaptation, Reading
+from hdbridge.daemon.adaptation.adaptation import Adaptation
 from hdbridge.daemon.adaptation.keeping import Keeping, fingerprint_of
+from hdbridge.daemon.adaptation.learning import Reading
 from hdbridge.daemon.adaptation.proposal import Entry, Proposal
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode, Standing
 from hdbridge.daemon.watch.encoder_health import Judgement
@@ -60,7 +61,7 @@ def followed(
 ) -> Followed:
     """An axis, going on from what is kept of its model in ``folder``.
 
-    ``model`` is the committed one, or the part of it that compensates. InputError where the settings name
+    ``model`` is the committed one, whole, whatever part of it compensates. InputError where the settings name
     a parameter that it does not have; OutputError where the folder cannot be written.
     """
     keeping = Keeping(folder, axis.name, now)

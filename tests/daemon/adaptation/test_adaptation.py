@@ -11,6 +11,7 @@ from support.adapting import AXIS, MODEL, PERIOD_S, wandering, work, worn
 from hdbridge.daemon.adaptation.adaptation import Adaptation
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Standing
 from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
 
 QUICK = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=3600.0, half_life_turns=10.0)
@@ -165,10 +166,33 @@ def test_a_load_that_is_off_all_at_once_freezes_until_the_zero_is_taken_again():
     assert axis.standing is Standing.FROZEN
     assert "slipped" in axis.adaptation.report().reason
     assert axis.adaptation.used_arcsec.tolist() == before[2]
-    axis.adaptation.lost_zero()
+    times, samples = axis.measures(MODEL, axis.path[-1:])
+    samples["state"] = AxisState.LENT  # it is homed
+    axis.takes(times, samples)
     axis.works(stands=100, zero_arcsec=40.0)
     assert axis.standing is Standing.FOLLOWING
     assert axis.events() == ["frozen", "thawed"]
+
+
+def test_a_zero_that_has_moved_too_far_is_a_fault():
+    axis = Axis(zero_bound_arcsec=1.0)
+    axis.works(stands=100)
+    times, samples = axis.measures(MODEL, wandering(700, 7))
+    samples["load_position_deg"] += 0.012 * (times - times[0]) / 3600.0
+    axis.takes(times, samples)
+    assert axis.standing is Standing.FROZEN
+    assert "at most 1" in axis.adaptation.report().reason
+
+
+def test_a_command_ends_a_doubt_that_lasts():
+    axis = Axis()
+    axis.works(stands=100)
+    axis.works(stands=100, zero_arcsec=40.0)
+    assert axis.standing is Standing.FROZEN
+    axis.adaptation.adapt("on")
+    axis.works(stands=100, zero_arcsec=40.0)
+    assert axis.standing is Standing.FOLLOWING
+    assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.6
 
 
 def test_a_doubt_that_passes_thaws_after_some_plausible_windows():
@@ -219,7 +243,7 @@ def test_after_power_was_off_the_path_has_to_be_known_again():
     axis = Axis()
     axis.works(stands=60)
     times, samples = axis.measures(MODEL, axis.path[-1:])
-    samples["state"] = 1
+    samples["state"] = AxisState.DISABLED
     axis.takes(times, samples)
     assert axis.standing is Standing.WAITING
     axis.works(stands=60)
