@@ -8,7 +8,7 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
   now          one axis through `Cycle` as it is here
   n axes       `BusCycle` with 1, 2, 4 and 6 axes
 
-each with the target held, and compensated. Both checkouts have a process of their own, kept alive for the
+each with the target held, and compensated. Each of the three has a process of its own, kept alive for the
 whole run; only one of them works at a time. The buses are those of `cycle.py`, and what the answering nodes
 cost is subtracted. Of n axes the cost for each axis and for one axis more is printed: what is linear in n has
 both constant or falling.
@@ -194,7 +194,8 @@ class Checkout:
 
 def measure(interface: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Medians by kind and variant, and of the ratios of neighbouring blocks; us."""
-    now = Checkout(HERE)
+    # A worker of its own for the single axis of each side: they shall share the processor's caches alike.
+    now, several = Checkout(HERE), Checkout(HERE)
     before = Checkout(options.before) if options.before is not None else None
     times: dict[tuple[str, str], list[float]] = {}
     for _ in range(options.blocks):
@@ -205,9 +206,9 @@ def measure(interface: str, options: argparse.Namespace) -> dict[str, dict[str, 
                 )
             times.setdefault((kind, "now"), []).append(now.block(interface, 0, kind, options.cycles))
             for count in AXES:
-                own_us = now.block(interface, count, kind, max(options.cycles // count, 50))
+                own_us = several.block(interface, count, kind, max(options.cycles // count, 50))
                 times.setdefault((kind, str(count)), []).append(own_us)
-    for each in (now, before):
+    for each in (now, several, before):
         if each is not None:
             each.close()
     result: dict[str, dict[str, float]] = {HELD: {}, COMPENSATED: {}}
