@@ -1,0 +1,41 @@
+"""``hdbridge ctl``: ask a daemon that runs: look, move, stop, compensate, run procedures.
+
+common.py        where the daemon is; the right to move; Ctrl-C stops the axis
+look.py          what only looks
+motion.py        power and motion
+model.py         compensation, models, adaptation
+procedures.py    jobs, objects of the drive
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import typer
+
+from hdbridge.cli.ctl import look, model, motion, procedures
+
+_SIGNED = {"ignore_unknown_options": True}
+"""For commands that take a number which may be negative, in place of an option that is none."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(
+        help="Ask a daemon that runs: look, move, stop, compensate, run procedures.",
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+    )
+    plain: list[Callable[..., None]] = [
+        *(look.status, look.watch, look.events, look.lease, look.mark),
+        *(motion.enable, motion.disable, motion.reset, motion.home, motion.stop, motion.quick_stop),
+        *(model.compensate, model.model, model.adapt, model.load_loop),
+        *(procedures.job, procedures.jobs, procedures.cancel, procedures.get),
+    ]
+    for each in plain:
+        group.command(each.__name__.replace("_", "-"))(each)
+    signed: list[Callable[..., None]] = [motion.move, motion.jog, motion.queue]
+    for each in signed:
+        group.command(context_settings=_SIGNED)(each)
+    group.command("set", context_settings=_SIGNED)(procedures.put)
+    app.add_typer(group, name="ctl")

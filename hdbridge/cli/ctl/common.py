@@ -1,0 +1,144 @@
+"""What the commands share: where the daemon is, the right to move, what is printed of an axis."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from hdbridge.cli.options import console, notes, write_json
+from hdbridge.errors import HdbridgeError
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from hdbridge.client import Client
+    from hdbridge.client.axis import Axis
+    from hdbridge.client.messages import AxisState
+
+AtOption = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="ADDRESS",
+        help="Name of the machine, socket or URL of its daemon; else HDBRIDGE_SOCKET, HDBRIDGE_URL (its "
+        "token in HDBRIDGE_TOKEN), or the only one that runs here.",
+    ),
+]
+AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
+AxesArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else every one.")
+]
+TakeOption = Annotated[
+    bool,
+    typer.Option("--force", help="Take the right to move from whoever has it, whose motion is stopped."),
+]
+
+
+def connected(at: str | None) -> Client:
+    """The daemon; use it as a context manager."""
+    from hdbridge.client import Client
+
+    return Client(at, name="hdbridge ctl")
+
+
+@contextmanager
+def moving(at: str | None, name: str, *, force: bool = False) -> Iterator[Axis]:
+    """An axis, the right to move it, and Ctrl-C (and what else ends a command) that stops it."""
+    with connected(at) as client, client.lease(force=force), stopped_by_signals(client, name):
+        yield client.axis(name)
+
+
+@contextmanager
+def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
+    """Brake these axes to rest where the block is interrupted; the interruption goes on."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {
+        each: signal.signal(each, interrupt)
+        for each in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(each) is not signal.SIG_IGN
+    }
+    try:
+        yield
+    except KeyboardInterrupt:
+        for name in names:
+            with suppress(HdbridgeError):  # the daemon's own supervision is still there
+                client.axis(name).stop()
+                notes.print(f"axis '{name}' is stopped; it stays enabled", markup=False, soft_wrap=True)
+        raise
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
+def tell(state: AxisState, json_file: Path | None) -> None:
+    """How an axis stands after a command."""
+    write_json(json_file, document("ctl-axis", state))
+    load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
+    error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
+    target = "" if state.load_target_deg is None else f": target {state.load_target_deg:.4f} deg{load}{error}"
+    console.print(f"axis '{state.name}' is {state.state}{target}", markup=False, soft_wrap=True)
+    for line in concerns(state):
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def concerns(state: AxisState) -> Iterator[str]:
+    """What a person should know of an axis, a line each."""
+    if state.fault is not None:
+        yield f"axis '{state.name}' stopped: {state.fault.text}; {state.fault.hint}"
+    if state.adaptation.frozen is not None:
+        yield f"axis '{state.name}' does not adapt: {state.adaptation.frozen}"
+    for each in state.advice:
+        yield f"axis '{state.name}': {each}"
+
+
+def document(kind: str, message: Any) -> dict[str, Any]:
+    """A message of the daemon as a result for machines."""
+    return {"schema": f"hdbridge.{kind}/1", **message.model_dump(mode="json")}
+
+
+def figure(value: float | None, digits: int) -> str:
+    """A number in a table; a dash where there is none."""
+    return "-" if value is None else f"{value:z.{digits}f}"
+
+
+def axes_table(axes: list[AxisState]) -> Table:
+    """One row per axis."""
+    table = Table("axis", "state")
+    for name in ("target, deg", "load encoder, deg", "error, arcsec", "correction, arcsec"):
+        table.add_column(name, justify="right")
+    table.add_column("compensation")
+    table.add_column("model")
+    for each in axes:
+        moving = "" if each.mode == "hold" else f", {each.mode}"
+        queued = f", {each.queued} wait" if each.queued else ""
+        table.add_row(
+            escape(each.name),
+            f"{each.state}{moving}{queued}",
+            figure(each.load_target_deg, 4),
+            figure(each.load_position_deg, 4),
+            figure(each.error_arcsec, 2),
+            figure(each.correction_arcsec, 2),
+            str(each.scheme),
+            _model(each),
+        )
+    return table
+
+
+def _model(state: AxisState) -> str:
+    if state.model is None:
+        return "-"
+    name = "file" if state.model.version is None else str(state.model.version)
+    if state.model.age_s is None:
+        return name
+    days = state.model.age_s / 86_400
+    return f"{name}, {days:.0f} days old" if days >= 2 else f"{name}, {state.model.age_s / 3600:.0f} h old"

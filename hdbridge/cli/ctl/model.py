@@ -1,0 +1,80 @@
+"""Which model compensates the axes of a daemon, by which part, and how it follows the load encoder."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.ctl.common import AtOption, AxisArgument, TakeOption, moving, tell
+from hdbridge.cli.options import JsonOption
+from hdbridge.client.messages.values import AdaptationMode, Scheme
+from hdbridge.errors import InputError
+
+
+def compensate(
+    axis: AxisArgument,
+    scheme: Annotated[Scheme, typer.Argument(metavar="SCHEME", help="`none` switches it off.")],
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Compensate by a part of the model from now on: none, synchronous, hysteresis, both or extended.
+
+    The change is ramped, also in motion.
+    """
+    with moving(at, axis, force=force) as moved:
+        tell(moved.compensate(scheme.value), json_file)
+
+
+def model(
+    axis: AxisArgument,
+    version: Annotated[
+        str,
+        typer.Argument(
+            metavar="VERSION",
+            help="Its number in `hdbridge model log`; `pending` commits the one that waits, `active` reads "
+            "the active one again.",
+        ),
+    ],
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Make another model of an axis the active one; the change is ramped, also in motion."""
+    if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
+        raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
+    with moving(at, axis, force=force) as moved:
+        tell(moved.activate_model(int(version) if version.isdigit() else version), json_file)
+
+
+def adapt(
+    axis: AxisArgument,
+    mode: Annotated[
+        AdaptationMode | None,
+        typer.Argument(metavar="MODE", help="`off`, `observe` (report what would change) or `on`."),
+    ] = None,
+    back: Annotated[
+        bool, typer.Option("--back", help="Take back what was changed since the model was activated.")
+    ] = False,
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Let parameters follow the load encoder, only observe what would change, or neither."""
+    if back == (mode is not None):
+        raise InputError("expected a mode, or --back: one of the two")
+    with moving(at, axis, force=force) as moved:
+        tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value), json_file)
+
+
+def load_loop(
+    axis: AxisArgument,
+    on: Annotated[bool, typer.Option("--on/--off", help="Switch it on or off.")],
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Switch the slow integral of the error at the load on or off, where the machine file has one."""
+    with moving(at, axis, force=force) as moved:
+        tell(moved.load_loop(on), json_file)

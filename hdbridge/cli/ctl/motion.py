@@ -1,0 +1,193 @@
+"""Power and motion of the axes of a daemon. What moves takes the right to move for as long as it runs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hdbridge.cli.ctl.common import (
+    AtOption,
+    AxesArgument,
+    AxisArgument,
+    TakeOption,
+    connected,
+    moving,
+    stopped_by_signals,
+    tell,
+)
+from hdbridge.cli.options import JsonOption
+from hdbridge.errors import InputError
+
+VelocityOption = Annotated[
+    float | None,
+    typer.Option("--velocity", min=1e-6, help="Degrees of the load per second; else the axis's limit."),
+]
+AccelerationOption = Annotated[
+    float | None, typer.Option("--acceleration", min=1e-6, help="Of the load, deg/s2; else the axis's limit.")
+]
+
+
+def enable(
+    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+) -> None:
+    """Switch power on, standing still; the drive is booted and verified first where it is not."""
+    with moving(at, axis, force=force) as moved:
+        tell(moved.enable(), json_file)
+
+
+def disable(
+    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+) -> None:
+    """Brake to rest, then switch power off. What hangs on the axis needs a brake."""
+    with moving(at, axis, force=force) as moved:
+        tell(moved.disable(), json_file)
+
+
+def reset(
+    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+) -> None:
+    """Release a latched stop when its cause is gone; the axis stays disabled."""
+    with moving(at, axis, force=force) as moved:
+        tell(moved.reset(), json_file)
+
+
+def home(
+    axis: AxisArgument,
+    method: Annotated[
+        int,
+        typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual."),
+    ],
+    switch_velocity_deg_s: Annotated[
+        float | None,
+        typer.Option("--switch-velocity", min=1e-6, help="Towards the switch, deg/s at the load."),
+    ] = None,
+    zero_velocity_deg_s: Annotated[
+        float | None, typer.Option("--zero-velocity", min=1e-6, help="Towards the zero, deg/s at the load.")
+    ] = None,
+    acceleration_deg_s2: AccelerationOption = None,
+    offset_deg: Annotated[
+        float, typer.Option("--offset", help="Load angle that the home position gets (607Ch).")
+    ] = 0.0,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Seconds that it may take.")
+    ] = 60.0,
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Home by a method of the drive's own, from disabled; it is disabled again afterwards."""
+    with moving(at, axis, force=force) as moved:
+        done = moved.home(
+            method,
+            switch_velocity_deg_s=switch_velocity_deg_s,
+            zero_velocity_deg_s=zero_velocity_deg_s,
+            acceleration_deg_s2=acceleration_deg_s2,
+            offset_deg=offset_deg,
+            timeout_s=timeout_s,
+        )
+        tell(done, json_file)
+
+
+def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
+    """Brake axes to rest within their limits; they stay enabled. Needs no right to move."""
+    with connected(at) as client:
+        states = [client.axis(each).stop() for each in axes] if axes else client.stop().axes
+    for each in states:
+        tell(each, None)
+
+
+def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
+    """Stop axes as fast as their drives can, latched until a reset. Needs no right to move."""
+    with connected(at) as client:
+        states = [client.axis(each).quick_stop() for each in axes] if axes else client.quick_stop().axes
+    for each in states:
+        tell(each, None)
+
+
+def move(
+    axis: AxisArgument,
+    angles_deg: Annotated[
+        list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
+    ],
+    relative: Annotated[
+        bool, typer.Option("--relative", help="Each angle counts from the target before it.")
+    ] = False,
+    velocity_deg_s: VelocityOption = None,
+    acceleration_deg_s2: AccelerationOption = None,
+    wait: Annotated[
+        bool, typer.Option("--wait/--no-wait", help="Wait until the axis rests there; else answer at once.")
+    ] = True,
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Move the load to one angle or to several, and hold the last.
+
+    The axis has to be enabled. Ctrl-C stops it; it stays enabled.
+    """
+    if not wait and len(angles_deg) > 1:
+        raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
+    with moving(at, axis, force=force) as moved:
+        before_deg = moved.state().load_target_deg or 0.0
+        for given_deg in angles_deg:
+            before_deg = before_deg + given_deg if relative else given_deg
+            state = moved.move(
+                before_deg,
+                velocity_deg_s=velocity_deg_s,
+                acceleration_deg_s2=acceleration_deg_s2,
+                wait=wait,
+            )
+            tell(state, json_file if given_deg is angles_deg[-1] else None)
+
+
+def jog(
+    axis: AxisArgument,
+    velocity_deg_s: Annotated[
+        float, typer.Argument(metavar="SPEED", help="Degrees of the load per second, with a sign.")
+    ],
+    duration_s: Annotated[
+        float, typer.Option("--for", min=0.05, max=86_400.0, help="Seconds; Ctrl-C ends it before.")
+    ] = 1.0,
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Turn an axis at a speed for a time, then brake to rest. It stops, too, when this command is killed."""
+    with moving(at, axis, force=force) as moved:
+        moved.jog(velocity_deg_s, duration_s)
+        tell(moved.rest(), json_file)
+
+
+def queue(
+    axis: AxisArgument,
+    angles_deg: Annotated[
+        list[float] | None, typer.Argument(metavar="ANGLE...", help="Load angles in degrees.")
+    ] = None,
+    velocity_deg_s: VelocityOption = None,
+    acceleration_deg_s2: AccelerationOption = None,
+    dwell_s: Annotated[
+        float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Seconds to rest at each of them.")
+    ] = 0.0,
+    clear: Annotated[
+        bool,
+        typer.Option("--clear", help="Forget the way points that have not begun, in place of adding any."),
+    ] = False,
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
+    from hdbridge.client.calls import given
+    from hdbridge.client.messages import QueueItem
+
+    if clear == bool(angles_deg):
+        raise InputError("expected angles, or --clear: one of the two")
+    if clear:
+        with connected(at) as client, client.lease(force=force):
+            tell(client.axis(axis).clear_queue(), json_file)
+        return
+    limits = {"velocity_deg_s": velocity_deg_s, "acceleration_deg_s2": acceleration_deg_s2}
+    points = [given(QueueItem, target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
+    with connected(at) as client, client.lease(force=force), stopped_by_signals(client, axis):
+        tell(client.axis(axis).queue(points), json_file)

@@ -1,0 +1,195 @@
+"""`hdbridge ctl`, against the API as it is served over a machine without drives."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from support.api import served
+from support.fake_bridge import FakeBridge
+
+from hdbridge import SafetyStop
+from hdbridge.client import messages
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
+        yield place
+
+
+@pytest.fixture
+def machine(place, monkeypatch):
+    """The machine as it comes up, its first axis enabled; the environment leads to it."""
+    monkeypatch.setenv("HDBRIDGE_SOCKET", str(place.socket))
+    place.bridge.__init__()
+    place.bridge.axes["joint-1"].at = messages.ControlState.ENABLED
+    return place.bridge
+
+
+@pytest.fixture
+def ctl(hdbridge, machine):
+    """Run `hdbridge ctl ARGS...`; what it prints, after it was checked that it went well."""
+
+    def run(*arguments: object, status: int = 0) -> str:
+        done = hdbridge("ctl", *arguments)
+        assert done.returncode == status, done.stderr
+        return done.stdout if status == 0 else done.stderr
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("line", "asked"),
+    [
+        ("enable joint-2", ("joint-2", "enable")),
+        ("disable joint-1", ("joint-1", "disable")),
+        ("reset joint-2", ("joint-2", "reset")),
+        ("home joint-2 --method 37", ("joint-2", "home", 37)),
+        ("move joint-1 -30 --velocity 20", ("joint-1", "move", -30.0, 20.0)),
+        ("jog joint-1 -5 --for 0.05", ("joint-1", "jog", -5.0, 0.5)),
+        ("queue joint-1 --clear", ("joint-1", "clear queue")),
+        ("compensate joint-1 both", ("joint-1", "compensate", "both")),
+        ("model joint-1 4", ("joint-1", "model", 4)),
+        ("model joint-1 pending", ("joint-1", "model", "pending")),
+        ("adapt joint-1 observe", ("joint-1", "adapt", "observe")),
+        ("adapt joint-1 --back", ("joint-1", "adaptation back")),
+        ("load-loop joint-1 --on", ("joint-1", "load loop", True)),
+        ("set joint-1 6041h 1", ("joint-1", "write", "6041h", "1")),
+        (
+            "job joint-1 step --set count=60 --set scheme=both --no-wait",
+            ("joint-1", "job", "step", {"count": 60, "scheme": "both"}),
+        ),
+    ],
+)
+def test_a_command_asks_the_daemon_for_what_it_says(ctl, machine, line, asked):
+    ctl(*line.split())
+    assert machine.moved[0] == asked
+    assert not machine.state().lease.held
+
+
+def test_status_is_a_table_for_people_and_the_state_for_machines(ctl, machine, tmp_path):
+    machine.axes["joint-2"].at = messages.ControlState.QUICK_STOPPED
+    said = ctl("status", "--json", "state.json")
+    assert "machine 'cell', simulated; virtual hdbridge is up, load 31 %; cycle of 4 ms" in said
+    assert "nobody has the right to move" in said
+    assert "axis 'joint-2' stopped: a TPDO is missing; check the cable" in said
+    raw = json.loads((tmp_path / "state.json").read_text())
+    assert raw["schema"] == "hdbridge.ctl-status/1"
+    assert messages.MachineState.model_validate(raw).axes[1].fault.name == "LOST_TPDO"
+
+
+def test_several_angles_are_moved_to_one_after_the_other(ctl, machine, tmp_path):
+    ctl("move", "joint-1", 10, 20, "--json", "stands.json")
+    assert json.loads((tmp_path / "stands.json").read_text())["load_target_deg"] == 20.0
+    ctl("move", "joint-1", 5, -1, "--relative")
+    assert [each[2] for each in machine.moved] == [10.0, 20.0, 25.0, 24.0]
+
+
+def test_stops_go_to_all_or_to_those_named_and_need_nobodys_leave(ctl, machine):
+    machine.lease.take("another")
+    ctl("stop")
+    ctl("stop", "joint-2")
+    ctl("quick-stop", "joint-2", "joint-1")
+    ctl("quick-stop")
+    assert [each[0] for each in machine.stopped] == [
+        *("joint-1", "joint-2"), "joint-2", *("joint-2", "joint-1"), *("joint-1", "joint-2"),
+    ]  # fmt: skip
+
+
+def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machine):
+    machine.lease.take("cell controller")
+    assert "'cell controller' has the right to move" in ctl("lease")
+    said = ctl("move", "joint-1", 1, status=7)
+    assert "'cell controller'" in said
+    assert len(said.splitlines()) == 1
+    assert machine.moved == []
+    ctl("move", "joint-1", 1, "--force")
+    assert machine.moved == [("joint-1", "move", 1.0, None)]
+    machine.lease.take("cell controller")
+    assert "nobody" in ctl("lease", "--force")
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "words"),
+    [
+        ("move joint-1 181", 2, "-180 to 180"),
+        ("move joint-1 nan", 2, "target_deg"),
+        ("move joint-2 1", 7, "enable it first"),
+        ("move joint-9 1", 2, "joint-1, joint-2"),
+        ("move joint-1 1 2 --no-wait", 2, "queue"),
+        ("queue joint-1", 2, "--clear"),
+        ("adapt joint-1", 2, "--back"),
+        ("adapt joint-1 onn", 2, "did you mean on?"),
+        ("compensate joint-1 bth", 2, "did you mean both?"),
+        ("model joint-1 newest", 2, "pending or active"),
+        ("get joint-1 9999h", 2, "no such object"),
+        ("cancel step-9", 2, "no job"),
+        ("job joint-1 step --set count", 2, "NAME=VALUE"),
+        ("status --at http://", 2, "expected"),
+        ("status --at /nowhere/cell.sock", 7, "hdbridge run"),
+    ],
+)
+def test_what_is_refused_is_one_line_with_the_exit_status_of_its_kind(ctl, machine, line, status, words):
+    said = ctl(*line.split(), status=status)
+    assert words in said
+    assert len(said.splitlines()) == 1
+    assert machine.moved == []
+
+
+def test_events_and_marks_are_listed(ctl, tmp_path):
+    ctl("mark", "coupling tightened")
+    assert "and once more" in ctl("mark", "and once more")
+    assert "coupling tightened" in ctl("events", "--json", "all.json")
+    assert "coupling tightened" not in ctl("events", "--since", 1)
+    assert [each["sequence"] for each in json.loads((tmp_path / "all.json").read_text())["events"]] == [1, 2]
+
+
+def test_watch_looks_again_and_again(ctl):
+    lines = ctl("watch", "--lines", "--count", 3, "--every", 0.05).splitlines()
+    assert [messages.MachineState.model_validate_json(each).name for each in lines] == ["cell"] * 3
+    assert "joint-2" in ctl("watch", "--count", 2, "--every", 0.05)
+
+
+def test_a_job_is_followed_and_its_failure_is_the_commands(ctl, machine, monkeypatch):
+    problem = messages.Problem.of(SafetyStop("cycle 7: lost; check the cable"))
+    looked = 0
+
+    def jobs():
+        nonlocal looked
+        looked += 1
+        if looked < 3:
+            return machine.ran
+        failed = {"state": messages.JobState.FAILED, "problem": problem}
+        return [each.model_copy(update=failed) for each in machine.ran]
+
+    monkeypatch.setattr(machine, "jobs", jobs)
+    assert "check the cable" in ctl("job", "joint-1", "step", status=5)
+
+
+def test_an_object_is_read(ctl):
+    assert "6041h:00 'Statusword': 4663 (0x1237)  uint16" in ctl("get", "joint-1", "Statusword")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_axis_that_moves(machine, place, number):
+    machine.axes["joint-1"].moving_s = 60.0
+    command = [sys.executable, "-m", "hdbridge", "ctl", "move", "joint-1", "30"]
+    environment = {**os.environ, "HDBRIDGE_SOCKET": str(place.socket)}
+    with subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as moving:
+        until = time.monotonic() + 60
+        while not machine.moved:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        moving.send_signal(number)
+        _, said = moving.communicate(timeout=60)
+    assert moving.returncode == 130
+    assert "axis 'joint-1' is stopped; it stays enabled" in said
+    assert "Traceback" not in said
+    assert machine.stopped == [("joint-1", "stop")]
+    assert not machine.state().lease.held
