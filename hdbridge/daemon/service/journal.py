@@ -1,0 +1,54 @@
+"""What the control process tells, as lines of the log: it logs nothing itself."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Final
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import Event, EventKind, SampleArray
+from hdbridge.drive.supervision import Fault, Reaction
+
+_log = logging.getLogger(__name__)
+_FAULTS: Final = list(Fault)
+_LEVELS: Final = {
+    EventKind.STOPPED: logging.ERROR,
+    EventKind.BUS_DOWN: logging.ERROR,
+    EventKind.FAULT: logging.WARNING,
+    EventKind.REFUSED: logging.WARNING,
+    EventKind.UNDERRUN: logging.WARNING,
+    EventKind.STREAM_REFUSED: logging.WARNING,
+    EventKind.DONE: logging.DEBUG,
+    EventKind.MOTION_ENDED: logging.DEBUG,
+}
+"""Of the others INFO."""
+
+
+class Journal:
+    """A sink of the observer: an event a line, with the name of its axis."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer."""
+        if lost:
+            _log.warning("cycles lost", {"cycles": lost})
+        for event in events:
+            level = _LEVELS.get(event.kind, logging.INFO)
+            if _log.isEnabledFor(level):
+                _log.log(level, event.kind.name.lower().replace("_", " "), self._facts(event))
+
+    def _facts(self, event: Event) -> dict[str, object]:
+        facts: dict[str, object] = {"cycle": event.cycle}
+        if 0 <= event.axis < len(self._names):
+            facts["axis"] = self._names[event.axis]
+        if event.kind is EventKind.STATE:
+            facts["state"] = AxisState(event.code).name.lower().replace("_", "-")
+        if event.kind is EventKind.FAULT:
+            facts["fault"] = _FAULTS[event.code].name
+            facts["reaction"] = Reaction(event.id).name.lower()
+        if event.text:
+            facts["text"] = event.text
+        return facts

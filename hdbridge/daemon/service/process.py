@@ -1,0 +1,108 @@
+"""The service process: ``python -m hdbridge.daemon.service.process FD``, started by the keeper.
+
+It puts the parts together (bridge, API, recorder, watch, adaptation, log) and ends them in order. It has one
+event loop; what blocks runs in threads. When it dies the axes go to the end of what they were told.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from contextlib import AsyncExitStack
+from typing import Final
+
+from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.api.policy import Policy
+from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.logs import begin_log
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.journal import Journal
+from hdbridge.daemon.service.timing import RealTiming
+from hdbridge.daemon.start import Start, begin_child
+from hdbridge.errors import HdbridgeError
+
+THREADS_PER_AXIS: Final = 2
+"""An axis may be verified while another of its requests blocks."""
+SPARE_THREADS: Final = 4
+LAST_WORDS_S: Final = 35.0
+"""How long is waited for the control process to bring its axes to rest, so that it is recorded."""
+
+
+def main(arguments: list[str]) -> int:
+    """Serve until SIGTERM; the exit status."""
+    try:
+        start = Start.inherited(arguments)
+        begin_child(start, "hdbridge-serve")
+        begin_log(start.log)
+        with Memory.attach(start.memory_fd) as memory:
+            asyncio.run(serve(start, memory))
+    except HdbridgeError as error:
+        print(f"hdbridge: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+async def serve(start: Start, memory: Memory) -> None:
+    """All of the service, from its begin to its end."""
+    machine = start.machine
+    told = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    async with AsyncExitStack() as stack:
+        timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS)
+        stack.callback(timing.close)
+        bridge = ServiceBridge(
+            machine, memory, timing, runtime=start.runtime, simulated=start.simulation is not None
+        )
+        metrics = Metrics()
+        for sink in (Journal([axis.name for axis in machine.axes]), metrics):
+            bridge.core.observer.add(sink)
+        await stack.enter_async_context(bridge)
+        server = ApiServer(bridge, listeners(machine, start.api_fds), metrics)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(server.run())
+            group.create_task(_say_when_served(server, memory))
+            await told.wait()
+            await _last_words(bridge, memory)
+            server.stop()
+
+
+def listeners(machine: Machine, descriptors: Sequence[int]) -> list[Listener]:
+    """What the keeper has opened: the Unix socket, then the TCP port where the machine has one."""
+    unix, *others = [socket.socket(fileno=each) for each in descriptors]
+    made = [Listener(unix, Policy())]
+    tcp = machine.api.tcp
+    if tcp is not None and others:
+        token = machine.beside(tcp.token_file).read_text(encoding="ascii").strip()
+        policy = Policy(token, frozenset(each.lower() for each in tcp.names))
+        pem = [machine.beside(each) if each is not None else None for each in (tcp.certificate, tcp.key)]
+        made.append(Listener(others[0], policy, *pem))
+    return made
+
+
+async def _say_when_served(server: ApiServer, memory: Memory) -> None:
+    """The keeper waits for the number of this process in the shared memory."""
+    while not server.started:
+        await asyncio.sleep(0.01)
+    memory.status.set(Cell.SERVICE_PID, os.getpid())
+
+
+async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
+    """Go on while the axes are brought to rest: clients see it, and it is recorded."""
+    end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
+    while bridge.core.observer.alive and asyncio.get_running_loop().time() < end_s:
+        try:
+            os.kill(memory.status.loop_pid, 0)
+        except OSError:
+            break
+        await asyncio.sleep(0.05)
+    bridge.core.observer.poll()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

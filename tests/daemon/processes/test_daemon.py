@@ -1,0 +1,92 @@
+"""The whole daemon on simulated drives: started, asked, and what becomes of its processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.running import gone, running
+
+
+def test_a_day_in_short(tmp_path: Path) -> None:
+    """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
+    with running(tmp_path, "article", "--simulate", "--speed", 4, name="article") as daemon:
+        daemon.until_told("READY=1")
+        state = daemon.state()
+        assert state is not None  # it answers at once
+        assert state["simulated"]
+        assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o660
+        assert stat.S_IMODE(daemon.socket.parent.stat().st_mode) == 0o700
+        second = run_to_its_end(tmp_path, "article", "--simulate")
+        assert second.returncode == 7
+        assert "another daemon listens there" in second.stderr
+
+        daemon.until_axis("disabled")
+        daemon.ask("enable")
+        daemon.ask("move", target_deg=3.0)
+        assert daemon.axis()["load_target_deg"] == pytest.approx(3.0, abs=1e-9)
+
+        (control,), (service,) = daemon.pids("control"), daemon.pids("service")
+        before = daemon.cycle()
+        os.kill(service, signal.SIGKILL)
+        daemon.until(lambda: len(daemon.pids("service")) == 2, "the service returns")
+        daemon.until(lambda: daemon.cycle() > before, "and finds the loop where it is")
+        assert daemon.pids("control") == [control]
+        daemon.forget_lease()
+        assert daemon.until_axis("enabled")["load_target_deg"] == pytest.approx(3.0, abs=1e-9)
+        daemon.ask("move", target_deg=1.0)
+
+        os.kill(control, signal.SIGKILL)
+        daemon.until(lambda: len(daemon.pids("control")) == 2, "the control process returns")
+        assert daemon.until_axis("disabled")["power"] != "operation enabled"
+        assert len(daemon.pids("service")) == 2
+
+        daemon.process.send_signal(signal.SIGHUP)
+        assert daemon.ended() == 0
+        assert not daemon.socket.exists()
+        assert all(gone(pid) for pid in (*daemon.pids("control"), *daemon.pids("service")))
+
+
+def test_without_its_keeper_it_stops_the_axes_and_ends(tmp_path: Path) -> None:
+    with running(tmp_path, "article", "--simulate", name="article") as daemon:
+        daemon.until_told("READY=1")
+        daemon.until_axis("disabled")
+        daemon.ask("enable")
+        daemon.ask("move", target_deg=90.0, wait=False)
+        daemon.process.kill()
+        daemon.process.wait()
+        children = (*daemon.pids("control"), *daemon.pids("service"))
+        while not all(gone(pid) for pid in children):
+            time.sleep(0.1)
+        assert "ending" in daemon.names()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (("nowhere",), 2, "no such file or folder, nor a bundled profile"),
+        (("article",), 2, "the bus 'virtual' reaches nothing outside this process"),
+        (("article", "--speed", "2", "--interface", "socketcan"), 2, "--simulate"),
+        (("cell", "--simulate", "--truth", "x.yaml"), 2, "expected once for each of the axes base, arm"),
+        (("article", "--interface", "socketcan", "--channel", "can99"), 3, "can99"),
+    ],
+)
+def test_what_it_refuses(tmp_path: Path, arguments: tuple[str, ...], status: int, said: str) -> None:
+    done = run_to_its_end(tmp_path, *arguments)
+    assert done.returncode == status, done.stderr
+    assert said in done.stderr
+    assert not list(tmp_path.glob("hdbridge/*.sock"))
+
+
+def run_to_its_end(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "hdbridge", "run", *arguments],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}, cwd=folder,
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip

@@ -1,0 +1,187 @@
+"""A whole daemon in processes of its own, and the little of a client that its tests need."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+PATIENCE_S = 120.0
+"""For what takes two seconds on a machine that has nothing else to do."""
+
+
+class Daemon:
+    """``hdbridge run ...``: its processes, its API, its log."""
+
+    def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
+        """``folder`` is its runtime folder's and its own to write into; ``name`` that of the machine."""
+        self.folder, self.name = folder, name
+        self.events: list[dict[str, Any]] = []
+        """Of its log, all processes together."""
+        self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._manager.bind(str(folder / "notify"))
+        self._manager.settimeout(PATIENCE_S)
+        environment = {
+            **os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder),
+            "NOTIFY_SOCKET": str(folder / "notify"),
+        }  # fmt: skip
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hdbridge", "run", *map(str, arguments)],
+            env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.socket = folder / "hdbridge" / f"{name}.sock"
+        self.client = httpx.Client(
+            transport=httpx.HTTPTransport(uds=str(self.socket)),
+            base_url="http://hdbridge/api/v1",
+            timeout=60.0,
+        )
+        self._lease: str | None = None
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            try:
+                self.events.append(json.loads(line))
+            except ValueError:
+                self.events.append({"event": line.strip()})
+
+    # ------------------------------------------------------------------ what it says
+
+    def until_told(self, line: str) -> None:
+        """The service manager has been told this."""
+        while self._manager.recv(4096).decode() != line:
+            pass
+
+    def until(self, met: Callable[[], Any], what: str) -> Any:
+        """Wait for something that is asked for again and again; what it gave."""
+        end = time.monotonic() + PATIENCE_S
+        while not (found := met()):
+            assert time.monotonic() < end, f"{what}: {self._last_words()}"
+            assert self.process.poll() is None, f"{what}: it ended: {self._last_words()}"
+            time.sleep(0.05)
+        return found
+
+    def _last_words(self) -> str:
+        told = [each for each in self.events if each["event"] != "request"][-20:]
+        return "\n".join(json.dumps(each) for each in (*told, self.axis()))
+
+    def names(self) -> list[str]:
+        """Of the events in its log."""
+        return [str(event["event"]) for event in self.events]
+
+    def pids(self, which: str) -> list[int]:
+        """Of the ``control`` or ``service`` processes that were started, oldest first."""
+        return [event["pid"] for event in self.events if event["event"] == f"{which} process started"]
+
+    # ------------------------------------------------------------------ what it is asked
+
+    def state(self) -> dict[str, Any] | None:
+        """The machine; None while the API does not answer."""
+        try:
+            return dict(self.client.get("/state").raise_for_status().json())
+        except httpx.HTTPError:
+            return None
+
+    def axis(self, place: int = 0) -> dict[str, Any]:
+        """An axis; empty while the API does not answer."""
+        state = self.state()
+        return dict(state["axes"][place]) if state else {}
+
+    def cycle(self) -> int:
+        """Number of the newest cycle; -1 while the API does not answer."""
+        state = self.state()
+        return int(state["cycle"]["cycle"]) if state else -1
+
+    def until_axis(self, state: str, place: int = 0) -> dict[str, Any]:
+        """Wait until an axis is in a state of the loop."""
+        return dict(self.until(lambda: (found := self.axis(place)).get("state") == state and found, state))
+
+    def ask(self, name: str, **body: object) -> httpx.Response:
+        """A request to the first axis, with the lease; AssertionError where it is refused.
+
+        Where it has to wait, for the drive that is being verified or brought to rest, it does.
+        """
+        if self._lease is None:
+            granted = self.client.post("/lease", json={"client": "test", "force": True})
+            assert granted.status_code == 201, granted.text
+            self._lease = granted.json()["token"]
+        axis = self.axis()["name"]
+        headers = {"X-Lease": self._lease}
+
+        def answered() -> httpx.Response | None:
+            answer = self.client.post(f"/axes/{axis}/{name}", json=body or None, headers=headers)
+            return None if answer.status_code == 409 and "wait " in answer.text else answer
+
+        answer: httpx.Response = self.until(answered, name)
+        assert answer.is_success, answer.text
+        return answer
+
+    def forget_lease(self) -> None:
+        """A new service knows of no lease."""
+        self._lease = None
+
+    # ------------------------------------------------------------------ its end
+
+    def ended(self) -> int:
+        """Wait for the end of the keeper; its exit status."""
+        status = self.process.wait(PATIENCE_S)
+        self._reader.join()
+        return status
+
+    def close(self) -> None:
+        """End it where it still runs, and every process of it."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(40.0)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        for pid in (*self.pids("control"), *self.pids("service")):
+            for number in (signal.SIGCONT, signal.SIGKILL):
+                if _is_ours(pid):
+                    os.kill(pid, number)
+        self._reader.join()
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+        self._manager.close()
+        self.client.close()
+
+
+@contextmanager
+def running(folder: Path, *arguments: object, name: str) -> Iterator[Daemon]:
+    """A daemon that is told to end on the way out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    daemon = Daemon(folder, arguments, name)
+    try:
+        yield daemon
+    finally:
+        daemon.close()
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended, waited for or not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
+
+
+def _is_ours(pid: int) -> bool:
+    try:
+        return b"hdbridge.daemon" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
