@@ -67,6 +67,10 @@ class Record:
             raise ValueError("the columns of a record are one-dimensional and of one length")
         object.__setattr__(self, "columns", MappingProxyType(columns))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle, which knows no read-only mapping."""
+        return type(self), (dict(self.columns), self.source, self.starts)
+
     @classmethod
     def read_csv(cls, path: Path | str, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
         """Read a CSV file, plain or gzip.

@@ -25,7 +25,7 @@ from hdbridge.control.survived import Survived
 from hdbridge.daemon.service.jobwork import Told, Work
 from hdbridge.errors import DaemonError
 from hdbridge.procedures.moves import Procedure
-from hdbridge.records.record import Record
+from hdbridge.records.record import REQUIRED, Record
 from hdbridge.records.recording import Segment
 
 Outcome = TypeVar("Outcome")
@@ -220,7 +220,7 @@ class PipedBench:
 
     def record(self) -> Record:
         """What it has measured."""
-        return self._done.record if self._done is not None else Record({"time_s": np.empty(0)})
+        return self._done.record if self._done is not None else Record(dict.fromkeys(REQUIRED, np.empty(0)))
 
     def run(
         self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None, /

@@ -61,6 +61,7 @@ class CalibrateOptions(_Options):
     """Of ``hdbridge calibrate``."""
 
     plan: _Name = "quick"
+    """A bundled one, or the file of that name (and ``.yaml``) beside the axis file."""
     resume: _Name | None = None
     """Folder, within the axis's recordings, of one that goes on."""
 
@@ -237,7 +238,8 @@ def _journal(work: Work, options: CalibrateOptions, rig: Rig, told: Told) -> tup
         journal.check_is_of(work.axis)
         told.folder(folder)
         return journal.plan, folder, journal
-    plan = Plan.load(options.plan)
+    own = work.profile.folder / f"{options.plan}.yaml"
+    plan = Plan.load(str(own) if own.is_file() else options.plan)
     outlook(plan, work.axis)  # refused before a folder is made
     folder = _new_folder(work, "")
     told.folder(folder)

@@ -13,11 +13,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
+from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.bench import Run, axis_view
 from hdbridge.control.compensation import Compensation
@@ -27,7 +28,7 @@ from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, SampleAr
 from hdbridge.daemon.service.reports import fault_of
 from hdbridge.errors import DaemonError, RefusedError, SafetyStop
 from hdbridge.motion.stream import Cubic
-from hdbridge.procedures.moves import MotionLimits, Move, Path, Procedure, Sample
+from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment, versions_here
@@ -43,8 +44,12 @@ BRAKE_S: Final = 30.0
 """By then an axis that was told to stop stands, and its power is off."""
 _HALVINGS: Final = 5
 """Of a period between two knots, at most."""
-_ACCELERATION_SHARE: Final = 1.04
-"""Of the limit: a stream may have a little more."""
+_VELOCITY_SHARE: Final = 1.0 + 3e-7
+_ACCELERATION_SHARE: Final = 1.045
+"""Of the limits, to what more knots are of use: a stream may have a little more."""
+_JERK_SHARE: Final = 0.3
+"""Most that the acceleration may change within a period, of its limit: where it is more, the cubic between
+two knots would pass that limit however near they are."""
 _SLOPE_S: Final = 1e-5
 """Half the time over which a path's velocity is taken."""
 _ROUNDING_S: Final = 1e-9
@@ -70,6 +75,14 @@ def knots_of(path: Path, stream: int, period_s: float, limits: MotionLimits) -> 
         before = end
 
 
+def streamed_view(axis: AxisConfig) -> AxisView:
+    """What a procedure may know of an axis that follows streams: with a jerk that they can follow."""
+    view = axis_view(axis)
+    limits = view.limits
+    jerk = min(limits.jerk_deg_s3, _JERK_SHARE * limits.acceleration_deg_s2 / axis.drive.cycle_s)
+    return replace(view, limits=replace(limits, jerk_deg_s3=jerk))
+
+
 def _knot(path: Path, stream: int, time_s: float) -> Knot:
     if time_s >= path.duration_s:
         return Knot(stream, time_s, path.at(path.duration_s), 0.0)
@@ -82,7 +95,7 @@ def _refined(path: Path, begin: Knot, end: Knot, limits: MotionLimits, halvings:
     """``end``, and what has to come before it."""
     cubic = Cubic.between(*begin[1:], *end[1:])
     kept = (
-        cubic.fastest_deg_s() <= limits.velocity_deg_s
+        cubic.fastest_deg_s() <= _VELOCITY_SHARE * limits.velocity_deg_s
         and cubic.hardest_deg_s2() <= _ACCELERATION_SHARE * limits.acceleration_deg_s2
     )
     if not kept and halvings:
@@ -122,7 +135,7 @@ class DaemonBench:
         self._axis = rig.axis
         self._compensation = compensation or rig.uncompensated()
         self._interrupted = interrupted
-        self._view = axis_view(rig.axis)
+        self._view = streamed_view(rig.axis)
         self._period_s = rig.period_s
         self._measured = _Measured()
         self._reader: SampleReader = rig.core.memory.reader()

@@ -1,0 +1,86 @@
+"""The service as it runs: event loop, worker threads, a job's process; the control loop in a thread."""
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from support.service import Service, stepped_service
+
+from hdbridge.client.messages import JobKind
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.timing import RealTiming
+from hdbridge.errors import RefusedError
+
+
+@contextmanager
+def turning(service: Service) -> Iterator[None]:
+    """The loop turns by itself, faster than its period: its clock is virtual, the service's is not."""
+    ended = threading.Event()
+
+    def turn() -> None:
+        while not ended.wait(0.001):
+            service.daemon.turn()
+
+    thread = threading.Thread(target=turn)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+async def verified(bridge: ServiceBridge) -> None:
+    async with asyncio.timeout(60.0):
+        while any(each.state().state != "disabled" for each in bridge.axes.values()):
+            await asyncio.sleep(0.02)
+
+
+def test_many_things_at_once(tmp_path: Path) -> None:
+    async def story(service: Service) -> None:
+        timing = RealTiming(8)
+        async with ServiceBridge(service.machine, service.daemon.memory, timing, runtime=tmp_path) as bridge:
+            await verified(bridge)
+            token = bridge.lease.take("test")
+            await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))
+            first, second = bridge.axes.values()
+            feed = bridge.subscribe(most=20)
+            await asyncio.gather(first.move(token, 3.0), second.move(token, -2.0))
+            assert first.state().load_target_deg == pytest.approx(3.0)
+            assert second.state().load_target_deg == pytest.approx(-2.0)
+            batch = await anext(feed)
+            assert len(batch.samples) <= 20
+            assert batch.lost > 0  # who does not fetch loses samples
+            feed.close()
+
+            # One client waits for a move, others look, read, and take its place.
+            waiting = asyncio.create_task(first.move(token, 60.0))
+            await asyncio.sleep(0.05)
+            read = await asyncio.gather(
+                *(first.sdo_read("6064h") for _ in range(5)), second.sdo_read("1018h:01")
+            )
+            assert len(read) == 6
+            await first.move(token, 0.0)
+            with pytest.raises(RefusedError, match="another move"):
+                await waiting
+            await first.queue(token, [WayPoint(1.0), WayPoint(0.0)])
+            async with await second.stream(token) as stream:
+                for number in range(1, 40):
+                    await stream.put([StreamPoint(0.02 * number, -2.0 + 0.001 * number)])
+            await bridge.coordinated(token, {"axis1": 2.0, "axis2": 0.0})
+
+            job = await first.job(token, JobKind.STEP, {"count": 2, "scheme": "none"})
+            async with asyncio.timeout(60.0):
+                while (known := {each.id: each for each in bridge.jobs()}[job.id]).state == "running":
+                    await second.move(token, 1.0)
+                    await second.move(token, 0.0)
+            assert known.state == "done", known.problem
+            await second.disable(token)
+        timing.close()
+
+    with stepped_service(tmp_path, axes=2, lease_s=60.0) as service, turning(service):
+        asyncio.run(story(service))
