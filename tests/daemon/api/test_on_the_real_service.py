@@ -1,0 +1,109 @@
+"""The API, the client and the command line over the real service, on a stepped loop with a simulated drive.
+
+Virtual time runs as fast as it can while the clients think, so the lease is a long one.
+"""
+
+import asyncio
+import math
+from collections.abc import Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from support.service import Service, play, stepped_service
+
+from hdbridge import Client, InputError, LeaseError, RefusedError
+from hdbridge.client import messages
+from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.api.policy import Policy
+from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.api.sockets import unix_socket
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    with stepped_service(tmp_path_factory.mktemp("service"), lease_s=3600.0) as made:
+        yield made
+
+
+@asynccontextmanager
+async def served(service: Service):
+    path = service.folder / "cell.sock"
+    metrics = Metrics()
+    async with service.ready(simulated=True) as bridge:
+        bridge.core.observer.add(metrics)
+        server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
+        serving = asyncio.ensure_future(server.run())
+        try:
+            yield path
+        finally:
+            server.stop()
+            await serving
+
+
+def with_client(service: Service, use: Callable[[Client], None]) -> None:
+    """Run a client's program in a thread, as if in another process."""
+
+    async def story() -> None:
+        async with served(service) as path:
+
+            def program() -> None:
+                with Client(path, name="test", timeout_s=60.0) as client:
+                    use(client)
+
+            await asyncio.to_thread(program)
+
+    play(story())
+
+
+def test_a_client_lives_a_day(service):
+    def day(client: Client) -> None:
+        axis = client.axis("axis1")
+        assert axis.state().state is messages.ControlState.DISABLED
+        with pytest.raises(RefusedError):
+            axis.move(5)
+        axis.enable()
+        there = axis.move(5)
+        assert there.at_rest
+        assert abs(there.error_arcsec) < 60
+        with client.lease(), Client(client.address.socket, name="another") as other:
+            with pytest.raises(LeaseError, match="'test'"):
+                other.axis("axis1").move(6)
+            other.axis("axis1").stop()
+        with pytest.raises(InputError):
+            axis.move(1e6)
+        assert axis.queue([6.0, messages.QueueItem(target_deg=5.5)]).load_target_deg == pytest.approx(5.5)
+        axis.compensate("both")
+        assert axis.state().scheme is messages.Scheme.BOTH
+        assert axis.read("6041h").type == "uint16"
+        client.mark("tea")
+        assert "tea" in [each.text for each in client.events().events]
+        axis.quick_stop()
+        stopped = axis.state()
+        assert stopped.state is messages.ControlState.QUICK_STOPPED
+        assert axis.reset().state is messages.ControlState.DISABLED
+        axis.enable()
+        assert axis.disable().power is messages.PowerState.SWITCH_ON_DISABLED
+
+    with_client(service, day)
+
+
+def test_a_path_is_streamed_and_seen_in_the_samples(service):
+    def stream(client: Client) -> None:
+        axis = client.axis("axis1")
+        axis.enable()
+        begin_deg = axis.state().load_target_deg
+        duration_s, depth_deg = 2.0, 0.5
+
+        def at(time_s: float) -> tuple[float, float, float]:
+            phase = math.tau * time_s / duration_s
+            position_deg = begin_deg + depth_deg * (1 - math.cos(phase))
+            return time_s, position_deg, depth_deg * math.tau / duration_s * math.sin(phase)
+
+        with axis.stream(timeout_s=5.0) as points:
+            points.put(at(0.02 * number) for number in range(101))
+        assert axis.rest().load_target_deg == pytest.approx(begin_deg, abs=1e-3)
+        samples = next(iter(client.live(axes=["axis1"])))
+        assert samples.axes["axis1"].load_target_deg[-1] == pytest.approx(begin_deg, abs=1e-3)
+        axis.disable()
+
+    with_client(service, stream)
