@@ -210,7 +210,7 @@ def refused(line: str) -> str | None:
         word = rest.pop(0)
         if word in {"--help", "-h"}:
             return None
-        if not word.startswith("-"):
+        if not word.startswith("-") or re.fullmatch(r"-\d+(\.\d+)?", word):
             given += 1
         elif word not in options:
             return f"no option {word}: {line}"

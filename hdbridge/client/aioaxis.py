@@ -112,7 +112,7 @@ class AsyncAxis:
         while True:
             found = await self.state()
             if found.fault is not None:
-                raise SafetyStop(f"axis '{self.name}': {found.fault.text}; {found.fault.hint}")
+                raise SafetyStop(f"axis '{self.name}': {found.fault}")
             if found.at_rest and found.queued == 0 and found.mode == "hold":
                 return found
             await asyncio.sleep(POLL_S)

@@ -114,7 +114,7 @@ class Axis:
         while True:
             found = self.state()
             if found.fault is not None:
-                raise SafetyStop(f"axis '{self.name}': {found.fault.text}; {found.fault.hint}")
+                raise SafetyStop(f"axis '{self.name}': {found.fault}")
             if found.at_rest and found.queued == 0 and found.mode == "hold":
                 return found
             time.sleep(POLL_S)

@@ -94,7 +94,7 @@ def tell(state: AxisState, json_file: Path | None) -> None:
 def concerns(state: AxisState) -> Iterator[str]:
     """What a person should know of an axis, a line each."""
     if state.fault is not None:
-        yield f"axis '{state.name}' stopped: {state.fault.text}; {state.fault.hint}"
+        yield f"axis '{state.name}' stopped: {state.fault}"
     if state.adaptation.frozen is not None:
         yield f"axis '{state.name}' does not adapt: {state.adaptation.frozen}"
     for each in state.advice:

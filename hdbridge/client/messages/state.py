@@ -31,6 +31,10 @@ class Fault(Report):
         False, description="the reset boots and verifies the drive again before it releases the latch"
     )
 
+    def __str__(self) -> str:
+        """What happened and what to do, each once: the supervision's own words end with the hint."""
+        return self.text if self.text.endswith(self.hint) else f"{self.text}; {self.hint}"
+
 
 class Limits(Report):
     """What the axis may do, at the load."""

@@ -14,6 +14,7 @@ from hdbridge.daemon.api.routes.parts import (
     kept,
     port,
     refusals,
+    stopped,
 )
 from hdbridge.daemon.service.interface import Bridge, WayPoint
 from hdbridge.evaluation.stepping import Scheme
@@ -61,6 +62,7 @@ def _add_power(routes: APIRouter, bridge: Bridge) -> None:
         """Stop as fast as the drive can, latched until a reset. Needs no lease."""
         found = port(bridge, axis)
         await found.quick_stop()
+        await stopped(found)
         return found.state()
 
     @routes.post("/stop", tags=["Stop"], responses=refusals(STOPPING))

@@ -18,6 +18,7 @@ from hdbridge.daemon.api.routes.parts import (
     kept,
     port,
     refusals,
+    stopped,
 )
 from hdbridge.daemon.service.interface import Bridge
 
@@ -89,6 +90,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
     async def quick_stop_all() -> messages.MachineState:
         """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
         await bridge.quick_stop()
+        await stopped(*bridge.axes.values())
         return bridge.state()
 
     @routes.post("/stop", tags=["Stop"], responses=refusals(tuple(each for each in STOPPING if each != 404)))

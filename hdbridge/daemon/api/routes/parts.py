@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, TypeVar
 
 from fastapi import Header, Path, Request
 
-from hdbridge.client.messages import Problem
+from hdbridge.client.messages import ControlState, Problem
 from hdbridge.daemon.api.problems import UnknownError
 from hdbridge.daemon.service.interface import AxisPort, Bridge
 from hdbridge.errors import LeaseError
@@ -16,6 +16,10 @@ from hdbridge.errors import LeaseError
 T = TypeVar("T")
 RENEWALS: Final = 3
 """How often a lease is renewed within its time-out while a request of its holder is waited for."""
+
+STOP_LOOKS: Final = 25
+STOP_LOOK_S: Final = 0.01
+_ON: Final = frozenset({ControlState.ENABLING, ControlState.ENABLED, ControlState.STOPPING})
 
 Holder = Annotated[
     str,
@@ -54,6 +58,14 @@ def port(bridge: Bridge, axis: str) -> AxisPort:
     if found is None:
         raise UnknownError(f"there is no axis {axis[:80]!a}; expected one of: {', '.join(bridge.axes)}")
     return found
+
+
+async def stopped(*axes: AxisPort) -> None:
+    """Wait for a quick stop to show in the axes' states, for a moment: their samples come in batches."""
+    for _ in range(STOP_LOOKS):
+        if all(each.state().state not in _ON for each in axes):
+            return
+        await asyncio.sleep(STOP_LOOK_S)
 
 
 async def kept(bridge: Bridge, holder: str, request: Request, motion: Awaitable[T]) -> T:

@@ -1,0 +1,22 @@
+"""The examples of docs/daemon-api.md, each run as it stands against a served machine."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "daemon-api.md"
+EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("number", range(len(EXAMPLES)))
+def test_an_example_runs(number, api, monkeypatch, capsys):
+    monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
+    exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), {"__name__": "__main__"})
+    assert not api.bridge.state().lease.held
+    told = capsys.readouterr().out
+    assert bool(told) == ("print(" in EXAMPLES[number])
+
+
+def test_there_are_examples():
+    assert len(EXAMPLES) >= 4
