@@ -49,6 +49,12 @@ def run(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    page: Annotated[
+        bool, typer.Option("--page", help="Show the live page to this machine; its address is printed.")
+    ] = False,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65_535, help="With --page: at this port; 0: any.")
+    ] = 8402,
     force: ForceOption = False,
 ) -> None:
     """Hold the drives of a machine, day and night, and take load angles from clients.
@@ -74,7 +80,8 @@ def run(
     simulation = _simulation(held, truth or [], seed, speed) if simulate else None
     if simulation is None:
         _check_real(held, truth or [], speed)
-    raise typer.Exit(hold(held, simulation, force=force, log=LogSettings(*eventlog.handed_over())))
+    log = LogSettings(*eventlog.handed_over())
+    raise typer.Exit(hold(held, simulation, force=force, page=port if page else None, log=log))
 
 
 def _simulation(machine: Machine, truths: list[Path], seed: int, speed: float) -> Simulation:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import secrets
+import socket
+import sys
 from contextlib import ExitStack
 
 from hdbridge.daemon.api.sockets import check_exposure, tcp_socket, unix_socket
@@ -21,10 +24,13 @@ def hold(
     simulation: Simulation | None = None,
     *,
     force: bool = False,
+    page: int | None = None,
     log: LogSettings | None = None,
 ) -> int:
     """Run the daemon of a machine in this process until a signal ends it; the exit status.
 
+    ``page`` is a port at which this machine alone reaches the live page, 0 takes any: the address is told on
+    standard error, with a token that is made for this run; a machine with an ``api.tcp`` has its page there.
     ``force`` goes on where another process of this machine masters the interface, or another master is heard.
     InputError, BusError and DaemonError where it cannot begin; then nothing was sent.
     """
@@ -41,8 +47,22 @@ def hold(
         if (tcp := machine.api.tcp) is not None:
             check_exposure(tcp.host, tls=tcp.certificate is not None, unencrypted=tcp.unencrypted)
             listeners.append(stack.enter_context(tcp_socket(tcp.host, tcp.port)))
+        token = None
+        if page is not None and tcp is None:
+            token = secrets.token_urlsafe(32)
+            listeners.append(stack.enter_context(tcp_socket("127.0.0.1", page)))
+        if page is not None:
+            _tell_page(listeners[-1], token, tls=tcp is not None and tcp.certificate is not None)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
         start = Start(
-            machine, memory.fd, os.getpid(), simulation=simulation, force=force, runtime=folder, log=log
-        )
+            machine, memory.fd, os.getpid(), simulation=simulation, force=force, runtime=folder,
+            page_token=token, log=log,
+        )  # fmt: skip
         return Keeper(start, memory, listeners, Notifier.of_environment()).run()
+
+
+def _tell_page(listener: socket.socket, token: str | None, *, tls: bool) -> None:
+    """For the person at the terminal; the token of a run is nothing for a log."""
+    host, port, *_ = listener.getsockname()
+    address = f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}/"
+    print(f"page: {address}{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

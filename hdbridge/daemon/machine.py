@@ -115,13 +115,25 @@ class Machine:
         """
         if self.recorder.folder is not None:
             return self.beside(self.recorder.folder)
-        given = environment.get("STATE_DIRECTORY", "").split(":")[0]
-        if given:
-            return Path(given) / "recordings"
-        if os.access(self.folder, os.W_OK) and not self.folder.is_relative_to(bundled_folder("profiles")):
-            return (self.folder / "recordings" / "daemon").absolute()
+        if _given(environment) is not None or not _writable(self.folder):
+            return self.state_folder(environment) / "recordings"
+        return (self.folder / "recordings" / "daemon").absolute()
+
+    def axis_folder(self, axis: Axis, name: str, environment: Mapping[str, str] = os.environ) -> Path:
+        """A folder for what is kept of an axis: in its profile's, or where that cannot be written in the
+        state folder.
+        """
+        if _writable(axis.profile.folder):
+            return axis.profile.folder / name
+        return self.state_folder(environment) / axis.name / name
+
+    def state_folder(self, environment: Mapping[str, str] = os.environ) -> Path:
+        """That which the service manager gives, else one of the user's."""
+        given = _given(environment)
+        if given is not None:
+            return given
         state = environment.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        return Path(state) / "hdbridge" / self.name / "recordings"
+        return Path(state) / "hdbridge" / self.name
 
     def beside(self, text: str) -> Path:
         """A path as the machine file has it, relative to that file, made absolute."""
@@ -214,6 +226,17 @@ def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
     axis = Axis(config, _absolute(profile), entry.compensation, adaptation, entry.load_loop)
     axis.model()
     return axis
+
+
+def _given(environment: Mapping[str, str]) -> Path | None:
+    """The state folder that the service manager has made."""
+    text = environment.get("STATE_DIRECTORY", "").split(":")[0]
+    return Path(text) if text else None
+
+
+def _writable(folder: Path) -> bool:
+    """Whether something may be kept in a folder: not among what comes with hdbridge."""
+    return os.access(folder, os.W_OK) and not folder.is_relative_to(bundled_folder("profiles"))
 
 
 def _absolute(profile: Profile) -> Profile:

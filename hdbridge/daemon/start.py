@@ -52,6 +52,8 @@ class Start:
     """The runtime folder."""
     api_fds: tuple[int, ...] = ()
     """Listening sockets, the Unix one first; the service's."""
+    page_token: str | None = None
+    """What the page on the last of them asks for; None: no page was asked for."""
     restarts: int = 0
     """How many processes of this kind there were before."""
     log: LogSettings = LogSettings()

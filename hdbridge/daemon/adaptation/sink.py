@@ -88,8 +88,10 @@ class AdaptationSink:
         axes: Sequence[Followed],
         propose: Callable[[int, Proposal], None],
         writer: Executor | None = None,
+        first: int = 0,
     ) -> None:
-        """``propose`` is called with an axis's index and another model; it must not block.
+        """``propose`` is called with an axis's index and another model; it must not block. ``first`` is the
+        place of the first axis in a sample; the others come after it.
 
         What `Proposal.apply` is not set for is only reported. Files are written in ``writer``, in which
         one thread does them in order; without it at once.
@@ -99,6 +101,7 @@ class AdaptationSink:
         """Why state or history could not be written last; empty when they could."""
         self._propose = propose
         self._writer = writer
+        self._first = first
         self._time_s = 0.0
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
@@ -113,7 +116,7 @@ class AdaptationSink:
         for place, each in enumerate(self.axes):
             judgement = each.judgement()
             disbelieved = "" if judgement.believed else judgement.why
-            proposal = each.adaptation.take(times_s, samples["axes"][:, place], disbelieved)
+            proposal = each.adaptation.take(times_s, samples["axes"][:, self._first + place], disbelieved)
             if proposal is not None:
                 self._tell(place, proposal)
             self._keep(each, self._time_s - each.saved_s >= SAVE_S)

@@ -108,6 +108,10 @@ class AxisModels:
         """Ready for the control process."""
         return Choice(in_use, pickle.dumps(in_use.compensation(self._axis)))
 
+    def moved(self, model: TransmissionModel) -> Choice:
+        """What is in use, with other parameters; ``model`` is the part of it that compensates."""
+        return Choice(self.in_use, pickle.dumps(compensation_for(self._axis.config, model)))
+
     def taken(self, choice: Choice) -> None:
         """The control process has it."""
         self.in_use = choice.in_use

@@ -26,6 +26,7 @@ from hdbridge.evaluation.stepping import Scheme
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.service.core import Core
+    from hdbridge.model import TransmissionModel
 
 CHANGE_S: Final = 120.0
 """By then another compensation has been faded in, however slow its ramp."""
@@ -228,6 +229,11 @@ class ServiceAxis:
         """Have the control process compensate by what is in use, whatever it did meanwhile."""
         async with self._changing:
             await self.change(await self.core.timing.work(self.models.made, self.models.in_use))
+
+    async def follow(self, model: TransmissionModel) -> None:
+        """Compensate by the model in use as its parameters were moved; what is in use keeps its name."""
+        async with self._changing:
+            await self.change(await self.core.timing.work(self.models.moved, model))
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         """The slow integral of the measured error on or off."""

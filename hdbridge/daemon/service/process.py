@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from typing import Final
 
@@ -21,8 +22,11 @@ from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.journal import Journal
+from hdbridge.daemon.service.observer import Sink
+from hdbridge.daemon.service.recording import Recording
 from hdbridge.daemon.service.timing import RealTiming
 from hdbridge.daemon.start import Start, begin_child
 from hdbridge.errors import HdbridgeError
@@ -30,6 +34,8 @@ from hdbridge.errors import HdbridgeError
 THREADS_PER_AXIS: Final = 2
 """An axis may be verified while another of its requests blocks."""
 SPARE_THREADS: Final = 4
+FOLLOW_S: Final = 1.0
+"""How often is looked whether an adaptation proposes another model."""
 LAST_WORDS_S: Final = 35.0
 """How long is waited for the control process to bring its axes to rest, so that it is recorded."""
 
@@ -57,27 +63,59 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, runtime=start.runtime, simulated=start.simulation is not None
-        )
+            machine, memory, timing, runtime=start.runtime, simulated=start.simulation is not None,
+            recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
+        )  # fmt: skip
         metrics = Metrics()
-        for sink in (Journal([axis.name for axis in machine.axes]), metrics):
+        recording = Recording(machine, bridge)
+        stack.callback(recording.close)
+        adapting = _adaptations(machine, bridge, stack)
+        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, *adapting]
+        for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)
-        server = ApiServer(bridge, listeners(machine, start.api_fds), metrics)
+        server = ApiServer(bridge, listeners(machine, start.api_fds, start.page_token), metrics)
         async with asyncio.TaskGroup() as group:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
+            following = group.create_task(_follow(adapting))
             await told.wait()
             await _last_words(bridge, memory)
+            following.cancel()
             server.stop()
 
 
-def listeners(machine: Machine, descriptors: Sequence[int]) -> list[Listener]:
-    """What the keeper has opened: the Unix socket, then the TCP port where the machine has one."""
+def _adaptations(machine: Machine, bridge: ServiceBridge, stack: AsyncExitStack) -> list[Adapting]:
+    """One per axis, known to the bridge; their files are written in a thread of their own."""
+    writer = ThreadPoolExecutor(1, thread_name_prefix="adaptation")
+    stack.callback(writer.shutdown)
+    made = []
+    for place, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
+        given = axis.adaptation.folder
+        folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
+        adapting = Adapting(place, port, axis.adaptation, folder, writer)
+        bridge.adaptations[axis.name] = adapting
+        stack.callback(adapting.close)
+        made.append(adapting)
+    return made
+
+
+async def _follow(adapting: Sequence[Adapting]) -> None:
+    """Have the control process compensate by what the adaptations propose."""
+    while True:
+        for each in adapting:
+            await each.follow()
+        await asyncio.sleep(FOLLOW_S)
+
+
+def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:
+    """What the keeper has opened: the Unix socket, and a TCP port for the machine's clients or the page."""
     unix, *others = [socket.socket(fileno=each) for each in descriptors]
     made = [Listener(unix, Policy())]
     tcp = machine.api.tcp
-    if tcp is not None and others:
+    if page_token is not None:
+        made.append(Listener(others[0], Policy(page_token)))
+    elif tcp is not None:
         token = machine.beside(tcp.token_file).read_text(encoding="ascii").strip()
         policy = Policy(token, frozenset(each.lower() for each in tcp.names))
         pem = [machine.beside(each) if each is not None else None for each in (tcp.certificate, tcp.key)]

@@ -10,13 +10,15 @@ import sys
 import time
 from pathlib import Path
 
+import httpx
 import pytest
 from support.running import gone, running
 
 
 def test_a_day_in_short(tmp_path: Path) -> None:
     """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
-    with running(tmp_path, "article", "--simulate", "--speed", 4, name="article") as daemon:
+    arguments = ("article", "--simulate", "--speed", 4, "--page", "--port", 0)
+    with running(tmp_path, *arguments, name="article") as daemon:
         daemon.until_told("READY=1")
         state = daemon.state()
         assert state is not None  # it answers at once
@@ -27,9 +29,18 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         assert second.returncode == 7
         assert "another daemon listens there" in second.stderr
 
+        page, token = next(each for each in daemon.names() if each.startswith("page: ")).split("#token=")
+        state_of = page.removeprefix("page: ") + "api/v1/state"
+        assert httpx.get(page.removeprefix("page: ")).status_code == 200
+        assert httpx.get(state_of).status_code == 401
+        assert httpx.get(state_of, headers={"Authorization": f"Bearer {token}"}).status_code == 200
+
         daemon.until_axis("disabled")
         daemon.ask("enable")
         daemon.ask("move", target_deg=3.0)
+        assert daemon.ask("adaptation", mode="observe").json()["adaptation"]["mode"] == "observe"
+        recorder = (daemon.state() or {})["recorder"]
+        assert recorder["on"]
         assert daemon.axis()["load_target_deg"] == pytest.approx(3.0, abs=1e-9)
 
         (control,), (service,) = daemon.pids("control"), daemon.pids("service")
@@ -50,14 +61,24 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         daemon.process.send_signal(signal.SIGHUP)
         assert daemon.ended() == 0
         assert not daemon.socket.exists()
+        assert len(list(Path(recorder["folder"]).glob("*.mcap"))) == 2  # one of each service
         assert all(gone(pid) for pid in (*daemon.pids("control"), *daemon.pids("service")))
 
 
-def test_without_its_keeper_it_stops_the_axes_and_ends(tmp_path: Path) -> None:
-    with running(tmp_path, "article", "--simulate", name="article") as daemon:
+def test_without_room_on_the_disk_and_then_without_its_keeper(tmp_path: Path) -> None:
+    """It says that nothing is recorded, and works; then it stops the axes and ends."""
+    (tmp_path / "machine.yaml").write_text(
+        "schema: hdbridge.machine/1\nname: full\naxes: [{profile: article}]\nrecorder: {free_mb: 1e7}\n",
+        encoding="utf-8",
+    )
+    with running(tmp_path, tmp_path, "--simulate", name="full") as daemon:
         daemon.until_told("READY=1")
         daemon.until_axis("disabled")
         daemon.ask("enable")
+        recorder = daemon.until(
+            lambda: (found := (daemon.state() or {}).get("recorder", {})).get("dropped") and found, "dropped"
+        )
+        assert recorder["note"]
         daemon.ask("move", target_deg=90.0, wait=False)
         daemon.process.kill()
         daemon.process.wait()

@@ -1,0 +1,137 @@
+"""The adaptation of one axis behind the service: the model in use, moved as the load encoder says.
+
+What is in use stays the committed model, by its version; the control process compensates by it as it was
+moved. When another one is committed, or another part of it compensates, the adaptation begins anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from datetime import UTC, datetime
+from pathlib import Path
+
+from hdbridge.client import messages
+from hdbridge.daemon.adaptation.proposal import Proposal
+from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.adaptation.sink import AdaptationSink, followed
+from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.service.models import InUse
+from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.daemon.watch.encoder_health import EncoderHealth
+from hdbridge.errors import HdbridgeError
+from hdbridge.model import TransmissionModel
+
+_log = logging.getLogger(__name__)
+
+
+class Adapting:
+    """A sink of the observer, and what the bridge calls an adaptation."""
+
+    def __init__(
+        self, place: int, axis: ServiceAxis, settings: AdaptationSettings, folder: Path, writer: Executor
+    ) -> None:
+        """``place`` is the axis's index in a sample, ``folder`` where its state and history are kept."""
+        self._place, self._axis = place, axis
+        self._settings, self._folder, self._writer = settings, folder, writer
+        self._of: InUse | None = None
+        self._sink: AdaptationSink | None = None
+        self._health: EncoderHealth | None = None
+        self._committed: TransmissionModel | None = None
+        """The part of the model in use that compensates, as a new control process has it."""
+        self._applied: TransmissionModel | None = None
+        """What the control process compensates by."""
+        self._loop_pid = 0
+        self._problem = ""
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer."""
+        if self._axis.models.in_use is not self._of:
+            self._begin(self._axis.models.in_use)
+        if self._sink is None or self._health is None:
+            return
+        if len(samples):
+            self._health.take(samples)
+        self._sink.take(samples, events, lost)
+
+    def state(self) -> messages.AdaptationState:
+        """What clients are told."""
+        if self._sink is None:
+            return messages.AdaptationState(
+                mode=messages.AdaptationMode(self._settings.mode), frozen=self._problem or None
+            )
+        return self._sink.state(0)
+
+    async def set_mode(self, mode: messages.AdaptationMode) -> None:
+        """Another mode from here on."""
+        self._settings = self._settings.model_copy(update={"mode": mode.value})
+        if self._sink is None:
+            self._of = None  # begins with the next samples
+        else:
+            self._sink.adapt(0, mode.value)
+
+    async def back(self) -> None:
+        """Back to the committed model, and observe only."""
+        if self._sink is not None:
+            self._sink.back(0)
+            await self.follow()
+
+    async def follow(self) -> None:
+        """Have the control process compensate by the model as it was moved, where it does not yet."""
+        pid = self._axis.core.memory.status.loop_pid
+        if pid != self._loop_pid:  # a new one compensates by the committed model
+            self._loop_pid, self._applied = pid, self._committed
+        if self._sink is None:
+            return
+        model = self._sink.axes[0].adaptation.model
+        if model == self._applied:
+            return
+        try:
+            await self._axis.follow(model)
+        except HdbridgeError as problem:  # not in this state; it is tried again
+            if str(problem) != self._problem:
+                _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
+            self._problem = str(problem)
+        else:
+            self._applied, self._problem = model, ""
+            _log.info("adaptation applied", {"axis": self._axis.name})
+
+    def close(self) -> None:
+        """Keep what was learnt last."""
+        if self._sink is not None:
+            self._sink.close()
+
+    def _begin(self, in_use: InUse) -> None:
+        """Follow another model from here on."""
+        self.close()
+        self._of, self._sink, self._health, self._problem = in_use, None, None, ""
+        if self._settings.mode == "off":
+            return
+        model = in_use.scheme.of(in_use.model)
+        config = self._axis.axis.config
+        if not model.effects:
+            self._problem = "there is no model to follow: calibrate first"
+            return
+        health = EncoderHealth(config, model, self._place)
+        try:
+            one = followed(
+                config,
+                model,
+                self._settings,
+                self._folder,
+                lambda: datetime.now(UTC),
+                lambda: health.judgement,
+            )
+        except HdbridgeError as problem:
+            self._problem = str(problem)
+            _log.warning("no adaptation", {"axis": self._axis.name, "why": str(problem)})
+            return
+        self._health = health
+        self._sink = AdaptationSink([one], self._proposed, self._writer, first=self._place)
+        self._committed = self._applied = model
+
+    def _proposed(self, _place: int, proposal: Proposal) -> None:
+        told = {each.parameter: round(each.after, 4) for each in proposal.changes}
+        event = "adaptation" if proposal.apply else "adaptation would change"
+        _log.info(event, {"axis": self._axis.name, **told})

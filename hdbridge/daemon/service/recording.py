@@ -1,0 +1,70 @@
+"""The flight recorder behind the service: what it is told of models and remarks, and what it says."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from hdbridge.client import messages
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.models import InUse
+
+_log = logging.getLogger(__name__)
+
+
+class Recording:
+    """A sink of the observer. Without a folder that can be made it records nothing, and says so."""
+
+    def __init__(self, machine: Machine, bridge: ServiceBridge) -> None:
+        """It is known to the bridge from now on, as its recorder and for its remarks."""
+        self._folder = machine.recorder_folder()
+        self._bridge = bridge
+        self._note: str | None = None
+        self._recorder: FlightRecorder | None = None
+        self._told: dict[str, InUse] = {}
+        about = About.of(
+            machine.name, tuple(AxisAbout.of(axis.config) for axis in machine.axes), machine.cycle_s
+        )
+        try:
+            self._recorder = FlightRecorder(self._folder, about, machine.recorder, tell=self._tell)
+        except OSError as problem:
+            self._tell(f"{self._folder}: cannot be made: {problem.strerror}; nothing is recorded")
+        else:
+            bridge.marks.append(self._recorder.mark)
+        bridge.recorder = self.state
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer."""
+        if self._recorder is None:
+            return
+        for name, axis in self._bridge.axes.items():
+            in_use = axis.models.in_use
+            if self._told.get(name) is not in_use:
+                self._told[name] = in_use
+                version = str(in_use.version) if in_use.version is not None else ""
+                self._recorder.use_model(name, in_use.scheme.of(in_use.model).dump(), version)
+        self._recorder.take(samples, events, lost)
+
+    def state(self) -> messages.RecorderState:
+        """What clients are told."""
+        if self._recorder is None:
+            return messages.RecorderState(on=False, folder=str(self._folder), note=self._note)
+        counts = self._recorder.counts
+        return messages.RecorderState(
+            on=True, folder=str(self._folder), dropped=counts.dropped + counts.refused, note=self._note
+        )
+
+    def close(self) -> None:
+        """Finish the file; returns when it is on the disk."""
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def _tell(self, text: str) -> None:
+        """From the recorder's thread, too."""
+        self._note = text
+        self._bridge.core.log.note(text)
+        _log.warning("recorder", {"text": text})
