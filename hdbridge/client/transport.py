@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import ssl
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,11 @@ from hdbridge.errors import DaemonError, InputError
 
 
 def tls_context(address: Address, certificate: Path | str | None) -> ssl.SSLContext | None:
-    """That trusts this certificate, or the system's; None without TLS. InputError where it is none."""
+    """That trusts this certificate, that of ``$HDBRIDGE_CERTIFICATE``, or the system's; None without TLS.
+
+    InputError where it is none.
+    """
+    certificate = certificate or os.environ.get("HDBRIDGE_CERTIFICATE") or None
     if address.socket is not None or not address.url.startswith("https"):
         return None
     try:

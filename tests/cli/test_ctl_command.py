@@ -82,6 +82,14 @@ def test_status_is_a_table_for_people_and_the_state_for_machines(ctl, machine, t
     assert messages.MachineState.model_validate(raw).axes[1].fault.name == "LOST_TPDO"
 
 
+def test_the_only_axis_needs_no_name(ctl, machine):
+    assert "expected one of: joint-1, joint-2" in ctl("enable", status=2)
+    del machine.axes["joint-2"]
+    ctl("disable")
+    ctl("home", "--method", 37)
+    assert machine.moved == [("joint-1", "disable"), ("joint-1", "home", 37)]
+
+
 def test_several_angles_are_moved_to_one_after_the_other(ctl, machine, tmp_path):
     ctl("move", "joint-1", 10, 20, "--json", "stands.json")
     assert json.loads((tmp_path / "stands.json").read_text())["load_target_deg"] == 20.0

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import console, notes, write_json
-from hdbridge.errors import HdbridgeError
+from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -30,6 +30,10 @@ AtOption = Annotated[
         help="Name of the machine, socket or URL of its daemon; else HDBRIDGE_SOCKET, HDBRIDGE_URL (its "
         "token in HDBRIDGE_TOKEN), or the only one that runs here.",
     ),
+]
+OneAxisArgument = Annotated[
+    str | None,
+    typer.Argument(metavar="AXIS", help="Name of the axis; may be left out where there is one only."),
 ]
 AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
 AxesArgument = Annotated[
@@ -49,10 +53,22 @@ def connected(at: str | None) -> Client:
 
 
 @contextmanager
-def moving(at: str | None, name: str, *, force: bool = False) -> Iterator[Axis]:
-    """An axis, the right to move it, and Ctrl-C (and what else ends a command) that stops it."""
-    with connected(at) as client, client.lease(force=force), stopped_by_signals(client, name):
-        yield client.axis(name)
+def moving(at: str | None, name: str | None, *, force: bool = False) -> Iterator[Axis]:
+    """An axis, the right to move it, and Ctrl-C (and what else ends a command) that stops it.
+
+    Without a name it is the only one; InputError where there are several.
+    """
+    with connected(at) as client:
+        name = name or _only(client)
+        with client.lease(force=force), stopped_by_signals(client, name):
+            yield client.axis(name)
+
+
+def _only(client: Client) -> str:
+    names = list(client.axes)
+    if len(names) != 1:
+        raise InputError(f"AXIS: is missing; expected one of: {', '.join(names)}")
+    return names[0]
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from hdbridge.cli.ctl.common import (
     AtOption,
     AxesArgument,
     AxisArgument,
+    OneAxisArgument,
     TakeOption,
     connected,
     moving,
@@ -29,7 +30,7 @@ AccelerationOption = Annotated[
 
 
 def enable(
-    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
 ) -> None:
     """Switch power on, standing still; the drive is booted and verified first where it is not."""
     with moving(at, axis, force=force) as moved:
@@ -37,7 +38,7 @@ def enable(
 
 
 def disable(
-    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
 ) -> None:
     """Brake to rest, then switch power off. What hangs on the axis needs a brake."""
     with moving(at, axis, force=force) as moved:
@@ -45,7 +46,7 @@ def disable(
 
 
 def reset(
-    axis: AxisArgument, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
+    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
 ) -> None:
     """Release a latched stop when its cause is gone; the axis stays disabled."""
     with moving(at, axis, force=force) as moved:
@@ -53,11 +54,11 @@ def reset(
 
 
 def home(
-    axis: AxisArgument,
     method: Annotated[
         int,
         typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual."),
     ],
+    axis: OneAxisArgument = None,
     switch_velocity_deg_s: Annotated[
         float | None,
         typer.Option("--switch-velocity", min=1e-6, help="Towards the switch, deg/s at the load."),

@@ -105,7 +105,7 @@ class Compensate(Request):
 class SwitchLoadLoop(Request):
     """Switch the slow integral of the measured error on or off, where the machine file has one."""
 
-    on: bool = Field(strict=True)
+    on: bool = Field(strict=True, description="on, or off", examples=[True])
 
 
 class ActivateModel(Request):

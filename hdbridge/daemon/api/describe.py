@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from functools import cache
 from importlib.resources import files
 from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 Schema = dict[str, Any]
 _METHODS: Final = ("get", "post", "put", "delete")
@@ -28,7 +30,11 @@ def page(schema: Schema) -> str:
     sections = [
         (tag, [each for each in _operations(schema) if each["tag"] == tag["name"]]) for tag in schema["tags"]
     ]
-    return str(_template().render(info=schema["info"], sections=sections, style=_style()))
+    answers = [
+        {"name": name, "about": each.get("description", ""), "fields": _fields(schema, each)}
+        for name, each in sorted(_answered(schema).items())
+    ]
+    return str(_template().render(info=schema["info"], sections=sections, answers=answers, style=_style()))
 
 
 @cache
@@ -41,7 +47,36 @@ def _template() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["words"] = _words
     return environment.get_template("docs.html.j2")
+
+
+def _words(text: str) -> Markup:
+    """Text in which what stands between backticks is code."""
+    parts = text.split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if place % 2 else escape(part)
+        for place, part in enumerate(parts)
+    )
+
+
+def _answered(schema: Schema) -> dict[str, Schema]:
+    """The types that answers are made of; those of requests stand with their request."""
+    asked = {
+        _type(each["requestBody"]["content"]["application/json"]["schema"])
+        for methods in schema["paths"].values()
+        for each in methods.values()
+        if "requestBody" in each
+    }
+    kinds: dict[str, Schema] = schema["components"]["schemas"]
+    return {name: each for name, each in kinds.items() if "properties" in each and name not in asked}
+
+
+def _fields(schema: Schema, model: Schema) -> list[Schema]:
+    return [
+        _field(schema, name, each, required=name in model.get("required", ()))
+        for name, each in model["properties"].items()
+    ]
 
 
 @cache
@@ -65,6 +100,7 @@ def _operation(schema: Schema, path: str, method: str, given: Schema) -> Schema:
     parameters = given.get("parameters", [])
     leased = any(each["name"] == "X-Lease" for each in parameters)
     answer = next(each for status, each in given["responses"].items() if status < "300")
+    answered = answer["content"]["application/json"]["schema"]
     return {
         "tag": given["tags"][0],
         "id": given["operationId"],
@@ -73,17 +109,18 @@ def _operation(schema: Schema, path: str, method: str, given: Schema) -> Schema:
         "about": given.get("description", given["summary"]),
         "leased": leased,
         "parameters": [
-            _field(schema, each["name"], {**each["schema"], "description": each.get("description", "")})
+            _field(
+                schema,
+                each["name"],
+                {**each["schema"], "description": each.get("description", "")},
+                required=each.get("required", False),
+            )
             for each in parameters
             if each["name"] != "X-Lease"
         ],
-        "fields": [
-            _field(schema, name, each, required=name in model.get("required", ()))
-            for name, each in (model or {}).get("properties", {}).items()
-        ]
-        if model
-        else [],
-        "answer": _type(answer.get("content", {}).get("application/json", {}).get("schema", {})),
+        "fields": _fields(schema, model) if model else [],
+        "answer": _type(answered),
+        "answers": _type(answered.get("items", answered)),
         "errors": [
             (status, each["description"]) for status, each in given["responses"].items() if status >= "400"
         ],
@@ -95,7 +132,7 @@ def _field(schema: Schema, name: str, given: Schema, *, required: bool = True) -
     bounds = []
     for each in (given, *given.get("anyOf", ())):
         resolved = _resolved(schema, each)
-        bounds += [words.format(f"{resolved[key]:g}") for key, words in _BOUNDS if key in resolved]
+        bounds += [words.format(f"{resolved[key]:.16g}") for key, words in _BOUNDS if key in resolved]
     default = "" if required or given.get("default") is None else json.dumps(given["default"])
     return {
         "name": name,
@@ -145,10 +182,9 @@ def _example(model: Schema) -> Any:
 
 def _curl(method: str, path: str, example: Any, *, leased: bool) -> str:
     words = ["curl", "--unix-socket", "$HDBRIDGE_SOCKET"]
-    words += ["-X", method] if method != "GET" else []
+    words += ["-X", method] if method != ("GET" if example is None else "POST") else []
     words += ["-H", '"X-Lease: $LEASE"'] if leased else []
     if example is not None:
         words += ["--json", shlex.quote(json.dumps(example))]
-    words.append("http://localhost" + path.replace("{", "").replace("}", "").replace("axis", "AXIS", 1)
-                 if "{axis}" in path else f"http://localhost{path}")  # fmt: skip
-    return " ".join(words)
+    address = re.sub(r"\{(\w+)\}", lambda name: name[1].upper(), path)
+    return " ".join([*words, f"http://localhost{address}"])

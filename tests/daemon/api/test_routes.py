@@ -1,6 +1,7 @@
 """What each route asks of the machine, and how it answers."""
 
 import json
+import re
 
 import pytest
 
@@ -231,6 +232,9 @@ def test_the_page_of_the_api_has_every_operation_and_fetches_nothing(leased):
         for operation in methods.values():
             assert operation["description"], path
             assert f'id="{operation["operationId"]}"' in page.text
+    links = re.findall(r'href="#([^"]+)"', page.text)
+    assert set(links) <= set(re.findall(r'id="([^"]+)"', page.text))
+    assert "http://localhost/api/v1/axes/AXIS/move" in page.text
     assert "https:" not in page.text
     assert "<script" not in page.text
 
