@@ -1,7 +1,7 @@
 """The daemon's log: an event per line, as JSON or, on a terminal, in words; the same event not too often.
 
 Each process logs for itself to what it was given: standard error, which under systemd is the journal, and
-with ``--log`` a file. The control process logs nothing while it runs.
+with ``--log`` a file. The control process logs how it begins, and nothing while it turns.
 """
 
 from __future__ import annotations
@@ -88,3 +88,14 @@ def begin_log(settings: LogSettings) -> None:
         file.addFilter(RateLimit())
         _ROOT.addHandler(file)
     _ROOT.setLevel(logging.DEBUG)
+
+
+def log_once(settings: LogSettings, where: str, event: str, facts: dict[str, object]) -> None:
+    """One event of a process that logs nothing afterwards, its library neither."""
+    before = tuple(_ROOT.handlers)
+    begin_log(settings)
+    logging.getLogger(where).info(event, facts)
+    for each in set(_ROOT.handlers) - set(before):
+        _ROOT.removeHandler(each)
+        each.close()
+    _ROOT.setLevel(logging.CRITICAL)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from hdbridge.daemon.logs import LogSettings, RateLimit, begin_log
+from hdbridge.daemon.logs import LogSettings, RateLimit, begin_log, log_once
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.notify import Notifier
 from hdbridge.daemon.patience import BackOff, Budget
@@ -141,7 +141,7 @@ def log() -> Iterator[logging.Logger]:
 def test_the_log_is_json_where_nobody_looks(
     log: logging.Logger, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    begin_log(LogSettings(verbose=1, file=tmp_path / "log"))
+    begin_log(LogSettings(file=tmp_path / "log"))
     _log.info("begun", {"axes": 2})
     _log.debug("detail", {})
     (line,) = capsys.readouterr().err.splitlines()
@@ -150,6 +150,13 @@ def test_the_log_is_json_where_nobody_looks(
     assert [json.loads(each)["event"] for each in (tmp_path / "log").read_text().splitlines()] == [
         "begun", "detail",
     ]  # fmt: skip
+
+
+def test_the_control_process_logs_once(log: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
+    log_once(LogSettings(), "hdbridge.test", "begun", {"conditions": "none"})
+    _log.error("later", {})
+    (line,) = capsys.readouterr().err.splitlines()
+    assert json.loads(line)["conditions"] == "none"
 
 
 def test_the_journal_is_told_the_priority(

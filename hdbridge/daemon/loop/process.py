@@ -1,6 +1,7 @@
 """The control process: ``python -m hdbridge.daemon.loop.process FD``, started by the keeper.
 
-It has one thread, one bus and the shared memory. It opens no files, logs nothing and does no SDO of its own.
+It has one thread, one bus and the shared memory. Once it turns, it opens no files, logs nothing and does no
+SDO of its own.
 All that takes memory is made before the first turn.
 """
 
@@ -19,6 +20,7 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
+from hdbridge.daemon.logs import log_once
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.interface import Interface, listen
@@ -70,7 +72,8 @@ def run(start: Start) -> None:
         status.set(Cell.LOOP_PID, os.getpid())
         # A simulation that is late does not sleep: it would keep everything else from its processor.
         real = interface is not None
-        with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext():
+        with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext() as conditions:
+            log_once(start.log, __name__, "control process", {"conditions": str(conditions or "simulated")})
             while not controller.ended:
                 if terminated or status.stop_asked:
                     controller.end(at_once=status.stop_asked >= AT_ONCE)
