@@ -8,7 +8,7 @@ import socket
 import sys
 from contextlib import ExitStack
 
-from hdbridge.daemon.api.sockets import check_exposure, tcp_socket, unix_socket
+from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
 from hdbridge.daemon.keeper import Keeper
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
@@ -45,7 +45,6 @@ def hold(
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
         stack.callback(path.unlink, missing_ok=True)
         if (tcp := machine.api.tcp) is not None:
-            check_exposure(tcp.host, tls=tcp.certificate is not None, unencrypted=tcp.unencrypted)
             listeners.append(stack.enter_context(tcp_socket(tcp.host, tcp.port)))
         token = None
         if page is not None and tcp is None:

@@ -8,33 +8,30 @@ nothing before the next start.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Self
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.machinechecks import Places, agreed, check_load, check_tcp, check_together
 from hdbridge.daemon.machinefile import (
     ApiSettings,
     AxisEntry,
     LimitSettings,
     LoadLoopSettings,
     MachineFile,
-    token_complaint,
 )
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import load_eds, plan
-from hdbridge.drive.busload import check_bus_load
 from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.profile import Profile
-from hdbridge.files.yamlfile import Document, Location, read_yaml
+from hdbridge.files.yamlfile import Document, read_yaml
 from hdbridge.model import TransmissionModel
-
-T = TypeVar("T")
 
 
 def machine_file(text: str) -> Path | None:
@@ -164,17 +161,17 @@ class Machine:
 
     @classmethod
     def _of(cls, file: MachineFile, path: Path, document: Document | None) -> Self:
-        places = _Places(path, document)
+        places = Places(path, document)
         axes = [_axis(file, number, places) for number in range(len(file.axes))]
-        bus = file.bus or _agreed(axes, lambda axis: axis.bus, places, "bus")
-        realtime = file.realtime or _agreed(axes, lambda axis: axis.realtime, places, "realtime")
+        bus = file.bus or agreed(axes, lambda axis: axis.bus, places, "bus")
+        realtime = file.realtime or agreed(axes, lambda axis: axis.realtime, places, "realtime")
         axes = [
             replace(axis, config=axis.config.model_copy(update={"bus": bus, "realtime": realtime}))
             for axis in axes
         ]
-        _check_together(axes, places)
-        _check_load([axis.config for axis in axes], bus, places)
-        _check_tcp(file, places)
+        check_together(axes, places)
+        check_load([axis.config for axis in axes], bus, places)
+        check_tcp(file, places)
         return cls(
             file.name, path.absolute(), tuple(axes), bus, realtime,
             file.api, file.lease_s, file.limits, file.recorder,
@@ -194,24 +191,7 @@ class Machine:
         raise InputError(f"{self.path}: no axis '{name}'; expected one of: {names}")
 
 
-class _Places:
-    """Complaints about a machine file; where there is none, about the axis file that stands for it."""
-
-    def __init__(self, path: Path, document: Document | None) -> None:
-        self._path, self._document = path, document
-        self.folder = path.parent
-
-    def error(self, at: Location, message: str) -> InputError:
-        if self._document is None:
-            return InputError(f"{self._path}: {message}")
-        return self._document.error(at, message)
-
-    def where(self, at: Location) -> str:
-        """``line 5`` of the file, for another complaint to point at."""
-        return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
-
-
-def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
+def _axis(file: MachineFile, number: int, places: Places) -> Axis:
     """Read one axis and everything that belongs to it, before any of it is needed."""
     entry = file.axes[number]
     try:
@@ -242,76 +222,3 @@ def _writable(folder: Path) -> bool:
 def _absolute(profile: Profile) -> Profile:
     """The processes of the daemon need not share a working folder with who started it."""
     return Profile(profile.axis.absolute(), profile.model.absolute(), profile.truth.absolute())
-
-
-def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Places, key: str) -> T:
-    """What all axis files say; InputError where they differ, since the machine has one of it."""
-    first = ask(axes[0].config)
-    for number, axis in enumerate(axes[1:], start=1):
-        if ask(axis.config) != first:
-            raise places.error(
-                ("axes", number, "profile"),
-                f"{axis.config.where(key)}: differs from that of '{axes[0].name}' "
-                f"({axes[0].config.where(key)}); expected the same in both, or '{key}' in the machine file",
-            )
-    return first
-
-
-def _check_together(axes: Sequence[Axis], places: _Places) -> None:
-    """One SYNC and one master for all; names and node ids that nobody else has.
-
-    Identifiers of PDOs follow from the node ids, so they are distinct as well.
-    """
-    names: dict[str, int] = {}
-    nodes: dict[int, str] = {}
-    first = axes[0].config
-    for number, axis in enumerate(axes):
-        at = ("axes", number, "profile")
-        config = axis.config
-        if (other := names.setdefault(axis.name, number)) != number:
-            raise places.error(
-                at,
-                f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
-                f"name in {config.where('name')}",
-            )
-        for key in ("cycle_ms", "master_node_id"):
-            found, expected = getattr(config.drive, key), getattr(first.drive, key)
-            if found != expected:
-                raise places.error(
-                    at,
-                    f"{config.where(f'drive.{key}')}: found {found:g}; expected {expected:g}, as of "
-                    f"'{first.name}': one master sends one SYNC to all axes",
-                )
-        for node, key in _nodes(config):
-            if (owner := nodes.setdefault(node, axis.name)) != axis.name:
-                raise places.error(
-                    at, f"{config.where(key)}: node {node} is of '{owner}' already; expected another node id"
-                )
-
-
-def _nodes(config: AxisConfig) -> Iterator[tuple[int, str]]:
-    yield config.drive.node_id, "drive.node_id"
-    if config.load_encoder.source.node is not None:
-        yield config.load_encoder.source.node, "load_encoder.source.node"
-
-
-def _check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: _Places) -> None:
-    try:
-        check_bus_load(axes, bus.bitrate_bps)
-    except InputError as problem:
-        raise places.error(("axes",), str(problem)) from None
-
-
-def _check_tcp(file: MachineFile, places: _Places) -> None:
-    """What lets clients in from the network is there, and the token is nobody else's to read."""
-    tcp = file.api.tcp
-    if tcp is None:
-        return
-    if complaint := token_complaint(places.folder / tcp.token_file):
-        raise places.error(("api", "tcp", "token_file"), complaint)
-    for key in ("certificate", "key"):
-        text: str | None = getattr(tcp, key)
-        if text is not None and not os.access(places.folder / text, os.R_OK):
-            raise places.error(
-                ("api", "tcp", key), f"{places.folder / text} cannot be read; expected a PEM file"
-            )

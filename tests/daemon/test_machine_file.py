@@ -176,6 +176,15 @@ def test_the_token_is_nobody_elses_to_read(folder: Path) -> None:
     assert "expected a token of 16 to 200" in refused(folder, text)
 
 
+def test_a_token_does_not_cross_a_network_in_the_clear(folder: Path) -> None:
+    token = folder / "token"
+    token.write_text("0123456789abcdef", encoding="ascii")
+    token.chmod(0o600)
+    text = GOOD + "api: {tcp: {host: 0.0.0.0, token_file: token}}\n"
+    assert "machine.yaml:6:19: api.tcp.host: found '0.0.0.0', which others reach" in refused(folder, text)
+    assert load(folder, text.replace("token}}", "token, unencrypted: true}}")).api.tcp is not None
+
+
 def test_what_a_person_may_call_a_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load(folder)
     monkeypatch.chdir(folder)

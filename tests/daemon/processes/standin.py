@@ -14,6 +14,11 @@ from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Start, begin_child
 
 
+def say(line: str) -> None:
+    """In one piece, whatever the other process says at the same time."""
+    os.write(1, f"{line}\n".encode())
+
+
 def main(kind: str, *arguments: str) -> int:
     start = Start.inherited(list(arguments))
     begin_child(start, f"standin-{kind}")
@@ -25,14 +30,14 @@ def main(kind: str, *arguments: str) -> int:
         status = memory.status
         time.sleep(0.05)
         status.set(Cell.LOOP_PID if kind == "control" else Cell.SERVICE_PID, os.getpid())
-        print(f"{kind} {os.getpid()} {start.restarts}", flush=True)
+        say(f"{kind} {os.getpid()} {start.restarts}")
         while not told and not (kind == "control" and status.stop_asked):
             if kind == "control":
                 status.set(Cell.LOOP_COUNT, status.loop_count + 1)
             else:
                 status.set(Cell.SERVICE_TIME_NS, time.monotonic_ns())
             time.sleep(0.02)
-        print(f"{kind} ends", flush=True)
+        say(f"{kind} ends")
     return 0
 
 

@@ -1,0 +1,115 @@
+"""What has to agree between the axes of one machine, and who is told where it does not. Opens nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.daemon.api.sockets import check_exposure
+from hdbridge.daemon.machinefile import MachineFile, token_complaint
+from hdbridge.drive.busload import check_bus_load
+from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import Document, Location
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machine import Axis
+
+T = TypeVar("T")
+
+
+class Places:
+    """Complaints about a machine file; where there is none, about the axis file that stands for it."""
+
+    def __init__(self, path: Path, document: Document | None) -> None:
+        self._path, self._document = path, document
+        self.folder = path.parent
+
+    def error(self, at: Location, message: str) -> InputError:
+        if self._document is None:
+            return InputError(f"{self._path}: {message}")
+        return self._document.error(at, message)
+
+    def where(self, at: Location) -> str:
+        """``line 5`` of the file, for another complaint to point at."""
+        return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
+
+
+def agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: Places, key: str) -> T:
+    """What all axis files say; InputError where they differ, since the machine has one of it."""
+    first = ask(axes[0].config)
+    for number, axis in enumerate(axes[1:], start=1):
+        if ask(axis.config) != first:
+            raise places.error(
+                ("axes", number, "profile"),
+                f"{axis.config.where(key)}: differs from that of '{axes[0].name}' "
+                f"({axes[0].config.where(key)}); expected the same in both, or '{key}' in the machine file",
+            )
+    return first
+
+
+def check_together(axes: Sequence[Axis], places: Places) -> None:
+    """One SYNC and one master for all; names and node ids that nobody else has.
+
+    Identifiers of PDOs follow from the node ids, so they are distinct as well.
+    """
+    names: dict[str, int] = {}
+    nodes: dict[int, str] = {}
+    first = axes[0].config
+    for number, axis in enumerate(axes):
+        at = ("axes", number, "profile")
+        config = axis.config
+        if (other := names.setdefault(axis.name, number)) != number:
+            raise places.error(
+                at,
+                f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
+                f"name in {config.where('name')}",
+            )
+        for key in ("cycle_ms", "master_node_id"):
+            found, expected = getattr(config.drive, key), getattr(first.drive, key)
+            if found != expected:
+                raise places.error(
+                    at,
+                    f"{config.where(f'drive.{key}')}: found {found:g}; expected {expected:g}, as of "
+                    f"'{first.name}': one master sends one SYNC to all axes",
+                )
+        for node, key in _nodes(config):
+            if (owner := nodes.setdefault(node, axis.name)) != axis.name:
+                raise places.error(
+                    at, f"{config.where(key)}: node {node} is of '{owner}' already; expected another node id"
+                )
+
+
+def _nodes(config: AxisConfig) -> Iterator[tuple[int, str]]:
+    yield config.drive.node_id, "drive.node_id"
+    if config.load_encoder.source.node is not None:
+        yield config.load_encoder.source.node, "load_encoder.source.node"
+
+
+def check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: Places) -> None:
+    """The frames of a cycle fit into it."""
+    try:
+        check_bus_load(axes, bus.bitrate_bps)
+    except InputError as problem:
+        raise places.error(("axes",), str(problem)) from None
+
+
+def check_tcp(file: MachineFile, places: Places) -> None:
+    """What lets clients in from the network is there, and the token is nobody else's to read."""
+    tcp = file.api.tcp
+    if tcp is None:
+        return
+    try:
+        check_exposure(tcp.host, tls=tcp.certificate is not None, unencrypted=tcp.unencrypted)
+    except InputError as problem:
+        raise places.error(("api", "tcp", "host"), str(problem).removeprefix("api.tcp.host: ")) from None
+    if complaint := token_complaint(places.folder / tcp.token_file):
+        raise places.error(("api", "tcp", "token_file"), complaint)
+    for key in ("certificate", "key"):
+        text: str | None = getattr(tcp, key)
+        if text is not None and not os.access(places.folder / text, os.R_OK):
+            raise places.error(
+                ("api", "tcp", key), f"{places.folder / text} cannot be read; expected a PEM file"
+            )
