@@ -2,11 +2,12 @@
 
 import json
 import math
+import time
 from urllib.parse import urlsplit
 
 import pytest
 from support.api import TOKEN, served
-from support.browser import browser
+from support.browser import PATIENCE_S, browser
 from support.fake_bridge import FakeBridge
 
 from hdbridge.client.messages import Event, EventKind
@@ -50,6 +51,15 @@ def asked(bridge, what):
     return [each for each in bridge.moved if each[1] == what]
 
 
+def eventually(what):
+    """The page asks in its own time."""
+    end = time.monotonic() + PATIENCE_S
+    while not (found := what()):
+        assert time.monotonic() < end, "it was never asked"
+        time.sleep(0.02)
+    return found
+
+
 def take_control(page):
     page.click("#lease")
     page.until("!document.querySelector('#controls').disabled")
@@ -79,9 +89,7 @@ def test_nothing_moves_before_control_was_taken(bridge, page):
     page.until("document.querySelector('#state').innerText === 'enabled'")
     page.evaluate("document.querySelector('#move-to').value = '30.5'")
     page.click("#move")
-    page.until("document.querySelector('#notice').hidden")
-    page.until("document.querySelector('#controls').disabled === false")
-    assert asked(bridge, "move") == [("joint-1", "move", 30.5, None)]
+    assert eventually(lambda: asked(bridge, "move")) == [("joint-1", "move", 30.5, None)]
     page.click("#lease")
     page.until("document.querySelector('#controls').disabled")
     assert bridge.lease.holder is None
@@ -101,24 +109,23 @@ def test_a_jog_lasts_as_long_as_the_key_is_pressed_and_ends_in_a_stop(bridge, pa
     page.click("#enable")
     page.until("document.querySelector('#state').innerText === 'enabled'")
     page.press("ArrowLeft", hold_s=0.5)
-    page.until("true")
+    eventually(lambda: ("joint-1", "stop") in bridge.stopped)
     jogs = asked(bridge, "jog")
     assert jogs
     assert {(each[2], each[3]) for each in jogs} == {(-5.0, 0.4)}
-    assert ("joint-1", "stop") in bridge.stopped
 
 
 def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
     page.press("Escape")
     page.until("!document.querySelector('#fault').hidden")
-    assert ("joint-2", "quick-stop") in bridge.stopped
+    eventually(lambda: ("joint-2", "quick-stop") in bridge.stopped)
     assert "a TPDO is missing" in page.text("#fault")
     assert "check the cable" in page.text("#fault")
     assert page.evaluate("document.querySelector('#reset').disabled")
     take_control(page)
     page.click("#reset")
     page.until("document.querySelector('#fault').hidden")
-    assert asked(bridge, "reset") == [("joint-1", "reset")]
+    assert eventually(lambda: asked(bridge, "reset")) == [("joint-1", "reset")]
 
 
 def test_another_clients_control_is_shown(bridge, page):

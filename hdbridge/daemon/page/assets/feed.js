@@ -3,7 +3,7 @@
 import { socket } from "./api.js";
 
 export const KEPT_S = 20;
-const RATE_HZ = 50; // samples that a screen can use
+const RATE_HZ = 250; // few enough for a slow line, and close enough that no motor angle is passed over
 const AGAIN_MS = [500, 1000, 2000, 5000];
 
 /** The last KEPT_S of one axis: arrays that are cut at the front now and then, not at each sample. */

@@ -86,8 +86,8 @@ function take(batch) {
       const predicted = columns.predicted_arcsec[n];
       if (predicted !== null) left.add(columns.motor_position_deg[n], columns.load_position_deg[n], value - predicted);
     });
-    const { load_position_deg, load_target_deg, error_arcsec, correction_arcsec, predicted_arcsec } = columns;
-    history.push(batch.time_s, { load_position_deg, load_target_deg, error_arcsec, correction_arcsec, predicted_arcsec, transmission });
+    const { load_position_deg, load_target_deg, velocity_deg_s, error_arcsec, correction_arcsec, predicted_arcsec } = columns;
+    history.push(batch.time_s, { load_position_deg, load_target_deg, velocity_deg_s, error_arcsec, correction_arcsec, predicted_arcsec, transmission });
   }
   view.events(batch.events.filter((each) => !QUIET.has(each.kind)));
 }
@@ -107,7 +107,10 @@ function draw() {
   const time = history.time.map((each) => each - now);
   const column = (name) => history.column(name);
   charts.position.draw([time, column("load_position_deg"), column("load_target_deg")]);
-  charts.error.draw([time, column("error_arcsec")]);
+  // In motion the drive lags behind its target: that would hide what the load is off by where it is to stand.
+  const resting = document.getElementById("error-resting").checked;
+  const speed = column("velocity_deg_s");
+  charts.error.draw([time, column("error_arcsec").map((error, n) => (resting && speed[n] !== 0 ? null : error))]);
   charts.transmission.draw([time, aligned(column("transmission"), column("predicted_arcsec")), column("predicted_arcsec")]);
   const newest = (name) => column(name).at(-1) ?? null;
   view.figures(Object.fromEntries(["load_position_deg", "load_target_deg", "error_arcsec", "correction_arcsec"].map((name) => [name, newest(name)])));
