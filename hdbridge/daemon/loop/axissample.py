@@ -14,8 +14,8 @@ from hdbridge.drive.states import State
 
 _POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
 # As plain numbers: to combine the flags themselves costs more than the whole sample.
-_FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _KNOWN0, _KNOWN1 = map(
-    int, SampleFlag
+_FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
+    map(int, SampleFlag)
 )
 
 
@@ -70,6 +70,8 @@ class AxisSampler:
                 flags |= _CHANGING
             if underrun:
                 flags |= _UNDERRUN
+            if follower.loop_doubted:
+                flags |= _DOUBTED
         else:
             flags |= _AT_REST
             target_deg = position_deg / self._ratio

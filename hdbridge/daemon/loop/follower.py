@@ -88,12 +88,15 @@ class Follower:
             self.correction.change(new)
         else:
             self.correction = Correction(new)
-        self._needs = bool(self.correction.needs)
+        self.changed()
 
     def switch_load_loop(self, on: bool) -> None:
         """The slow integral on, or faded out. InputError where the axis has none."""
         if self._load_loop is None:
             raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
+        if on:
+            # From what it adds now, so that nothing jumps; what it has doubted before it may look at again.
+            self._load_loop.reset(self.loop_arcsec)
         self._load_loop_on = on
 
     # ---------------------------------------------------------------- turn by turn
@@ -148,8 +151,16 @@ class Follower:
         return counts
 
     def changed(self) -> None:
-        """A change of the compensation is complete."""
-        self._needs = bool(self.correction.needs)
+        """Another compensation may need the motion's history, or no longer."""
+        needs = bool(self.correction.needs)
+        if needs and not self._needs:
+            self._observer = Observer()
+        self._needs = needs
+
+    @property
+    def loop_doubted(self) -> bool:
+        """Whether the load loop does not believe the load encoder."""
+        return self._load_loop is not None and self._load_loop.doubted
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
         """The load target with the slow integral of the measured error; within the limits."""

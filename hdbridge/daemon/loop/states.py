@@ -147,3 +147,12 @@ def mermaid() -> str:
         for (source, target), words in causes.items()
     ]
     return "\n".join(lines)
+
+
+def table() -> str:
+    """Which commands each state takes, as a Markdown table; docs/daemon-internals.md holds its text."""
+    lines = ["| state | commands that it takes |", "|---|---|"]
+    for state in AxisState:
+        kinds = [kind.name for kind in CommandKind if target_of(state, kind) is not None]
+        lines.append(f"| {state.name} | {', '.join(kinds)} |")
+    return "\n".join(lines)

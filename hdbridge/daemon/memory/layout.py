@@ -58,6 +58,8 @@ class SampleFlag(IntFlag):
     """The set-point stands."""
     UNDERRUN = 64
     """A stream ran out of knots in motion."""
+    LOOP_DOUBTED = 128
+    """The load loop does not believe the load encoder; it is out of use until it is switched on again."""
     CHANNEL0_KNOWN = 256
     CHANNEL1_KNOWN = 512
 

@@ -12,7 +12,9 @@ import pytest
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 
 from hdbridge.control.bench import compensation_for
+from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
 from hdbridge.drive.states import State
 from hdbridge.model import TransmissionModel
@@ -490,8 +492,6 @@ def test_a_loop_that_begins_anew_does_not_carry_out_what_was_posted_before(enabl
         cycle.leave(axis)
     setups = []
     for axis in enabled.axes:
-        from hdbridge.daemon.loop.follower import AxisSetup
-
         model = TransmissionModel(axis.config.gear.ratio)
         setups.append(AxisSetup(axis.config, compensation_for(axis.config, model)))
     again = Controller(cycle, setups, enabled.memory)
@@ -500,3 +500,37 @@ def test_a_loop_that_begins_anew_does_not_carry_out_what_was_posted_before(enabl
     for _ in range(50):
         again.turn()
     assert [axis.state for axis in again.axes] == [S.UNVERIFIED]
+
+
+def with_load_loop(made: AxisSetup) -> AxisSetup:
+    return replace(made, load_loop=LoadLoopSettings(gain_1_s=2.0, maximum_arcsec=40.0, slew_arcsec_s=40.0))
+
+
+def test_the_load_loop_takes_away_what_the_model_leaves_and_fades_when_switched_off() -> None:
+    without = TransmissionModel(50.0)
+    with stepped_daemon(model=without, setup=lambda _, made: with_load_loop(made)) as daemon:
+        daemon.verify()
+        daemon.enable()
+        id_ = daemon.move(7.3)
+        daemon.until(lambda: daemon.ended(id_))
+        daemon.run(0.2)
+        left = 7.3 - record(daemon)["load_position_deg"][-1]
+        daemon.run(8.0)
+        axis = record(daemon)
+        assert abs(7.3 - axis["load_position_deg"][-20:].mean()) < 0.3 * abs(left)
+        assert axis["loop_arcsec"][-1] * left > 0.0
+        assert axis["load_target_deg"][-1] == 7.3
+        assert np.abs(np.diff(axis["loop_arcsec"])).max() <= 40.0 * 0.004 * (1 + 1e-9)
+        daemon.done(K.LOAD_LOOP, i=0)
+        daemon.run(3.0)
+        assert record(daemon)["loop_arcsec"][-1] == 0.0
+        daemon.done(K.LOAD_LOOP, i=1)
+        daemon.run(4.0)
+        assert record(daemon)["loop_arcsec"][-1] != 0.0
+        # The encoder slips: what it shows at rest is not believed any more.
+        daemon.nodes[0].faults.load_jump_counts = 150
+        daemon.run(3.0)
+        axis = record(daemon)
+        assert axis["flags"][-1] & SampleFlag.LOOP_DOUBTED
+        assert axis["loop_arcsec"][-1] == 0.0
+        assert daemon.states == [S.ENABLED]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from hdbridge.daemon.loop.states import (
@@ -10,6 +12,7 @@ from hdbridge.daemon.loop.states import (
     Happening,
     mermaid,
     refusal,
+    table,
     target_of,
 )
 from hdbridge.daemon.memory import CommandKind
@@ -68,3 +71,10 @@ def test_the_diagram_names_every_state_and_the_way_to_power() -> None:
     text = mermaid()
     assert all(state.name in text for state in AxisState)
     assert "DISABLED --> ENABLING: ENABLE" in text
+
+
+def test_the_page_has_what_the_table_says() -> None:
+    page = Path(__file__).resolve().parents[3] / "docs" / "daemon-internals.md"
+    text = page.read_text(encoding="utf-8")
+    assert mermaid() in text
+    assert table() in text

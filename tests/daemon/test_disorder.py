@@ -1,0 +1,377 @@
+"""Everything at once and in any order: commands that make sense or none, faults, mad services.
+
+The laws (`support.daemonlaws`) are checked on every frame that leaves the loop: no target outside the limits,
+stale at enable, or farther from the last than the limits of velocity and slew allow; no power without an
+ENABLE command since it was last taken away; nothing to an axis that is not verified; each command answered
+once.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+import struct
+from contextlib import ExitStack, suppress
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
+from support.daemonlaws import Laws
+
+from hdbridge.control.bench import compensation_for
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError
+from hdbridge.drive.objects import Mode
+from hdbridge.errors import HdbridgeError
+from hdbridge.model import TransmissionModel
+
+K = CommandKind
+TRAVEL_DEG = 3.0
+"""Short, so that the ends are met often."""
+KINDS = [each for each in K if each is not K.ENDING]
+axes = st.integers(0, 1)
+angles = st.one_of(
+    st.floats(-1.2 * TRAVEL_DEG, 1.2 * TRAVEL_DEG), st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
+)
+speeds = st.one_of(st.floats(-30.0, 30.0), st.sampled_from([math.nan, math.inf, 0.0]))
+counts = st.integers(-(1 << 40), 1 << 40)
+turns = st.integers(0, 12)
+
+
+def machine_axes():
+    """Two axes with little travel."""
+    made = []
+    for axis in article_axes(2):
+        limits = axis.limits.model_copy(
+            update={"position_min_deg": -TRAVEL_DEG, "position_max_deg": TRAVEL_DEG}
+        )
+        made.append(axis.model_copy(update={"limits": limits}))
+    return made
+
+
+class Disorder(RuleBasedStateMachine):
+    """Two axes, a service that does anything, and a bus on which anything happens."""
+
+    events = 0
+    """Rules applied, of all examples."""
+    enabled = 0
+    """RPDOs that enabled a drive, of all examples."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stack = ExitStack()
+        self.daemon: SteppedDaemon = self.stack.enter_context(stepped_daemon(machine_axes()))
+        self.laws = Laws(self.daemon)
+        self.stream = 0
+        self.booted = [False, False]
+        self.models = [
+            pickle.dumps(compensation_for(axis.config, model.bound_to(axis.config)))
+            for axis in self.daemon.axes
+            for model in (self._model(), self._model().only(("synchronous",)), self._model().only(()))
+        ]
+
+    @initialize()
+    def boot(self) -> None:
+        for axis in range(2):
+            self._boot(axis)
+
+    @staticmethod
+    def _model() -> TransmissionModel:
+        return TransmissionModel.load(PROFILE / "model.yaml")
+
+    def teardown(self) -> None:
+        Disorder.enabled += sum(laws.enabled for laws in self.laws.axes.values())
+        self.stack.close()
+
+    def post(self, kind: CommandKind | int, axis: int = 0, **fields: float) -> None:
+        with suppress(MailboxFullError):
+            # The laws have to know before a turn takes it.
+            self.laws.post(kind, axis, self.daemon.post(kind, axis, **fields))  # type: ignore[arg-type]
+
+    def go(self, number: int = 1) -> None:
+        Disorder.events += 1
+        for _ in range(number):
+            self.laws.turn()
+            self.laws.take(list(self.daemon.events))
+            self.daemon.events.clear()
+        self.laws.samples()
+
+    # ---------------------------------------------------------------- a service that knows what it does
+
+    def _boot(self, axis: int) -> None:
+        """Boot over the relay, as far as the bus lets it, and verify; where it was, verify alone."""
+        daemon = self.daemon
+        if not daemon.axes[axis].cycle.feedback.fresh or not self.booted[axis]:
+            with suppress(HdbridgeError):
+                drive = daemon.drive(axis)
+                drive.boot()
+                daemon.run(0.02)
+                drive.enable(Mode.CSP)
+                self.booted[axis] = True
+        self.laws.take(list(daemon.events))
+        daemon.events.clear()
+        self.post(K.RESET, axis, i=1)
+        image = daemon.axes[axis].image
+        actual = daemon.nodes[axis].firmware.motion.machine.motor_counts
+        self.post(K.VERIFIED, axis, i=actual, j=image.load_counts, k=0x0250)
+        self.go(3)
+
+    def stopped(self) -> bool:
+        daemon = self.daemon
+        return any(state is not AxisState.ENABLED for state in daemon.states) and not daemon.bus.down
+
+    @precondition(stopped)
+    @rule()
+    def start(self) -> None:
+        """All that a person and a service do to get a stopped machine going again."""
+        for node in self.daemon.nodes:
+            node.faults.silent = node.faults.mute_heartbeat = False
+        self.go(5)
+        for axis in range(2):
+            if self.daemon.states[axis] is AxisState.QUICK_STOPPED:
+                self.go(10)
+                self.post(K.RESET, axis)
+                self.go(10)
+                self.post(K.DRIVE_FAULT_RESET, axis)
+                self.go(5)
+            if self.daemon.states[axis] is AxisState.LENT:
+                self.post(K.RELEASE, axis)
+                self.go()
+            if self.daemon.states[axis] in (AxisState.LATCHED, AxisState.UNVERIFIED):
+                self._boot(axis)
+            if self.daemon.states[axis] is AxisState.DISABLED:
+                self.enable(axis, 12)
+
+    @precondition(stopped)
+    @rule()
+    def start_again(self) -> None:
+        """The same: so that it is not the exception."""
+        self.start()
+
+    @rule(axis=axes, number=turns)
+    def enable(self, axis: int, number: int) -> None:
+        image = self.daemon.axes[axis].image
+        self.post(K.ENABLE, axis, i=image.motor_counts, j=image.load_counts, k=image.statusword or 0)
+        self.go(number)
+
+    @rule(axis=axes, number=st.integers(10, 30))
+    def enable_and_wait(self, axis: int, number: int) -> None:
+        self.enable(axis, number)
+
+    @rule(
+        axis=st.integers(-1, 2),
+        kind=st.sampled_from(
+            [K.DISABLE, K.QUICK_STOP, K.STOP, K.LEND, K.RELEASE, K.STREAM_END, K.DRIVE_FAULT_RESET]
+        ),
+        number=turns,
+    )
+    def order(self, axis: int, kind: CommandKind, number: int) -> None:
+        self.post(kind, axis)
+        self.go(number)
+
+    @rule(axis=axes, verified=st.integers(0, 1), number=turns)
+    def reset(self, axis: int, verified: int, number: int) -> None:
+        self.post(K.RESET, axis, i=verified)
+        self.go(number)
+
+    @rule(
+        axis=axes,
+        goal=angles,
+        velocity=speeds,
+        acceleration=st.sampled_from([math.nan, 50.0, 1e9, -1.0]),
+        number=turns,
+    )
+    def move(self, axis: int, goal: float, velocity: float, acceleration: float, number: int) -> None:
+        self.post(K.MOVE, axis, a=goal, b=velocity, c=acceleration)
+        self.go(number)
+
+    @rule(axis=axes, goal=st.floats(-TRAVEL_DEG, TRAVEL_DEG), number=st.integers(1, 40))
+    def move_far(self, axis: int, goal: float, number: int) -> None:
+        self.post(K.MOVE, axis, a=goal, b=math.nan, c=math.nan)
+        self.go(number)
+
+    @rule(
+        axis=axes,
+        velocity=speeds,
+        timeout=st.sampled_from([0.02, 0.2, 1.0, -1.0, math.nan, 1e9]),
+        number=turns,
+    )
+    def jog(self, axis: int, velocity: float, timeout: float, number: int) -> None:
+        self.post(K.JOG, axis, a=velocity, b=timeout)
+        self.go(number)
+
+    @rule(
+        mask=st.integers(0, 4),
+        travel=st.floats(-2.0, 2.0),
+        knots=st.integers(1, 26),
+        before=st.booleans(),
+        number=turns,
+    )
+    def stream_smoothly(self, mask: int, travel: float, knots: int, before: bool, number: int) -> None:
+        """A path from where the axes stand, whole or broken off, its knots there before or after."""
+        self.stream += 1
+        if not before:
+            self.post(K.STREAM_BEGIN, 0, a=0.1, i=mask, j=self.stream)
+        for axis in self.daemon.axes:
+            begin = axis.set_point.position_deg
+            path = []
+            for place in range(knots):
+                s = place / 25
+                path.append(Knot(
+                    self.stream, 0.5 * s, begin + travel * (10 * s**3 - 15 * s**4 + 6 * s**5),
+                    travel / 0.5 * (30 * s**2 - 60 * s**3 + 30 * s**4),
+                ))  # fmt: skip
+            self.daemon.memory.knots[axis.index].put(path)
+        if before:
+            self.post(K.STREAM_BEGIN, 1, a=0.1, i=mask, j=self.stream)
+        self.go(number)
+
+    @rule(axis=axes, on=st.integers(0, 1), kind=st.sampled_from([K.COMPENSATE, K.LOAD_LOOP]), number=turns)
+    def switch(self, axis: int, on: int, kind: CommandKind, number: int) -> None:
+        self.post(kind, axis, i=on)
+        self.go(number)
+
+    @rule(axis=axes, which=st.integers(0, 5), number=turns)
+    def change_model(self, axis: int, which: int, number: int) -> None:
+        self.post(K.CHANGE, axis, i=self.daemon.memory.blobs.put(self.models[which]))
+        self.go(number)
+
+    # ---------------------------------------------------------------- a service out of its mind
+
+    @rule(
+        kind=st.one_of(st.sampled_from(KINDS), st.integers(-5, 300).filter(lambda n: n != K.ENDING)),
+        axis=st.integers(-3, 5), a=angles, b=speeds, c=speeds, i=counts, j=counts,
+        k=st.one_of(counts, st.sampled_from([0x0250, 0x1237, 0x0008, 0x0007])), number=turns,
+    )  # fmt: skip
+    def nonsense(self, kind, axis, a, b, c, i, j, k, number) -> None:
+        if kind in (K.VERIFIED, K.UNLEND, K.ENABLE):
+            # Which of the turns of 2**32 counts it is in nobody but the service can know.
+            i = max(min(i, (1 << 31) - 1), -(1 << 31))
+        self.post(kind, axis, a=a, b=b, c=c, i=i, j=j, k=k)
+        self.go(number)
+
+    @rule(data=st.binary(max_size=50), number=turns)
+    def nonsense_model(self, data: bytes, number: int) -> None:
+        self.post(K.CHANGE, 0, i=self.daemon.memory.blobs.put(pickle.dumps(data)))
+        self.go(number)
+
+    @rule(
+        axis=axes,
+        knots=st.lists(st.tuples(st.integers(-1, 3), angles, angles, speeds), max_size=20),
+        number=turns,
+    )
+    def nonsense_knots(self, axis: int, knots: list[tuple[int, float, float, float]], number: int) -> None:
+        self.daemon.memory.knots[axis].put([Knot(self.stream + s, t, p, v) for s, t, p, v in knots])
+        self.go(number)
+
+    @rule(number=st.integers(0, 300))
+    def flood(self, number: int) -> None:
+        for place in range(number):
+            self.post(K.MOVE if place % 2 else K.STOP, place % 2, a=float(place % 5), b=math.nan, c=math.nan)
+        self.go(3)
+
+    @rule(
+        can_id=st.one_of(st.integers(0, 0x7FF), st.sampled_from([0, 0x601, 0x602])),
+        data=st.binary(max_size=8),
+        number=turns,
+    )
+    def outgoing(self, can_id: int, data: bytes, number: int) -> None:
+        # A node that the service has set up otherwise is none of the loop's laws; restarts and reads are.
+        if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
+            data = b"\x40" + data[1:]
+        self.daemon.memory.outgoing.put(0, can_id, data)
+        self.go(number)
+
+    # ---------------------------------------------------------------- a bus on which anything happens
+
+    @rule(axis=axes, what=st.sampled_from(["drop_tpdos", "shorten_tpdos", "duplicate_tpdos", "hold_tpdos"]),
+          how_many=st.integers(1, 4), number=turns)  # fmt: skip
+    def spoil_tpdos(self, axis: int, what: str, how_many: int, number: int) -> None:
+        setattr(self.daemon.nodes[axis].faults, what, how_many)
+        self.go(number)
+
+    @rule(axis=axes, number=turns)
+    def restart_node(self, axis: int, number: int) -> None:
+        self.booted[axis] = False
+        self.daemon.nodes[axis].faults.boot_up()
+        self.go(number)
+
+    @rule(axis=axes, code=st.sampled_from([0x3210, 0x8611, 0x8130]), number=turns)
+    def drive_fault(self, axis: int, code: int, number: int) -> None:
+        self.daemon.nodes[axis].faults.raise_error(code)
+        self.go(number)
+
+    @rule(axis=axes, jump=st.integers(-200_000, 200_000), number=turns)
+    def jump(self, axis: int, jump: int, number: int) -> None:
+        self.daemon.nodes[axis].faults.load_jump_counts = jump
+        self.go(number)
+
+    @rule(axis=axes, what=st.sampled_from(["silent", "mute_heartbeat"]), on=st.booleans(), number=turns)
+    def unplug(self, axis: int, what: str, on: bool, number: int) -> None:
+        setattr(self.daemon.nodes[axis].faults, what, on)
+        self.go(number)
+
+    @rule(can_id=st.one_of(
+        st.integers(0x081, 0x7FF).filter(lambda n: not 0x201 <= n <= 0x202 and not 0x600 <= n <= 0x67F),
+        st.sampled_from([0x080, 0x081, 0x701, 0x702, 0x77F])),
+        data=st.binary(max_size=8), number=turns)  # fmt: skip
+    def foreign(self, can_id: int, data: bytes, number: int) -> None:
+        if can_id == 0x701 or can_id == 0x702:
+            data = data[:1]
+        if 0x181 <= can_id <= 0x182 or 0x281 <= can_id <= 0x282:
+            return  # a liar about where the axis is: see `lying_tpdo`
+        self.daemon.interfere(can_id, data)
+        self.go(number)
+
+    @rule(node=st.integers(1, 2), length=st.integers(0, 7), number=turns)
+    def lying_tpdo(self, node: int, length: int, number: int) -> None:
+        self.daemon.interfere(0x180 + node, struct.pack("<Hih", 0x1237, 999_999, 0)[:length])
+        self.go(number)
+
+    @rule(can_id=st.sampled_from([0x080, 0x201, 0x202, 0x77F, 0x601]), number=turns)
+    def no_room(self, can_id: int, number: int) -> None:
+        self.daemon.bus.no_room_for = can_id
+        self.go(number)
+
+    @rule(down=st.booleans(), number=turns)
+    def interface(self, down: bool, number: int) -> None:
+        self.daemon.bus.down = down
+        self.go(number)
+
+    @rule(duration=st.sampled_from([0.001, 0.003, 0.006, 0.02, 0.3]), number=turns)
+    def hang(self, duration: float, number: int) -> None:
+        self.daemon.hang(duration)
+        self.go(number)
+
+    @rule(number=st.integers(1, 60))
+    def pass_time(self, number: int) -> None:
+        self.go(number)
+
+
+SMALL = settings(
+    max_examples=6, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
+)
+LARGE = settings(SMALL, max_examples=1000, stateful_step_count=120)
+
+
+def run(size: settings) -> None:
+    from hypothesis.stateful import run_state_machine_as_test
+
+    Disorder.events = Disorder.enabled = 0
+    run_state_machine_as_test(Disorder, settings=size)
+
+
+def test_in_no_order_is_a_law_broken() -> None:
+    run(SMALL)
+    assert Disorder.events > 100
+    assert Disorder.enabled > 100, "the drives were hardly ever enabled: nothing was tested"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+def test_in_no_order_is_a_law_broken_in_a_hundred_thousand_events() -> None:
+    run(LARGE)
+    print(f"{Disorder.events} events, {Disorder.enabled} targets to enabled drives")
+    assert Disorder.events >= 100_000

@@ -1,0 +1,145 @@
+"""What a spy on the bus holds the daemon's control loop to, frame by frame, whatever is going on."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import TYPE_CHECKING
+
+from hdbridge.daemon.loop.relay import MAY_MOVE
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, Event, EventKind
+from hdbridge.drive.image import position_limits_counts
+from hdbridge.units import ARCSEC_PER_DEG
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from support.daemon import SteppedDaemon
+
+POWERLESS = frozenset({0x00, 0x02, 0x80})
+"""Controlwords that leave a drive without power or take it away: disable voltage, quick stop, fault reset."""
+ENABLE_OPERATION = 0x0F
+SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
+LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+STANDING_COUNTS = 4
+"""By which an axis at rest may have moved since its last TPDO."""
+
+
+class AxisLaws:
+    """The RPDOs of one axis."""
+
+    def __init__(self, daemon: SteppedDaemon, index: int) -> None:
+        self.axis = daemon.axes[index]
+        self.machine = daemon.nodes[index].firmware.motion.machine
+        self.least, self.greatest = position_limits_counts(self.axis.config)
+        self.most = most_counts(self.axis.config)
+        self.allowed = False
+        """An ENABLE command was given since power was last taken away."""
+        self.begun = False
+        """Power has been asked for since."""
+        self.latched = False
+        """The loop has told of a stop, and of no reset since."""
+        self.word = 0
+        self.target = 0
+        self.enabled = 0
+
+    def take(self, data: bytes) -> None:
+        word, target = struct.unpack("<Hi", data)
+        name = self.axis.config.name
+        assert self.axis.state not in SILENT, f"{name}: an RPDO while it is {self.axis.state.name}"
+        if word in POWERLESS:
+            if self.begun:
+                self.allowed = self.begun = False
+        else:
+            assert self.allowed, f"{name}: controlword {word:04X}h without an ENABLE command"
+            assert not self.latched, f"{name}: controlword {word:04X}h without a reset"
+            self.begun = True
+        if word == ENABLE_OPERATION:
+            assert self.axis.state in MAY_MOVE, f"{name}: driven while it is {self.axis.state.name}"
+            assert self.least <= target <= self.greatest, f"{name}: target {target} is outside the limits"
+            if self.word == ENABLE_OPERATION:
+                step = abs(target - self.target)
+                assert step <= self.most, f"{name}: target jumps by {step} counts, at most {self.most} may be"
+            else:
+                away = abs(target - self.machine.motor_counts)
+                assert away <= STANDING_COUNTS, f"{name}: enabled {away} counts from where it stands"
+            self.enabled += 1
+        self.word, self.target = word, target
+
+
+def most_counts(config: AxisConfig) -> int:
+    """Most that a target may differ from the last one, from the axis file alone."""
+    slew_deg_s = config.compensation.slew_arcsec_s / ARCSEC_PER_DEG
+    motor_deg = (config.limits.velocity_deg_s + slew_deg_s) * config.drive.cycle_s * config.gear.ratio
+    return math.ceil(abs(config.motor_encoder.counts(motor_deg))) + 2
+
+
+class Laws:
+    """Everything on one bus."""
+
+    def __init__(self, daemon: SteppedDaemon) -> None:
+        self.daemon = daemon
+        self.axes = {axis.config.drive.node_id: AxisLaws(daemon, axis.index) for axis in daemon.axes}
+        self.relayed = 0
+        self.frames = 0
+        self.asked: dict[int, CommandKind | int] = {}
+        """Commands that are not answered yet."""
+        self._last_sequence = 0
+        daemon.bus.spy = self.spy
+
+    def post(self, kind: CommandKind | int, axis: int, id_: int) -> None:
+        """A command is in the mailbox."""
+        self.asked[id_] = kind
+        if kind == CommandKind.ENABLE and 0 <= axis < len(self.daemon.axes):
+            self.axes[self.daemon.axes[axis].config.drive.node_id].allowed = True
+
+    def spy(self, can_id: int, data: bytes) -> None:
+        """A frame of the master."""
+        self.frames += 1
+        node, function = can_id & 0x7F, can_id & 0x780
+        if function == 0x200:
+            self.axes[node].take(data)
+        elif can_id == 0x000 or function == 0x600:
+            self.relayed += 1
+            nodes = {data[1]} if can_id == 0x000 else {node}
+            assert nodes <= set(self.axes)
+        else:
+            assert can_id in (0x080, 0x77F), f"{can_id:03X}h was sent"
+
+    def turn(self) -> None:
+        """One turn, and what it has told."""
+        self.relayed = 0
+        self.daemon.turn()
+        assert self.relayed <= 1
+
+    def take(self, events: list[Event]) -> None:
+        """Each command is answered once."""
+        for event in events:
+            if event.kind in (EventKind.DONE, EventKind.REFUSED) and event.id:
+                assert event.id in self.asked, f"answered twice, or not asked: {event}"
+                kind = self.asked.pop(event.id)
+                if kind == CommandKind.RESET and event.kind is EventKind.DONE:
+                    self._laws_of(event.axis).latched = False
+            elif event.kind is EventKind.STATE and event.code in LATCHES:
+                self._laws_of(event.axis).latched = True
+            if event.kind in (EventKind.REFUSED, EventKind.STOPPED, EventKind.STREAM_REFUSED):
+                assert event.text, event
+
+    def _laws_of(self, axis: int) -> AxisLaws:
+        return self.axes[self.daemon.axes[axis].config.drive.node_id]
+
+    def samples(self) -> None:
+        """Every turn has left one sample, and it makes sense."""
+        samples, lost = self.daemon.samples.read()
+        assert lost == 0
+        for sample in samples:
+            assert sample["sequence"] > self._last_sequence
+            self._last_sequence = int(sample["sequence"])
+            for axis, laws in zip(sample["axes"], self.axes.values(), strict=True):
+                AxisState(axis["state"])
+                values = [axis[name] for name in axis.dtype.names[6:-3]]
+                assert all(map(math.isfinite, values)), axis
+                if axis["state"] == AxisState.ENABLED:
+                    limits = laws.axis.config.limits
+                    assert limits.position_min_deg - 0.1 <= axis["load_target_deg"]
+                    assert axis["load_target_deg"] <= limits.position_max_deg + 0.1
