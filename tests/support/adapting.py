@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import random
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +19,7 @@ from hdbridge.daemon.adaptation.proposal import Entry
 from hdbridge.daemon.adaptation.regressors import Regressors
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
 from hdbridge.daemon.watch.encoder_health import EncoderHealth
 from hdbridge.drive import Drive
@@ -35,7 +37,8 @@ ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 AXIS = AxisConfig.load(ARTICLE / "axis.yaml")
 MODEL = TransmissionModel.load(ARTICLE / "model.yaml")
 FLOOR_ARCSEC = quantisation_floor_arcsec(AXIS.motor_encoder.counts_per_turn, AXIS.gear.ratio)
-ENABLED = 3
+NOISE_ARCSEC = 0.3
+LOAD_COUNT_ARCSEC = AXIS.load_encoder.resolution_arcsec
 PERIOD_S = AXIS.drive.cycle_s
 GOLDEN = 0.6180339887
 SPAN_DEG = 60.0
@@ -49,7 +52,7 @@ def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcse
         "hysteresis_growth": growth,
         "motor_orders": [{"order": 2, "amplitude_arcsec": second_order_arcsec, "phase_deg": 20.0}],
     }
-    data["load"]["encoder"]["noise_arcsec"] = 0.3
+    data["load"]["encoder"]["noise_arcsec"] = NOISE_ARCSEC
     return Truth.model_validate(data)
 
 
@@ -81,7 +84,7 @@ def work(
     error = truth.predict(Motion(motor), Start.FORWARD) + zero_arcsec
     error = error + np.random.default_rng(seed).normal(0.0, noise_arcsec, len(motor))
     samples = np.zeros(len(motor), AXIS_SAMPLE)
-    samples["state"], samples["fault"] = ENABLED, NO_FAULT
+    samples["state"], samples["fault"] = AxisState.ENABLED, NO_FAULT
     samples["flags"] = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
     samples["motor_target_deg"] = samples["motor_position_deg"] = motor
     samples["load_position_deg"] = motor / AXIS.gear.ratio + error / ARCSEC_PER_DEG
@@ -133,7 +136,7 @@ class Sampler:
         found["cycle"] = found["sequence"] = self._cycle + np.arange(count)
         found["time_ns"] = np.round(1e9 * period_s * found["cycle"])
         axis = found["axes"][:, 0]
-        axis["state"], axis["fault"] = ENABLED, NO_FAULT
+        axis["state"], axis["fault"] = AxisState.ENABLED, NO_FAULT
         axis["flags"] = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN | SampleFlag.COMPENSATING
         axis["motor_target_deg"] = axis["issued_deg"] = demand
         axis["motor_position_deg"] = columns["motor_position_deg"]
@@ -220,6 +223,43 @@ class Work:
             if proposal is not None and proposal.apply:
                 self._use(proposal.model)
                 self.health.use(proposal.model)
+
+
+Misreading = Callable[[int], int]
+
+
+def _drifts(work: Work) -> Misreading:
+    """By half an arcsec a second."""
+    begun_s = work.time_s
+    return lambda counts: counts + round(0.5 * (work.time_s - begun_s) / LOAD_COUNT_ARCSEC)
+
+
+def _freezes(_: Work) -> Misreading:
+    stuck: list[int] = []
+
+    def reading(counts: int) -> int:
+        if not stuck:
+            stuck.append(counts)
+        return stuck[0]
+
+    return reading
+
+
+def _jumps(_: Work) -> Misreading:
+    """By 100 arcsec."""
+    return lambda counts: counts + round(100.0 / LOAD_COUNT_ARCSEC)
+
+
+def _scatters(_: Work) -> Misreading:
+    """Ten times as much as it did."""
+    noise = random.Random(1)
+    return lambda counts: counts + round(noise.gauss(0.0, 10.0 * NOISE_ARCSEC) / LOAD_COUNT_ARCSEC)
+
+
+FAULTS: dict[str, Callable[[Work], Misreading]] = {
+    "drift": _drifts, "freeze": _freezes, "jump": _jumps, "noise x 10": _scatters,
+}  # fmt: skip
+"""What a load encoder's faults make of its counts, from when they are made."""
 
 
 @contextmanager

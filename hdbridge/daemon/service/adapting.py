@@ -1,7 +1,7 @@
 """The adaptation of one axis behind the service: the model in use, moved as the load encoder says.
 
 What is in use stays the committed model, by its version; the control process compensates by it as it was
-moved. When another one is committed, or another part of it compensates, the adaptation begins anew.
+moved, whichever part of it compensates. When another one is committed the adaptation begins anew.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hdbridge.daemon.adaptation.proposal import Proposal
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.daemon.adaptation.sink import AdaptationSink, followed
 from hdbridge.daemon.memory import Event, SampleArray
-from hdbridge.daemon.service.models import InUse
+from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.daemon.watch.encoder_health import EncoderHealth
 from hdbridge.errors import HdbridgeError
@@ -35,20 +35,16 @@ class Adapting:
         """``place`` is the axis's index in a sample, ``folder`` where its state and history are kept."""
         self._place, self._axis = place, axis
         self._settings, self._folder, self._writer = settings, folder, writer
-        self._of: InUse | None = None
+        self._of: TransmissionModel | None = None
+        """The committed model that it is of."""
         self._sink: AdaptationSink | None = None
         self._health: EncoderHealth | None = None
-        self._committed: TransmissionModel | None = None
-        """The part of the model in use that compensates, as a new control process has it."""
-        self._applied: TransmissionModel | None = None
-        """What the control process compensates by."""
-        self._loop_pid = 0
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """From the observer."""
-        if self._axis.models.in_use is not self._of:
-            self._begin(self._axis.models.in_use)
+        if self._axis.models.in_use.model is not self._of:
+            self._begin(self._axis.models.in_use.model)
         if self._sink is None or self._health is None:
             return
         if len(samples):
@@ -78,14 +74,15 @@ class Adapting:
             await self.follow()
 
     async def follow(self) -> None:
-        """Have the control process compensate by the model as it was moved, where it does not yet."""
-        pid = self._axis.core.memory.status.loop_pid
-        if pid != self._loop_pid:  # a new one compensates by the committed model
-            self._loop_pid, self._applied = pid, self._committed
-        if self._sink is None:
+        """Have the control process compensate by the model as it was moved, where it does not yet.
+
+        A job measures with one model: it is not changed until the job has ended.
+        """
+        if self._sink is None or self._axis.models.in_use.model is not self._of:
             return
         model = self._sink.axes[0].adaptation.model
-        if model == self._applied:
+        in_use = self._axis.models.in_use
+        if model.effects == (in_use.adapted or in_use.model).effects or self._axis.motion.busy(Kind.JOB):
             return
         try:
             await self._axis.follow(model)
@@ -94,7 +91,9 @@ class Adapting:
                 _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
             self._problem = str(problem)
         else:
-            self._applied, self._problem = model, ""
+            self._problem = ""
+            if self._health is not None:
+                self._health.use(model)
             _log.info("adaptation applied", {"axis": self._axis.name})
 
     def close(self) -> None:
@@ -102,13 +101,12 @@ class Adapting:
         if self._sink is not None:
             self._sink.close()
 
-    def _begin(self, in_use: InUse) -> None:
-        """Follow another model from here on."""
+    def _begin(self, model: TransmissionModel) -> None:
+        """Follow another committed model from here on."""
         self.close()
-        self._of, self._sink, self._health, self._problem = in_use, None, None, ""
+        self._of, self._sink, self._health, self._problem = model, None, None, ""
         if self._settings.mode == "off":
             return
-        model = in_use.scheme.of(in_use.model)
         config = self._axis.axis.config
         if not model.effects:
             self._problem = "there is no model to follow: calibrate first"
@@ -129,7 +127,6 @@ class Adapting:
             return
         self._health = health
         self._sink = AdaptationSink([one], self._proposed, self._writer, first=self._place)
-        self._committed = self._applied = model
 
     def _proposed(self, _place: int, proposal: Proposal) -> None:
         told = {each.parameter: round(each.after, 4) for each in proposal.changes}

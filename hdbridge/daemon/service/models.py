@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -37,10 +37,17 @@ class InUse:
     version: int | None
     """Its number in the history; None where it has none."""
     file: Path
+    adapted: TransmissionModel | None = None
+    """The model as the load encoder has moved its parameters; None: as it was committed."""
+
+    @property
+    def compensating(self) -> TransmissionModel:
+        """What compensates: the part of the model, as it was moved."""
+        return self.scheme.of(self.adapted or self.model)
 
     def compensation(self, axis: Axis) -> Compensation:
         """Its inverse, for the control process. InputError where it cannot be for this axis."""
-        return compensation_for(axis.config, self.scheme.of(self.model))
+        return compensation_for(axis.config, self.compensating)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +88,7 @@ class AxisModels:
             raise InputError(
                 f"{self._axis.name}: there is no model to compensate with; calibrate first, or use 'none'"
             )
-        return self.made(InUse(in_use.model, scheme, in_use.version, in_use.file))
+        return self.made(replace(in_use, scheme=scheme))
 
     def found(self, version: int | Literal["pending", "active"], identity: Identity) -> Choice:
         """A model of the profile, by the present scheme.
@@ -109,8 +116,8 @@ class AxisModels:
         return Choice(in_use, pickle.dumps(in_use.compensation(self._axis)))
 
     def moved(self, model: TransmissionModel) -> Choice:
-        """What is in use, with other parameters; ``model`` is the part of it that compensates."""
-        return Choice(self.in_use, pickle.dumps(compensation_for(self._axis.config, model)))
+        """What is in use with other parameters: ``model`` is the whole of it, as it was moved."""
+        return self.made(replace(self.in_use, adapted=model))
 
     def taken(self, choice: Choice) -> None:
         """The control process has it."""

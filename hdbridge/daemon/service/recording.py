@@ -46,7 +46,7 @@ class Recording:
             if self._told.get(name) is not in_use:
                 self._told[name] = in_use
                 version = str(in_use.version) if in_use.version is not None else ""
-                self._recorder.use_model(name, in_use.scheme.of(in_use.model).dump(), version)
+                self._recorder.use_model(name, in_use.compensating.dump(), version)
         self._recorder.take(samples, events, lost)
 
     def state(self) -> messages.RecorderState:

@@ -5,11 +5,8 @@ The change of an hour is packed into minutes, with rates and intervals to match;
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable
-
 import pytest
-from support.adapting import AXIS, FLOOR_ARCSEC, Work, at_work, truth_of
+from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of
 
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Standing
 
@@ -17,10 +14,7 @@ QUICK = AdaptationSettings(mode="on", half_life_turns=5.0, rate_arcsec_per_hour=
 CHANGING = truth_of(200.0, growth=0.1, second_order_arcsec=1.5)
 WORKED_S = 110.0
 FAULT_S, FAULTY_UNTIL_S = 30.0, 60.0
-COUNT_ARCSEC = AXIS.load_encoder.resolution_arcsec
 OFFSET, SECOND = 12, slice(2, 4)
-
-Misreading = Callable[[int], int]
 
 
 @pytest.fixture(scope="module")
@@ -46,39 +40,11 @@ def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -
     assert work.disbelieved == []
 
 
-def drifts(work: Work) -> Misreading:
-    """By half an arcsec a second."""
-    begun_s = work.time_s
-    return lambda counts: counts + round(0.5 * (work.time_s - begun_s) / COUNT_ARCSEC)
-
-
-def freezes(work: Work) -> Misreading:
-    stuck: list[int] = []
-
-    def reading(counts: int) -> int:
-        stuck.append(counts)
-        return stuck[0]
-
-    return reading
-
-
-def jumps(work: Work) -> Misreading:
-    return lambda counts: counts + round(100.0 / COUNT_ARCSEC)
-
-
-def scatters(work: Work) -> Misreading:
-    """Ten times as much as it did."""
-    noise = random.Random(1)
-    return lambda counts: counts + round(noise.gauss(0.0, 3.0) / COUNT_ARCSEC)
-
-
-@pytest.mark.parametrize("fault", [drifts, freezes, jumps, scatters])
-def test_a_load_encoder_that_fails_freezes_the_adaptation(
-    fault: Callable[[Work], Misreading], left_alone: list[float]
-) -> None:
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_load_encoder_that_fails_freezes_the_adaptation(fault: str, left_alone: list[float]) -> None:
     with at_work(CHANGING, QUICK) as work:
         work.until(FAULT_S)
-        work.faults.load_reading = fault(work)
+        work.faults.load_reading = FAULTS[fault](work)
         begun_s, before = work.time_s, work.adaptation.used_arcsec
         work.until(FAULTY_UNTIL_S)
         report = work.adaptation.report()
@@ -95,3 +61,14 @@ def test_a_load_encoder_that_fails_freezes_the_adaptation(
     assert abs(work.adaptation.used_arcsec - before).max() <= rate * blind_s + 1e-9
     assert all(on <= 1.05 * off for on, off in zip(adapted, left_alone, strict=False))
     assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+
+
+@pytest.mark.slow
+def test_an_hour_by_the_default_settings() -> None:
+    with at_work(truth_of(3600.0), AdaptationSettings(mode="on")) as work:
+        work.until(3600.0)
+        adapted = work.three_sigma_arcsec()
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+    assert work.adaptation.estimate_arcsec[OFFSET] == pytest.approx(8.0, abs=0.5)
+    assert {each["event"] for each in work.history} == {"changed"}
+    assert work.disbelieved == []

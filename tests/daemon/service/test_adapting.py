@@ -63,7 +63,7 @@ def test_what_was_learnt_is_used_again_and_taken_back(tmp_path: Path) -> None:
                 assert changes(bridge) == 1
                 await made.follow()  # it is in use already
                 assert changes(bridge) == 1
-                assert axis.models.in_use is in_use  # by its name, the committed one
+                assert axis.models.in_use.model is in_use.model  # by its name, the committed one
 
                 token = bridge.lease.take("test")
                 await bridge.adaptation_back(token, axis.name)

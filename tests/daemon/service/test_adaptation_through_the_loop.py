@@ -1,0 +1,182 @@
+"""The adaptation through the whole daemon: samples out of the loop, another model into it."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from concurrent.futures import Executor, Future
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from support.adapting import truth_of
+from support.service import Service, play, stepped_service, until
+
+from hdbridge.client import messages
+from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.service.adapting import Adapting
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.effects import Hysteresis
+from hdbridge.evaluation.stepping import Scheme
+
+QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.0, half_life_turns=10.0)
+
+
+@pytest.fixture
+def service(tmp_path: Path):
+    """An axis whose loop is a tenth higher than its model says."""
+    truth = tmp_path / "truth.yaml"
+    grown = truth_of(1e-3, growth=0.1, second_order_arcsec=0.0)
+    truth.write_text(yaml.safe_dump(grown.model_dump(mode="json", by_alias=True, exclude_none=True)))
+    with stepped_service(tmp_path, truth=truth) as made:
+        axes = tuple(replace(each, adaptation=QUICK) for each in made.machine.axes)
+        made.machine = replace(made.machine, axes=axes)
+        yield made
+
+
+@asynccontextmanager
+async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Adapting]]:
+    """As the service process puts it together."""
+    async with service.enabled() as (bridge, token):
+        made = begin(service, bridge)
+        task = asyncio.get_running_loop().create_task(follow(bridge, made))
+        try:
+            yield bridge, token, made
+        finally:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+            made.close()
+
+
+def begin(service: Service, bridge: ServiceBridge) -> Adapting:
+    axis = service.machine.axes[0]
+    made = Adapting(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
+    bridge.adaptations["axis1"] = made
+    bridge.core.observer.add(made)
+    return made
+
+
+async def follow(bridge: ServiceBridge, made: Adapting) -> None:
+    while True:
+        await made.follow()
+        await bridge.core.timing.sleep(1.0)
+
+
+class AtOnce(Executor):
+    """Does what it is given where it is given it."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        done: Future = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) -> None:
+    axis, place = bridge.axes["axis1"], 10.0
+    for step in np.random.default_rng(seed).normal(0.0, 3.0, stands).tolist():
+        place = abs(place + step)
+        bridge.lease.renew(token)
+        await axis.move(token, place)
+        await bridge.core.timing.sleep(0.2)
+
+
+def offset_arcsec(bridge: ServiceBridge) -> float:
+    """Of the model that compensates."""
+    effects = bridge.axes["axis1"].models.in_use.compensating.effects
+    return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
+
+
+def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> None:
+    async def story() -> None:
+        async with adapting(service) as (bridge, token, _):
+            reader = service.daemon.memory.reader()
+            await work(bridge, token, 70)
+            samples, _ = reader.read()
+            samples = samples["axes"][:, 0]
+            stands = (samples["velocity_deg_s"] == 0.0) & (samples["weight"] == 1.0)
+            changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
+            assert 0.0 < float(np.max(changed)) < 0.2  # a cycle: some arcsec are faded in, never at once
+            assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
+            assert service.daemon.told(EventKind.CHANGED)
+            state = bridge.axis_state("axis1").adaptation
+            assert state.mode == messages.AdaptationMode.ON
+            assert state.frozen is None
+            assert state.updated is not None
+            assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
+
+            await bridge.adaptation_back(token, "axis1")
+            assert offset_arcsec(bridge) == 40.0
+            await work(bridge, token, 20, seed=1)
+            assert offset_arcsec(bridge) == 40.0
+            assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
+
+    play(story())
+
+
+def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: Service) -> None:
+    async def story() -> None:
+        async with adapting(service) as (bridge, token, _):
+            await work(bridge, token, 50)
+            learnt = offset_arcsec(bridge)
+            assert learnt > 42.0
+        folder = service.machine.axes[0].profile.folder / "adaptation"
+        assert (folder / "axis1.json").exists()
+        assert len((folder / "axis1.log.jsonl").read_text().splitlines()) >= 1
+        async with service.bridge() as bridge:
+            assert offset_arcsec(bridge) == 40.0
+            made = begin(service, bridge)
+            await until(bridge, lambda: bridge.axis_state("axis1").adaptation.frozen is not None)
+            await made.follow()
+            assert offset_arcsec(bridge) == pytest.approx(learnt)
+            made.close()
+
+    play(story())
+
+
+def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> None:
+    async def story() -> None:
+        async with adapting(service) as (bridge, token, _):
+            await work(bridge, token, 6)
+            stuck = service.daemon.nodes[0].firmware.motion.load_counts
+            service.daemon.nodes[0].faults.load_reading = lambda _: stuck
+            await work(bridge, token, 6, seed=1)
+            frozen = bridge.axis_state("axis1").adaptation.frozen
+            assert frozen is not None
+            assert frozen.startswith("load encoder frozen: it reads")
+
+    play(story())
+
+
+def test_what_was_adapted_stays_with_another_part_of_the_model_and_after_a_job(service: Service) -> None:
+    async def story() -> None:
+        async with adapting(service) as (bridge, token, made):
+            await work(bridge, token, 50)
+            axis = bridge.axes["axis1"]
+            learnt = offset_arcsec(bridge)
+            assert learnt > 42.0
+            await made.set_mode(messages.AdaptationMode.OBSERVE)
+            await axis.compensate(token, Scheme.HYSTERESIS)
+            assert offset_arcsec(bridge) == learnt
+            assert len(axis.models.in_use.compensating.effects) == 1
+            await axis.put_back()  # as after a job, and when the control process begins anew
+            assert offset_arcsec(bridge) == learnt
+
+    play(story())
+
+
+def test_an_axis_works_without_an_adaptation_that_cannot_be(service: Service) -> None:
+    settings = QUICK.model_copy(update={"parameters": ("backlash.gap_arcsec",)})
+    axes = tuple(replace(each, adaptation=settings) for each in service.machine.axes)
+    service.machine = replace(service.machine, axes=axes)
+
+    async def story() -> None:
+        async with adapting(service) as (bridge, token, _):
+            await work(bridge, token, 1)
+            frozen = bridge.axis_state("axis1").adaptation.frozen
+            assert frozen is not None
+            assert "'backlash.gap_arcsec' is nothing that wear or temperature moves" in frozen
+
+    play(story())

@@ -1,0 +1,73 @@
+"""Measure the adaptation: an axis whose gear changes over an hour of work, and load encoders that fail.
+
+python tools/bench/adaptation.py [--minutes 60] [--faulty-minutes 10]
+
+The simulated axis of the article steps without a pause over real frames; within an hour its loop's offset
+grows by a fifth, and its second order by 3 arcsec. Each line is one run: three sigma of where the load
+*really* stood less its target, over eight neighbouring stepping tests (256 stands): the first, the largest,
+the last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+
+from support.adapting import FAULTS, FLOOR_ARCSEC, Work, at_work, truth_of
+
+from hdbridge.daemon.adaptation.settings import AdaptationSettings
+
+NEIGHBOURS = 8
+ON = AdaptationSettings(mode="on")
+
+
+def line(name: str, work: Work, until_s: float, told: str) -> None:
+    """A row of the table."""
+    three_sigma = work.three_sigma_arcsec(NEIGHBOURS)
+    figures = " | ".join(f"{each:.2f}" for each in (three_sigma[0], max(three_sigma), three_sigma[-1]))
+    print(f"| {name} | {until_s / 60.0:.0f} | {figures} | {told} |", flush=True)
+
+
+def measure(name: str, settings: AdaptationSettings | None, until_s: float) -> None:
+    """A run without faults."""
+    with at_work(truth_of(3600.0), settings) as work:
+        work.until(until_s)
+        told = "nothing" if work.adaptation is None else f"{len(work.history)} changes of the model"
+        line(name, work, until_s, told)
+
+
+def measure_fault(name: str, until_s: float) -> None:
+    """A run in the middle of which the load encoder fails."""
+    with at_work(truth_of(3600.0), ON) as work:
+        work.until(0.5 * until_s)
+        failed_s = work.time_s
+        work.faults.load_reading = FAULTS[name](work)
+        work.until(until_s)
+        frozen = next((each for each in work.history if each["event"] == "frozen"), None)
+        told = "never frozen"
+        if frozen is not None:
+            told = f"frozen after {frozen['axis_time_s'] - failed_s:.0f} s: {frozen['reason']}"
+        line(f"on, {name} halfway", work, until_s, told)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=60.0, help="axis time without faults; 0: none")
+    parser.add_argument("--faulty-minutes", type=float, default=10.0, help="axis time of each fault's run")
+    given = parser.parse_args()
+    print(f"Floor {FLOOR_ARCSEC:.2f} arcsec, 1.3 x floor {1.3 * FLOOR_ARCSEC:.2f} arcsec.\n")
+    print("| adaptation | minutes | first | largest | last | told |\n|---|---|---|---|---|---|")
+    if given.minutes:
+        measure("off", None, 60.0 * given.minutes)
+        measure("on", ON, 60.0 * given.minutes)
+    if given.faulty_minutes:
+        measure("off", None, 60.0 * given.faulty_minutes)
+        for name in FAULTS:
+            measure_fault(name, 60.0 * given.faulty_minutes)
+
+
+if __name__ == "__main__":
+    main()
