@@ -12,7 +12,7 @@ import pickle
 from collections.abc import Callable
 from typing import Final
 
-from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
 from hdbridge.control.compensation import Compensation
 from hdbridge.daemon.loop.axissample import AxisSampler
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
@@ -71,7 +71,10 @@ class AxisLoop:
         """Turns until the drive has taken too long."""
         self._why = ""
         """Why the axis stops, where that is no fault of the supervision's."""
-        self._stop_told = True
+        self.stands = True
+        """A stop is over, and told; never False but in QUICK_STOPPED and LATCHED."""
+        self._place = self._still = 0
+        """Motor counts of the last turn of a stop, and turns without a change."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
@@ -158,7 +161,8 @@ class AxisLoop:
             self._stand()
         if state in (AxisState.QUICK_STOPPED, AxisState.LATCHED):
             self.image.power.quick_stop()  # whatever it aimed at: nothing leads back to power but ENABLE
-            self._stop_told = False
+            self.stands = False
+            self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
         self._tell(self.index, EventKind.STATE, 0, state)
         self._answer_waiting(state)
@@ -251,7 +255,7 @@ class AxisLoop:
 
     def _reset(self, command: Command) -> None:
         quick_stopped = self.state is AxisState.QUICK_STOPPED
-        if quick_stopped and (self.cycle.riding or self.image.power.state is State.OPERATION_ENABLED):
+        if quick_stopped and not self.stands:
             raise TransitionError(f"{self.config.name}: the axis is still stopping; wait until it stands")
         if self.state is AxisState.LATCHED and not command.i:
             raise TransitionError(
@@ -345,7 +349,7 @@ class AxisLoop:
                 self._overdue(f"it did not reach 'operation enabled' within {2 * ENABLE_TIMEOUT_S:g} s")
         elif state is AxisState.STOPPING:
             self._after_stopping()
-        elif not self._stop_told:
+        elif not self.stands:
             self._after_stop()
 
     def _after_motion(self) -> None:
@@ -394,18 +398,28 @@ class AxisLoop:
     def _after_stop(self) -> None:
         """A stop is told in full when the axis stands, or when the time for that is over."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
-            self._left -= 1
-            if self.image.power.state is State.OPERATION_ENABLED:
-                if self._left > 0:
-                    return
-                self._why += "; the drive did not obey it, so its voltage is disabled"
-                self._aim_off()
+            if not self._obeyed():
+                return
         elif self.cycle.riding:
             return
-        self._stop_told = True
+        self.stands = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
         self._tell(self.index, EventKind.STOPPED, 0, code, self._stop_words())
+
+    def _obeyed(self) -> bool:
+        """Whether the quick stop of a command is over: the motor stands, or the time for it has passed."""
+        counts, before = self.cycle.feedback.motor_counts, self._place
+        self._place = counts
+        driven = self.image.power.state is State.OPERATION_ENABLED
+        self._still = self._still + 1 if not driven and abs(counts - before) <= 1 else 0
+        self._left -= 1
+        if self._left > 0:
+            return self._still >= STILL_CYCLES
+        if driven:
+            self._why += "; the drive did not obey it, so its voltage is disabled"
+            self._aim_off()
+        return True
 
     def _stop_words(self) -> str:
         """Why the axis stopped."""

@@ -278,10 +278,10 @@ class Controller:
             if axis.state in _AT_REST:
                 continue
             power = axis.image.power
-            if axis.state is AxisState.QUICK_STOPPED and not axis.cycle.riding:
+            if axis.state is AxisState.QUICK_STOPPED and axis.stands:
                 if power.state in _OFF:
                     continue
-                if axis.index not in self._released and power.state is not State.OPERATION_ENABLED:
+                if axis.index not in self._released:
                     # Out of the latch leads the way to no power; nobody is left to give another order.
                     self._released.add(axis.index)
                     self._order(axis, CommandKind.RESET)

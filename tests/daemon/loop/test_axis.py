@@ -267,7 +267,10 @@ def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
     enabled.done(K.QUICK_STOP, -1)
     assert enabled.states == [S.QUICK_STOPPED]
     sent = rpdos(enabled)
-    assert enabled.order(K.RESET).kind is E.REFUSED  # still moving
+    enabled.turn(2)
+    assert enabled.axes[0].image.power.state is State.QUICK_STOP_ACTIVE
+    assert "still stopping" in enabled.order(K.RESET).text
+    assert enabled.told(E.STOPPED) == []
     enabled.run(1.0)
     assert {word for word, _ in sent} == {0x02}
     (stopped,) = enabled.told(E.STOPPED)
