@@ -75,6 +75,14 @@ def test_every_field_that_takes_much_is_bounded(request_):
     assert [*unbounded(request_.model_json_schema(), request_.__name__)] == []
 
 
+@pytest.mark.parametrize("wrong", ["a\nb", "\x1b[2J", "\x9b2J", "\u202egnitirw", "\u2028", "x" * 401, 3])
+def test_a_text_of_a_client_is_one_line_that_moves_no_cursor(wrong):
+    """Others are shown it, and it goes into the log."""
+    with pytest.raises(ValidationError, match="client"):
+        messages.LeaseRequest(client=wrong)
+    assert messages.LeaseRequest(client="Zelle 3, Prüfstand \u2192 Süd").client
+
+
 def test_a_report_ignores_what_a_newer_daemon_adds():
     state = messages.LeaseState.model_validate({"held": False, "timeout_s": 5.0, "colour": "red"})
     assert not state.held

@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 WORDS_MAXIMUM: Final = 400
 """Characters of a text that a client gives."""
 
+_PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
+"""Nothing that moves a terminal's cursor, begins a line in a log or turns the direction of writing."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 """A number, not the text of one; NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
@@ -23,9 +25,7 @@ Acceleration = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=86_400)]
 Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """Of an axis or a machine, as in its file."""
-Words = Annotated[
-    str, StringConstraints(strict=True, max_length=WORDS_MAXIMUM, pattern=r"^[^\x00-\x1f\x7f]*$")
-]
+Words = Annotated[str, StringConstraints(strict=True, max_length=WORDS_MAXIMUM, pattern=_PRINTABLE)]
 """One line of text."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -63,6 +64,10 @@ def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
 
 
 def _add_pages(app: FastAPI, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
+    @cache
+    def described() -> str:
+        return describe.page(app.openapi())
+
     @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
     async def get_description() -> JSONResponse:
         """The description of the API, OpenAPI 3.1."""
@@ -72,7 +77,7 @@ def _add_pages(app: FastAPI, bridge: Bridge, metrics: Metrics, traffic: Traffic)
     async def get_docs() -> HTMLResponse:
         """The same for a person."""
         policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
-        return HTMLResponse(describe.page(app.openapi()), headers={"Content-Security-Policy": policy})
+        return HTMLResponse(described(), headers={"Content-Security-Policy": policy})
 
     @app.get("/", include_in_schema=False)
     async def get_page() -> Response:

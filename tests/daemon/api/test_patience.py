@@ -1,0 +1,66 @@
+"""Clients that begin and do not go on: closed after their time, which is a short one here."""
+
+import socket
+
+import pytest
+from support.api import served
+from support.fake_bridge import FakeBridge
+
+from hdbridge.daemon.api import guard, server
+
+
+@pytest.fixture(scope="module")
+def hasty(tmp_path_factory):
+    """A server that waits for a fifth of a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "HEAD_S", 0.2)
+        patch.setattr(guard, "BODY_S", 0.2)
+        with served(FakeBridge(), tmp_path_factory.mktemp("api")) as place:
+            yield place
+
+
+def said(place, sent: bytes) -> bytes:
+    """What comes back until the server closes the connection; the client itself never does."""
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.settimeout(60)
+        raw.connect(str(place.socket))
+        raw.sendall(sent)
+        received = b""
+        while part := raw.recv(65536):
+            received += part
+    return received
+
+
+def test_who_says_nothing_or_half_a_request_is_closed(hasty):
+    assert said(hasty, b"") == b""
+    assert said(hasty, b"GET /healthz HTTP/1.1\r\nHost: local") == b""
+
+
+def test_half_a_second_request_is_closed_after_the_first_was_answered(hasty):
+    whole = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    answer = said(hasty, whole + b"GET /heal")
+    assert answer.count(b"HTTP/1.1 200") == 1
+
+
+def test_a_body_that_does_not_come_is_told(hasty):
+    head = b"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 9\r\n\r\n"
+    assert b"HTTP/1.1 408" in said(hasty, head + b"{")
+    assert hasty.bridge.stopped == []
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(100),
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"X: " + b"a" * 30_000,
+        b"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n{}",
+        b"POST /api/v1/stop HTTP/1.1\r\nHost: a\r\nHost: localhost\r\n\r\n",
+        b"GET /api/v1/live HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n",
+    ],
+    ids=["tls", "long head", "two lengths", "two hosts", "half an upgrade"],
+)
+def test_what_is_no_request_is_refused_and_the_next_one_served(hasty, sent):
+    assert said(hasty, sent)[:12] in {b"HTTP/1.1 400", b"HTTP/1.1 421", b"HTTP/1.1 426"}
+    assert hasty.bridge.stopped == []
+    with hasty.over_socket() as client:
+        assert client.get("/state").status_code == 200
