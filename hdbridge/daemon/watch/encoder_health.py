@@ -27,7 +27,7 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray
-from hdbridge.daemon.watch.residual import Residuals, joined, residuals
+from hdbridge.daemon.watch.residual import Residuals, any_of, joined, residuals
 from hdbridge.daemon.watch.signs import (
     SIDE,
     Trend,
@@ -46,8 +46,8 @@ UNSEATED = (AxisState.UNVERIFIED, AxisState.LENT)
 """Afterwards the encoders' zeros may be others."""
 TAIL = 64
 """Samples that are looked at again with the next batch."""
-LOOK_S = 0.1
-"""How often the new samples are looked at."""
+LOOK_SAMPLES = 25
+"""So many new samples are looked at together: ten times a second, at 250 Hz."""
 BLOCK_S = 0.25
 BLOCK_SAMPLES = 20
 """A block of fewer usable samples says nothing."""
@@ -61,6 +61,8 @@ TREND_BLOCKS = 120
 """Blocks that a trend is taken from, at least; and, for a fast one, at most."""
 TREND_KEPT = 720
 TREND_EVERY = 20
+STEP_S = 180.0
+"""A step is looked for in the last of this time."""
 UNMODELLED_ARCSEC = 3.0
 """Residual of a model that does not say what it left on held-out data."""
 
@@ -139,6 +141,8 @@ class EncoderHealth:
         self._load_count_arcsec = axis.load_encoder.resolution_arcsec
         self._residual_arcsec = residual_of(model)
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
+        self._learned: dict[bool, float] = {}
+        """What the jitter usually is, at rest and in motion."""
         self._tail: SampleArray | None = None
         self._pending: list[Residuals] = []
         self._pending_samples = 0
@@ -178,16 +182,16 @@ class EncoderHealth:
         self._forget_place()
 
     def take(self, samples: SampleArray) -> Judgement:
-        """Judge the next samples of the loop, oldest first; they are looked at ten times a second."""
+        """Judge the next samples of the loop, oldest first; some are looked at together."""
         if len(samples):
             self._waiting.append(samples)
-        if sum(map(len, self._waiting)) * self._period_s >= LOOK_S:
+        if sum(map(len, self._waiting)) >= LOOK_SAMPLES:
             waiting, self._waiting = self._waiting, []
             self._look(waiting[0] if len(waiting) == 1 else np.concatenate(waiting))
         return self.judgement
 
     def _look(self, samples: SampleArray) -> None:
-        if np.any(np.isin(samples["axes"]["state"][:, self._place], UNSEATED)):
+        if any_of(samples["axes"]["state"][:, self._place], UNSEATED).any():
             self.reset()
         tail = self._tail
         if tail is not None and samples["cycle"][0] <= tail["cycle"][-1]:
@@ -209,12 +213,17 @@ class EncoderHealth:
         self._pending, self._pending_samples = [], 0
 
     def _usual(self, *, standing: bool) -> float:
+        return self._learned.get(standing, self._residual_arcsec)
+
+    def _learn(self, jitter_arcsec: float, *, standing: bool) -> None:
         known = self._jitters[standing]
-        if len(known) < LEARNED:
-            return self._residual_arcsec
-        # In motion the load shakes at some speeds more than at others: what is usual is the most of them.
-        typical = np.median(known) if standing else np.quantile(known, 0.9)
-        return max(float(typical), 0.3 * self._load_count_arcsec)
+        if len(known) >= REMEMBERED:
+            return
+        known.append(jitter_arcsec)
+        if len(known) >= LEARNED:
+            # In motion the load shakes at some speeds more than at others: what is usual is the most of them.
+            typical = np.median(known) if standing else np.quantile(known, 0.9)
+            self._learned[standing] = max(float(typical), 0.3 * self._load_count_arcsec)
 
     def _blame(self, fault: EncoderFault, why: str) -> None:
         self._bad_s = self._now_s
@@ -268,10 +277,10 @@ class EncoderHealth:
             )
 
     def _gather(self, found: Residuals) -> None:
-        """Blocks of a second; each is judged when it is full."""
+        """Blocks of `BLOCK_S` or more; each is judged when it is full."""
         self._pending.append(found)
         self._pending_samples += len(found)
-        if self._pending_samples * self._period_s < BLOCK_S:
+        if self._pending_samples < max(BLOCK_S / self._period_s, LOOK_SAMPLES):
             return
         block = joined(self._pending)
         self._pending, self._pending_samples = [], 0
@@ -296,8 +305,8 @@ class EncoderHealth:
                 f"its readings jitter by {jitter:.2f} arcsec {'at rest' if standing else 'in motion'}, "
                 f"usually by {usual:.2f} (at most {self.limits.noise_ratio:g} times as much is allowed)",
             )
-        elif not noisy and self._fault is None and len(self._jitters[standing]) < REMEMBERED:
-            self._jitters[standing].append(jitter)
+        elif not noisy and self._fault is None:
+            self._learn(jitter, standing=standing)
 
     def _judge_zero(self, block: Residuals) -> None:
         zero = self._zero
@@ -317,7 +326,7 @@ class EncoderHealth:
         zero.new = 0
         blocks = np.array(zero.blocks, dtype=np.float64)
         found = [trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS)]
-        step = find_step(*blocks.T)
+        step = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
         if step is not None:
             self._blame(
                 EncoderFault.JUMPED,

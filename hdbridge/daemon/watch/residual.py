@@ -62,6 +62,14 @@ class Residuals:
         return Residuals(*(getattr(self, name)[chosen] for name in self.__slots__))
 
 
+def any_of(states: NDArray[np.uint8], wanted: Sequence[AxisState]) -> BoolArray:
+    """Where an axis is in one of these states."""
+    found = states == wanted[0]
+    for each in wanted[1:]:
+        found |= states == each
+    return np.asarray(found)
+
+
 def joined(parts: Sequence[Residuals]) -> Residuals:
     """One after the other."""
     names = Residuals.__slots__
@@ -80,7 +88,7 @@ def residuals(samples: SampleArray, place: int, ratio: float, period_s: float) -
     predicted: FloatArray = axis["predicted_arcsec"]
     needed = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
     usable = (flags & (needed | SampleFlag.CHANGING)) == needed
-    usable &= np.isin(axis["state"], DRIVEN) & np.isfinite(predicted)
+    usable &= any_of(axis["state"], DRIVEN) & np.isfinite(predicted)
     if len(samples) > 1:
         lag_s = _lag_s(axis["issued_deg"] - motor, ratio * velocity, usable)
         if lag_s:

@@ -21,6 +21,10 @@ _MEDIAN = 1.25
 """Deviation of a median of few, by that of a mean."""
 PREDICTED_SHARE = 0.5
 """Of what the model says changes meanwhile, so much may be said too early or too late."""
+UNMODELLED_ARCSEC = 20.0
+UNMODELLED_DEG = 36.0
+"""So much the gear's error may change over so much travel of the motor, or more, in a way that no model says:
+ten times per turn by 10 arcsec to either side (`effects.motor_order` is 3 at most)."""
 SHAKE_S = 0.002
 """A change of speed may show in the error as so much time: wind-up, and the skew between two encoders."""
 
@@ -58,6 +62,7 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas
         + count_arcsec
         + PREDICTED_SHARE * _span(found.predicted_arcsec, span)
         + SHAKE_S * ARCSEC_PER_DEG * _span(found.velocity_deg_s, span)
+        + UNMODELLED_ARCSEC * np.minimum(_span(found.motor_deg, span) / UNMODELLED_DEG, 1.0)
     )
     together = np.all(sliding_window_view(found.usable, span), axis=1)
     together &= found.cycle[span - 1 :] - found.cycle[: len(together)] < 2 * span
@@ -144,8 +149,10 @@ def find_step(
     if not len(likely):
         return None
     row = int(np.argmax(likely)) + STEP_BLOCKS + 1
-    stepped = _fit(np.column_stack([np.arange(count) >= row, plain]), residual_arcsec)
-    sloping = _fit(np.column_stack([time_s - time_s[0], plain]), residual_arcsec)
+    # With a trend in both: a ramp that begins or ends is no step.
+    trended = np.column_stack([time_s - time_s[0], plain])
+    stepped = _fit(np.column_stack([np.arange(count) >= row, trended]), residual_arcsec)
+    sloping = _fit(trended, residual_arcsec)
     if stepped is None or sloping is None:
         return None
     solution, left, error = stepped

@@ -31,7 +31,7 @@ def model_of(offset=31.6, second=13.7, phase=161.5):
 MODEL = model_of()
 
 
-def judged(samples, health=None, batch=25):
+def judged(samples, health=None, batch=50):
     """The judgements over the samples: when each first came, and what it said."""
     health = health or EncoderHealth(AXIS, MODEL)
     seen = []

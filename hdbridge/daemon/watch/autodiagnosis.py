@@ -1,0 +1,165 @@
+"""Diagnoses the last minutes of an axis by itself, when the watch has raised something.
+
+Export and diagnosis are the commands that a person would type, in processes that get the processor only when
+nobody else wants it. What they give stands next to the recordings:
+
+    FOLDER/diagnoses/DATE-AXIS/record/          the record (hdbridge record export)
+    FOLDER/diagnoses/DATE-AXIS/model.yaml       the model that was in use
+    FOLDER/diagnoses/DATE-AXIS/diagnosis.json   what hdbridge diagnose found, and a page for a person
+    FOLDER/diagnoses/DATE-AXIS/log.txt          what the commands said
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from hdbridge.errors import HdbridgeError
+from hdbridge.files.atomic import new_folder, write_atomically
+
+DIAGNOSES: Final = "diagnoses"
+RECORD: Final = "record"
+RESULT: Final = "diagnosis.json"
+LONGEST_S: Final = 1800.0
+"""A diagnosis that takes longer is ended."""
+APART_S: Final = 3600.0
+"""Of one axis no more than one in so long."""
+_NS: Final = 10**9
+_log = logging.getLogger(__name__)
+
+
+class AutoDiagnosis:
+    """One at a time, in a thread that waits for the process."""
+
+    def __init__(
+        self,
+        folder: Path,
+        tell: Callable[[str, str], None],
+        *,
+        wall_ns: Callable[[], int] = time.time_ns,
+        apart_s: float = APART_S,
+    ) -> None:
+        """``folder`` is that of the flight recorder; ``tell`` gets axis and result, in another thread."""
+        self._folder = folder
+        self._tell = tell
+        self._wall_ns = wall_ns
+        self._apart_s = apart_s
+        self._last_ns: dict[str, int] = {}
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._threads: list[threading.Thread] = []
+
+    def ask(self, axis: str, model_text: str, minutes: float, reason: str) -> bool:
+        """Diagnose the last minutes; False where this axis was diagnosed a short while ago."""
+        now_ns = self._wall_ns()
+        last_ns = self._last_ns.get(axis)
+        if self._ended.is_set() or (last_ns is not None and now_ns - last_ns < self._apart_s * _NS):
+            return False
+        self._last_ns[axis] = now_ns
+        thread = threading.Thread(
+            target=self._run, args=(axis, model_text, minutes, reason, now_ns), name="diagnosis", daemon=True
+        )
+        self._threads = [each for each in self._threads if each.is_alive()] + [thread]
+        thread.start()
+        return True
+
+    def close(self) -> None:
+        """End what runs."""
+        self._ended.set()
+        process = self._process
+        if process is not None:
+            with suppress(ProcessLookupError):
+                process.kill()
+        for each in self._threads:
+            each.join()
+
+    def wait(self) -> None:
+        """Until nothing runs any more."""
+        for each in self._threads:
+            each.join()
+
+    def _run(self, axis: str, model_text: str, minutes: float, reason: str, now_ns: int) -> None:
+        with self._lock:
+            try:
+                self._tell(axis, self._diagnosed(axis, model_text, minutes, reason, now_ns))
+            except (HdbridgeError, OSError, subprocess.SubprocessError) as problem:
+                if not self._ended.is_set():
+                    self._tell(axis, f"the diagnosis was not made: {problem}")
+            except Exception:
+                _log.exception("an automatic diagnosis failed")
+
+    def _diagnosed(self, axis: str, model_text: str, minutes: float, reason: str, now_ns: int) -> str:
+        date = datetime.fromtimestamp(now_ns / _NS, UTC)
+        folder = new_folder(self._folder / DIAGNOSES / f"{date:%Y%m%dT%H%M%SZ}-{axis}")
+        begin = datetime.fromtimestamp(now_ns / _NS - 60.0 * minutes, UTC)
+        model = folder / "model.yaml"
+        write_atomically(model, model_text)
+        write_atomically(folder / "why.txt", reason + "\n")
+        self._command(
+            folder,
+            "record", "export", self._folder, "--axis", axis, "--from", begin.isoformat(),
+            "--out", folder / RECORD,
+        )  # fmt: skip
+        self._command(
+            folder,
+            "diagnose", folder / RECORD, "--model", model,
+            "--json", folder / RESULT, "--html", folder / "diagnosis.html",
+        )  # fmt: skip
+        found = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        return f"{summary(found)}; {folder}"
+
+    def _command(self, folder: Path, *arguments: object) -> None:
+        """Run one command of hdbridge to its end, with the lowest claim to the processor."""
+        line = [sys.executable, "-m", "hdbridge", *map(str, arguments)]
+        with (folder / "log.txt").open("ab") as log:
+            process = subprocess.Popen(
+                line, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+            self._process = process
+            try:
+                _yield_to_all(process.pid)
+                if self._ended.is_set():
+                    process.kill()
+                status = process.wait(LONGEST_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                raise
+            finally:
+                self._process = None
+        if status:
+            said = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise HdbridgeError(said[-1] if said else f"'hdbridge {arguments[0]}' ended with {status}")
+
+
+def summary(found: dict[str, Any]) -> str:
+    """A diagnosis in one line."""
+    findings: Sequence[dict[str, Any]] = found["findings"]
+    baseline, floor = found["baseline"]["rms_arcsec"], found["noise_floor_arcsec"]
+    named = ", ".join(
+        f"{each['cause']} ({100.0 * each['probability']:.0f} %, {each['peak_arcsec']:.1f} arcsec)"
+        for each in findings[:3]
+    )
+    return (
+        f"diagnosis: {named or 'nothing that it could name'}; the model is {baseline:.2f} arcsec rms off, "
+        f"the noise is {floor:.2f}"
+    )
+
+
+def _yield_to_all(pid: int) -> None:
+    """Only what nobody else wants of the processor."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, 19)
+    with suppress(OSError):
+        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
