@@ -155,7 +155,8 @@ class AxisMotion:
                         return
                     point = self._points[0]
                     await self._goto(activity, point)
-                    if not activity.over:
+                    # The queue may have been cleared while the loop was told of this one.
+                    if not activity.over and self._points and self._points[0] is point:
                         self._points.popleft()
                 await self._leg(activity)
                 await link.until(lambda: bool(activity.over), point.dwell_s)

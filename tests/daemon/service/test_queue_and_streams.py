@@ -1,5 +1,6 @@
 """Way points, streams and coordinated moves: what follows what, and how they end."""
 
+import asyncio
 import math
 from pathlib import Path
 
@@ -64,6 +65,23 @@ def test_a_bad_way_point_takes_none(service: Service) -> None:
                     await axis.queue(token, [WayPoint(2.0), bad])
             await bridge.core.timing.sleep(0.5)
             assert axis.state().load_target_deg == pytest.approx(0.0, abs=0.01)
+
+    play(story())
+
+
+@pytest.mark.parametrize("steps", range(3))
+def test_a_queue_may_be_forgotten_while_its_move_begins(service: Service, steps: int) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.queue(token, [WayPoint(4.0)])
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            await axis.clear_queue(token)
+            await until(bridge, lambda: axis.motion.activity.over != "")
+            state = axis.state()
+            assert state.load_target_deg == pytest.approx(4.0 if state.load_target_deg > 1.0 else 0.0)
+            assert state.at_rest
 
     play(story())
 
