@@ -1,4 +1,4 @@
-"""Write docs/reliability.md: what came of every fault of the suite, on both buses, as a table.
+"""Write docs/reliability.md: what came of every fault of the suite, wherever it is tried, as tables.
 
 python tools/reliability_page.py            try them (minutes; vcan by tools/socketcan.sh), write the page
 python tools/reliability_page.py --check    only say whether the page has the suite's rows
@@ -16,47 +16,105 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tests.support.reliability import RECORD, ROWS, VCAN, VIRTUAL, WORDS, Row, Seen, read_record  # noqa: E402
+from tests.support.reliability import (  # noqa: E402
+    DAEMON,
+    DAEMON_VCAN,
+    FURTHER,
+    RECORD,
+    ROWS,
+    VCAN,
+    VIRTUAL,
+    WORDS,
+    Further,
+    Row,
+    Seen,
+    read_record,
+)
 
 PAGE = ROOT / "docs" / "reliability.md"
+DAEMON_TESTS = sorted(Path("tests/daemon/loop").glob("test_reliability*.py"))
+SOCKETCAN_TESTS = ("tests/socketcan/test_reliability.py",)
 HEAD = """# What faults an axis under way survives
 
 Made by `python tools/reliability_page.py` from `tests/support/reliability.py`. The axis moves at constant
 speed, the fault is made by real frames, and the reaction has to come within the cycles that are allowed.
-After each quick stop and each latch the motor stands. The rows are tested with every change, on the virtual
-bus (4 ms) and on a Linux CAN stack (vcan, 20 ms, master and drive in threads of their own; a dash where vcan
-cannot show the fault). [timing-and-faults.md](timing-and-faults.md) says what the reactions are. Cycles are
-counted from the fault to the reaction, the one that notices it included.
+After each quick stop and each latch the motor stands. The rows are tested with every change:
 
-| fault | expected | within | seen | cycles, virtual | cycles, vcan |
-|---|---|---|---|---|---|
+* *bench*: the control cycle of a bench, on the virtual bus (4 ms) and on a Linux CAN stack (vcan, 20 ms,
+  master and drive in threads of their own; a dash where vcan cannot show the fault);
+* *daemon*: the daemon's control loop with two axes in motion, on the virtual bus. After each row the other
+  axis has gone on (or has stopped, where the whole bus is concerned), no further set-point was sent to the
+  one that stopped, and every command but a reset was refused. The reset by the service led to disabled,
+  where the axis stood; enabled by command it moved again.
+
+[timing-and-faults.md](timing-and-faults.md) says what the reactions are. Cycles are counted from the fault to
+the reaction, the one that notices it included.
+
+| fault | expected | within | seen | bench | bench, vcan | daemon |
+|---|---|---|---|---|---|---|
+"""
+FURTHER_HEAD = """
+## What only the daemon shows
+
+On the virtual bus, in cycles of 4 ms; 0 where nothing may happen.
+
+| fault | expected | within | taken |
+|---|---|---|---|
+"""
+DAEMON_VCAN_HEAD = """
+## The daemon as processes, on vcan
+
+`hdbridge run` and `hdbridge simulate` as real processes on a Linux CAN stack (20 ms), in seconds, as a client
+of the daemon sees it. The clock is the guest's own (`tools/socketcan.sh --slowed`): see
+[timing-and-faults.md](timing-and-faults.md).
+
+| fault | expected | within | taken |
+|---|---|---|---|
 """
 
 
 def rows() -> list[str]:
     """The first three columns of each row, as the page has to have them."""
-    return [f"| {row.name} | {_expected(row)} | {_within(row)} |" for row in ROWS]
+    further = [
+        f"| {each.name} | {each.expected} | {each.allowed:g} |"
+        for place in (DAEMON, DAEMON_VCAN)
+        for each in FURTHER
+        if each.place == place
+    ]
+    return [f"| {row.name} | {_expected(row)} | {_within(row)} |" for row in ROWS] + further
 
 
 def rows_of_page(text: str) -> list[str]:
     """The same of a page."""
-    lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    lines = [line for line in text.splitlines() if line.startswith("| ") and not line.startswith("| fault |")]
     return ["|".join(line.split("|")[:4]) + "|" for line in lines]
 
 
 def page(seen: list[Seen]) -> str:
     """The page of what was seen; SystemExit where a row was not tried or failed."""
-    found = {(each.name, each.bus): each for each in seen}
+    found = {(each.name, each.place): each for each in seen}
+
+    def seen_of(name: str, place: str) -> Seen:
+        if (name, place) not in found:
+            raise SystemExit(f"'{name}' was not tried on {place}: look at the tests")
+        return found[name, place]
+
     lines = []
-    for row, begun in zip(ROWS, rows(), strict=True):
-        here = {bus: found.get((row.name, bus)) for bus in row.buses}
-        missing = [bus for bus, each in here.items() if each is None]
-        if missing:
-            raise SystemExit(f"'{row.name}' was not tried on {', '.join(missing)}: look at the tests")
-        words = " / ".join(dict.fromkeys(each.seen for each in here.values() if each))
-        cells = [str(each.cycles) if (each := here.get(bus)) else "–" for bus in (VIRTUAL, VCAN)]
-        lines.append(f"{begun} {words} | {cells[0]} | {cells[1]} |")
-    return HEAD + "\n".join(lines) + "\n"
+    for row in ROWS:
+        here = {place: seen_of(row.name, place) for place in row.places}
+        words = " / ".join(dict.fromkeys(each.seen for each in here.values()))
+        cells = [f"{each.taken:g}" if (each := here.get(place)) else "–" for place in (VIRTUAL, VCAN, DAEMON)]
+        lines.append(f"| {row.name} | {_expected(row)} | {_within(row)} | {words} | {' | '.join(cells)} |")
+    text = HEAD + "\n".join(lines) + "\n"
+    for place, head in ((DAEMON, FURTHER_HEAD), (DAEMON_VCAN, DAEMON_VCAN_HEAD)):
+        of_place = [each for each in FURTHER if each.place == place]
+        if of_place:
+            text += head + "\n".join(_further(each, seen_of(each.name, place)) for each in of_place) + "\n"
+    return text
+
+
+def _further(row: Further, seen: Seen) -> str:
+    return f"| {row.name} | {row.expected} | {row.allowed:g} | {seen.taken:g} |"
 
 
 def _expected(row: Row) -> str:
@@ -68,14 +126,14 @@ def _within(row: Row) -> str:
 
 
 def try_all() -> list[Seen]:
-    """Run the suite on both buses."""
+    """Run the suite everywhere."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "record.jsonl"
         environment = {**os.environ, RECORD: str(record)}
         pytest = [sys.executable, "-m", "pytest", "-q"]
         for command in (
-            [*pytest, "tests/cycle/test_reliability.py"],
-            ["tools/socketcan.sh", *pytest, "tests/socketcan/test_reliability.py"],
+            [*pytest, "tests/cycle/test_reliability.py", *map(str, DAEMON_TESTS)],
+            ["tools/socketcan.sh", "--slowed", "50", *pytest, *map(str, SOCKETCAN_TESTS)],
         ):
             if status := subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode:
                 raise SystemExit(status)

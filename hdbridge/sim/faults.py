@@ -25,6 +25,8 @@ class Faults:
     """The next n come twice."""
     hold_tpdos: int = 0
     """The next n come delayed by one SYNC, after the fresh ones."""
+    reverse_tpdos: int = 0
+    """Those of the next n SYNCs come in reverse order."""
     mute_heartbeat: bool = False
     """The heartbeat stops, the rest goes on."""
     silent: bool = False
@@ -86,7 +88,12 @@ class Faults:
     def concerns_tpdos(self) -> bool:
         """For the node: whether TPDOs go through ``spoil``."""
         return bool(
-            self._held or self.drop_tpdos or self.shorten_tpdos or self.duplicate_tpdos or self.hold_tpdos
+            self._held
+            or self.drop_tpdos
+            or self.shorten_tpdos
+            or self.duplicate_tpdos
+            or self.hold_tpdos
+            or self.reverse_tpdos
         )
 
     def spoil(self, tpdos: list[Outgoing]) -> list[Outgoing]:
@@ -107,4 +114,7 @@ class Faults:
                 sent += [(can_id, data), (can_id, data)]
             else:
                 sent.append((can_id, data))
+        if self.reverse_tpdos > 0:
+            self.reverse_tpdos -= 1
+            sent.reverse()
         return sent + late

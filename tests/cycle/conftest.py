@@ -85,6 +85,7 @@ class Rig:
     supervision: Supervision
     intruder: can.BusABC
     target: int = 0
+    bad: float | None = None
 
     def enable(self) -> None:
         self.drive.enable(Mode.CSP)
@@ -96,11 +97,20 @@ class Rig:
         assert self.drive.image.power.state is State.OPERATION_ENABLED
         self.target = feedback.motor_counts
 
+    @property
+    def period_s(self) -> float:
+        return self.cycle.period_s
+
+    def bad_target(self, counts: float) -> None:
+        """What the next cycle is to command."""
+        self.bad = counts
+
     def move(self, cycles: int = 1) -> Feedback:
         """Go on at constant speed."""
         for _ in range(cycles):
             self.target += STEP_COUNTS
-            feedback = self.cycle.tick(self.target)
+            bad, self.bad = self.bad, None
+            feedback = self.cycle.tick(self.target if bad is None else bad)  # type: ignore[arg-type]
         return feedback
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:

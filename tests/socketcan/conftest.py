@@ -82,7 +82,7 @@ def interface() -> Iterator[str]:
     ip("link", "set", "up", CHANNEL)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def profile() -> Path:
     return unhurried_profile()
 

@@ -60,10 +60,15 @@ class VcanBench:
     interface: str
 
     def __post_init__(self) -> None:
-        self.supervision, self.cycle = self.master.supervision, self.master.cycle
+        self.supervision, self.period_s = self.master.supervision, self.master.cycle.period_s
+        self.bad: float | None = None
 
     def move(self) -> Any:
-        return self.master.move()
+        bad, self.bad = self.bad, None
+        return self.master.move() if bad is None else self.master.cycle.tick(bad)
+
+    def bad_target(self, counts: float) -> None:
+        self.bad = counts
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
         kind = {"is_extended_id": False, **kind}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -44,11 +45,12 @@ class SpoiltBus(LockstepBus):
         self.no_room_for: int | None = None
         """Identifier of a frame for which the transmit queue is full, once."""
         self.spy: Callable[[int, bytes], None] | None = None
-        self.down = False
+        self.down: int | None = None
+        """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if self.down:
-            raise can.CanOperationError("Network is down", errno.ENETDOWN)
+        if self.down is not None:
+            raise can.CanOperationError(os.strerror(self.down), self.down)
         if msg.arbitration_id == self.no_room_for:
             self.no_room_for = None
             raise can.CanOperationError("Transmit buffer full", errno.ENOBUFS)
@@ -57,8 +59,8 @@ class SpoiltBus(LockstepBus):
         super().send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.down:
-            raise can.CanOperationError("Network is down", errno.ENETDOWN)
+        if self.down is not None:
+            raise can.CanOperationError(os.strerror(self.down), self.down)
         return super().recv(timeout)
 
 
@@ -112,17 +114,18 @@ class SteppedDaemon:
 
     def __init__(
         self,
-        controller: Controller,
+        begin: Callable[[], Controller],
         memory: Memory,
         clock: VirtualClock,
         bus: SpoiltBus,
         nodes: Sequence[SimulatedDrive],
         intruder: VirtualBus,
     ) -> None:
-        self.controller, self.memory, self.clock = controller, memory, clock
+        self._begin, self.memory, self.clock = begin, memory, clock
         self.bus, self.nodes, self.intruder = bus, nodes, intruder
-        self.axes = controller.axes
-        self.period_s = controller.cycle.period_s
+        self.controller = begin()
+        self.axes = self.controller.axes
+        self.period_s = self.controller.cycle.period_s
         self.service_clock = SteppedClock(self)
         self.samples = memory.reader()
         self._events = memory.event_reader()
@@ -233,9 +236,15 @@ class SteppedDaemon:
 
     # ---------------------------------------------------------------- what goes wrong
 
-    def interfere(self, can_id: int, data: bytes = b"") -> None:
+    def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
         """A frame from another node, on the bus before the next turn."""
-        self.intruder.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        kind = {"is_extended_id": False, **kind}
+        self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
+
+    def begin_again(self) -> None:
+        """The control process has been killed, and the keeper starts another with the same memory."""
+        self.controller = self._begin()
+        self.axes = self.controller.axes
 
     def hang(self, duration_s: float) -> None:
         """The control process does nothing for so long; the drives go on."""
@@ -273,15 +282,17 @@ def stepped_daemon(
         intruder = stack.enter_context(VirtualBus(channel))
         spoilt = stack.enter_context(SpoiltBus(channel, clock))
         memory = stack.enter_context(Memory.create(len(configs), configs[0].drive.cycle_s))
-        cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=1_000_000)
-        setups = [
-            setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
-        ]
 
         def reopen() -> Link | None:
-            return None if spoilt.down else Link(spoilt, clock)
+            return None if spoilt.down is not None else Link(spoilt, clock)
 
-        controller = Controller(cycle, setups, memory, reopen)
-        daemon = SteppedDaemon(controller, memory, clock, spoilt, nodes, intruder)
+        def begin() -> Controller:
+            cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=1_000_000)
+            setups = [
+                setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
+            ]
+            return Controller(cycle, setups, memory, reopen)
+
+        daemon = SteppedDaemon(begin, memory, clock, spoilt, nodes, intruder)
         stack.callback(daemon._relay.shutdown)
         yield daemon

@@ -1,6 +1,8 @@
-"""The faults that an axis under way has to survive, as rows; each bus has a bench on which they are tried.
+"""The faults that an axis under way has to survive, as rows, and where each is tried.
 
-`docs/reliability.md` is made of what came of them, by ``tools/reliability_page.py``.
+A *place* is a control cycle on a bus: the bench's on the virtual bus and on vcan, the daemon's on the virtual
+bus. Each has a `Bench`. What only a daemon can show is in `FURTHER`, each with a test of its own.
+`docs/reliability.md` is made of what came of all, by ``tools/reliability_page.py``.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from hdbridge.control.cycle import Cycle
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
 from hdbridge.sim.node import SimulatedDrive
@@ -28,7 +29,8 @@ WORDS: Final = {
     Reaction.QUICK_STOP: "quick stop",
     Reaction.LATCH: "latch",
 }
-VIRTUAL, VCAN = "virtual", "vcan"
+VIRTUAL, VCAN, DAEMON = "virtual", "vcan", "daemon"
+DAEMON_VCAN = "daemon on vcan"
 
 
 class Bench(Protocol):
@@ -36,7 +38,7 @@ class Bench(Protocol):
 
     node: SimulatedDrive
     supervision: Supervision
-    cycle: Cycle
+    period_s: float
 
     def move(self) -> Any:
         """One cycle further at constant speed."""
@@ -50,6 +52,8 @@ class Bench(Protocol):
     def interface_down(self) -> None: ...
     def interface_deleted(self) -> None: ...
     def transmit_queue_full(self) -> None: ...
+    def bad_target(self, counts: float) -> None:
+        """What the next cycle is to command, motor counts."""
 
 
 Wish = Callable[[Bench], object]
@@ -67,9 +71,9 @@ class Row:
     """Cycles; or ``heartbeats``: until the drive's heartbeat counts as lost."""
     again: bool = False
     """Made before each cycle, not once."""
-    buses: tuple[str, ...] = (VIRTUAL, VCAN)
-    command: Callable[[Any], Any] | None = None
-    """In place of the next target."""
+    places: tuple[str, ...] = (VIRTUAL, VCAN, DAEMON)
+    everybody: bool = False
+    """It concerns every axis of the bus, not one."""
 
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
         """The same in cycles of an axis."""
@@ -94,6 +98,12 @@ def _frame(can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> Wish
     return make
 
 
+def _glitch(bench: Bench, counts: int) -> None:
+    """The next sample of the load encoder is wrong by so much."""
+    jumps = [counts]
+    bench.node.faults.load_reading = lambda right: right + (jumps.pop() if jumps else 0)
+
+
 _F, _R = Fault, Reaction
 _EMCY = struct.pack("<HB5x", 0x3110, 1)
 ROWS: Final = (
@@ -105,7 +115,7 @@ ROWS: Final = (
     Row("TPDOs are short in two cycles in a row", _drive(shorten_tpdos=4), _F.WRONG_LENGTH, _R.QUICK_STOP, 2),
     Row("a remote frame", _frame(0x181, is_remote_frame=True), _F.DISCARDED_FRAME, _R.GO, 1),
     Row("a 29-bit identifier", _frame(0x181, bytes(8), is_extended_id=True), _F.DISCARDED_FRAME, _R.GO, 1,
-        buses=(VIRTUAL,)),
+        places=(VIRTUAL, DAEMON)),
     Row("a stale TPDO before SYNC", _frame(0x181, bytes(8)), _F.DUPLICATE_TPDO, _R.GO, 1),
     Row("the drive falls silent (cable pulled)", _drive(silent=True), _F.LOST_TPDO, _R.QUICK_STOP, 2),
     Row("the drive's heartbeat stays away", _drive(mute_heartbeat=True), _F.HEARTBEAT_LOST, _R.QUICK_STOP,
@@ -119,38 +129,92 @@ ROWS: Final = (
         _F.DROPPED_OUT, _R.QUICK_STOP, 2),
     Row("the load encoder jumps and stays away", _drive(load_jump_counts=100_000), _F.ENCODER_JUMP,
         _R.QUICK_STOP, 3),
-    Row("SYNC of another master", _frame(0x080), _F.FOREIGN_SYNC, _R.QUICK_STOP, 1),
+    Row("the load encoder jumps for one sample", lambda bench: _glitch(bench, 100_000), _F.ENCODER_JUMP,
+        _R.FREEZE, 2),
+    Row("SYNC of another master", _frame(0x080), _F.FOREIGN_SYNC, _R.QUICK_STOP, 1, everybody=True),
     Row("a set-point of another master", _frame(0x201, bytes(6)), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1),
-    Row("heartbeat of another master", _frame(0x77F, b"\x05"), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1),
-    Row("an NMT command of another master", _frame(0, b"\x01\x05"), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1),
+    Row("heartbeat of another master", _frame(0x77F, b"\x05"), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1,
+        everybody=True),
+    Row("an NMT command of another master", _frame(0, b"\x01\x05"), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1,
+        everybody=True),
     Row("an SDO request of another client", _frame(0x601, bytes(8)), _F.OWN_ID_ELSEWHERE, _R.QUICK_STOP, 1),
     Row("a node babbles", _frame(0x7E5, bytes(8), 300), _F.FLOOD, _R.QUICK_STOP, 2, again=True,
-        buses=(VIRTUAL,)),
-    Row("a cycle starts 0.7 periods late", lambda bench: bench.hang(1.7 * bench.cycle.period_s), _F.OVERRUN,
+        everybody=True, places=(VIRTUAL, DAEMON)),
+    Row("a cycle starts 0.7 periods late", lambda bench: bench.hang(1.7 * bench.period_s), _F.OVERRUN,
         _R.GO, 1),
-    Row("two cycles in a row start late", lambda bench: bench.hang(1.7 * bench.cycle.period_s), _F.OVERRUN,
-        _R.QUICK_STOP, 2, again=True),
-    Row("the master's process hangs for 0.5 s", lambda bench: bench.hang(0.5), _F.HANG, _R.GO, 1),
-    Row("a target that is not a number", lambda bench: None, _F.BAD_TARGET, _R.QUICK_STOP, 1,
-        command=lambda feedback: math.nan),
-    Row("a target beyond 32 bits", lambda bench: None, _F.BAD_TARGET, _R.QUICK_STOP, 1,
-        command=lambda feedback: 1 << 31),
-    Row("the interface goes down", lambda bench: bench.interface_down(), _F.BUS_DOWN, _R.LATCH, 1),
-    Row("the interface is deleted", lambda bench: bench.interface_deleted(), _F.BUS_DOWN, _R.LATCH, 1),
+    Row("two cycles in a row start late", lambda bench: bench.hang(1.7 * bench.period_s), _F.OVERRUN,
+        _R.QUICK_STOP, 2, again=True, everybody=True),
+    Row("the master's process hangs for 0.5 s", lambda bench: bench.hang(0.5), _F.HANG, _R.GO, 1,
+        everybody=True),
+    Row("a target that is not a number", lambda bench: bench.bad_target(math.nan), _F.BAD_TARGET,
+        _R.QUICK_STOP, 1),
+    Row("a target that is infinite", lambda bench: bench.bad_target(math.inf), _F.BAD_TARGET,
+        _R.QUICK_STOP, 1),
+    Row("a target beyond 32 bits", lambda bench: bench.bad_target(1 << 31), _F.BAD_TARGET,
+        _R.QUICK_STOP, 1),
+    Row("the interface goes down", lambda bench: bench.interface_down(), _F.BUS_DOWN, _R.LATCH, 1,
+        everybody=True),
+    Row("the interface is deleted", lambda bench: bench.interface_deleted(), _F.BUS_DOWN, _R.LATCH, 1,
+        everybody=True),
     Row("the transmit queue is full", lambda bench: bench.transmit_queue_full(), _F.TRANSMIT_FULL,
-        _R.QUICK_STOP, 1, buses=(VIRTUAL,)),
+        _R.QUICK_STOP, 1, everybody=True, places=(VIRTUAL, DAEMON)),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What came of a row on a bus."""
+class Further:
+    """What a daemon shows that a bench cannot; each has a test of its own, which says what it saw."""
 
-    bus: str
+    place: str
+    name: str
+    expected: str
+    allowed: float
+    """Cycles on the virtual bus, seconds on vcan."""
+
+    def show(self, taken: float) -> None:
+        """It was seen, after so many cycles or seconds; AssertionError where that was too long."""
+        assert taken <= self.allowed, f"{self.name}: {taken:g}, allowed are {self.allowed:g}"
+        _record(Seen(self.place, self.name, self.expected, taken, self.allowed))
+
+
+FURTHER: Final = (
+    Further(DAEMON, "TPDOs come in another order", "no effect", 0),
+    Further(DAEMON, "the load encoder's counts pass the end of their 32 bits", "no effect", 0),
+    Further(DAEMON, "the motor does not follow", "quick stop, once the error is beyond the limit", 2),
+    Further(DAEMON, "a model asks for a step beyond the limits of speed and slew",
+            "quick stop; the target is not sent", 1),
+    Further(DAEMON, "a client's target is not a number, infinite or out of limits",
+            "refused; the motion goes on", 1),
+    Further(DAEMON, "a client streams a set-point that is not a number", "the stream ends, braking", 1),
+    Further(DAEMON, "a mailbox full of commands that make no sense", "each refused; the motion goes on", 32),
+    Further(DAEMON, "an SDO write, an NMT reset, a set-point from the service in motion", "not sent", 4),
+    Further(DAEMON, "the place told with the enable command is stale", "enabled where it is; no motion", 0),
+    Further(DAEMON, "the drive's identity, encoder or gear is another", "no set-point; not enabled", 0),
+    Further(DAEMON, "the control process is killed in motion", "the drives stop by themselves", 25),
+    Further(DAEMON, "the control process begins again", "every axis disabled and unverified", 1),
+    Further(DAEMON, "the service dies during a jog", "the jog runs out and brakes", 150),
+    Further(DAEMON, "the interface comes back", "opened; verified again; disabled", 126),
+    Further(DAEMON, "the disk is full", "the recorder drops and says so; no cycle is missed", 0),
+)  # fmt: skip
+"""In the order of the page."""
+
+
+def further(name: str) -> Further:
+    """The one of that name."""
+    (found,) = (each for each in FURTHER if each.name == name)
+    return found
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What came of a row at a place."""
+
+    place: str
     name: str
     seen: str
-    cycles: int
-    allowed: int
+    taken: float
+    """Cycles, or seconds where the row says so."""
+    allowed: float
 
 
 def read_record(path: Path) -> list[Seen]:
@@ -158,14 +222,14 @@ def read_record(path: Path) -> list[Seen]:
     return [Seen(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def rows_of(bus: str) -> list[Row]:
-    """The rows that this bus can show."""
-    return [row for row in ROWS if bus in row.buses]
+def rows_of(place: str) -> list[Row]:
+    """The rows that can be shown there."""
+    return [row for row in ROWS if place in row.places]
 
 
-def try_out(row: Row, bench: Bench, bus: str, heartbeat_timeout_s: float) -> Seen:
+def try_out(row: Row, bench: Bench, place: str, heartbeat_timeout_s: float) -> Seen:
     """Make the fault on an axis under way; AssertionError where its reaction does not come in time."""
-    allowed = row.allowed_cycles(heartbeat_timeout_s, bench.cycle.period_s)
+    allowed = row.allowed_cycles(heartbeat_timeout_s, bench.period_s)
     bench.supervision.events.clear()
     row.make(bench)
     cycles = 0
@@ -178,7 +242,7 @@ def try_out(row: Row, bench: Bench, bus: str, heartbeat_timeout_s: float) -> See
             row.make(bench)
         cycles += 1
         with suppress(SafetyStop):
-            bench.cycle.tick(row.command) if row.command else bench.move()
+            bench.move()
         hits = [
             event
             for event in bench.supervision.events
@@ -187,7 +251,7 @@ def try_out(row: Row, bench: Bench, bus: str, heartbeat_timeout_s: float) -> See
     assert hits[0].reaction is row.reaction
     latched = bench.supervision.stop
     assert (latched is not None) == (row.reaction >= Reaction.QUICK_STOP or row.fault is Fault.HANG)
-    seen = Seen(bus, row.name, _words(bench.supervision, hits[0]), cycles, allowed)
+    seen = Seen(place, row.name, _words(bench.supervision, hits[0]), cycles, allowed)
     _record(seen)
     return seen
 

@@ -110,6 +110,8 @@ class ServiceBridge:
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
+        # From here on each is being taken over: before its state is known, nobody else asks anything of it.
+        await asyncio.sleep(0)
         return self
 
     async def __aexit__(self, *_: object) -> None:

@@ -7,7 +7,7 @@ from support.service import Service, play, stepped_service, until
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
-from hdbridge.errors import LeaseError
+from hdbridge.errors import LeaseError, RefusedError
 from hdbridge.evaluation.stepping import Scheme
 
 
@@ -45,6 +45,31 @@ def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
             await axis.disable(own)
 
     play(second())
+
+
+def test_nothing_is_asked_of_an_axis_before_its_state_is_known(service: Service) -> None:
+    """A drive that still holds its axis after a quick stop is not booted because the service is young."""
+    daemon = service.daemon
+    daemon.verify()
+    daemon.enable()
+    daemon.move(30.0)
+    daemon.run(0.5)
+    daemon.done(CommandKind.QUICK_STOP)
+    daemon.run(0.5)
+
+    async def story() -> None:
+        async with service.bridge() as bridge:
+            axis = bridge.axes["axis1"]
+            token = bridge.lease.take("at once")
+            with pytest.raises(RefusedError, match="being compared"):
+                await axis.reset(token)
+            assert daemon.states == [AxisState.QUICK_STOPPED]
+            await until(bridge, lambda: axis.commissioning.report is not None)
+            await bridge.core.timing.sleep(0.1)
+            await axis.reset(token)
+            assert daemon.states == [AxisState.DISABLED]
+
+    play(story())
 
 
 def test_what_was_lent_is_taken_back(service: Service) -> None:

@@ -1,5 +1,6 @@
 """After each kind of stop: what a client is told, and what leads back. Never to power by itself."""
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -120,7 +121,7 @@ def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
             axis = bridge.axes["axis1"]
             await axis.move(token, 100.0, wait=False)
             await bridge.core.timing.sleep(0.5)
-            service.daemon.bus.down = True
+            service.daemon.bus.down = errno.ENETDOWN
             with pytest.raises(HdbridgeError):
                 await axis.move(token, 150.0)
             await bridge.core.timing.sleep(1.0)
@@ -128,7 +129,7 @@ def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
             assert any("bus is down" in each for each in bridge.state().warnings)
             assert axis.state().state == "latched"
             assert axis.state().fault.needs_verification
-            service.daemon.bus.down = False
+            service.daemon.bus.down = None
             await until(bridge, lambda: axis.state().state == "disabled")
             assert bridge.state().bus.up
             await axis.enable(token)

@@ -1,0 +1,310 @@
+"""What only the daemon shows of the fault table: clients that err, processes that end, a bus that is back."""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from support.flight import about
+from support.reliability import further
+from support.reliability_daemon import ENABLE_OPERATION, RPDO, DaemonBench, daemon_bench
+from support.service import play, until
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError
+from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.drive.states import State
+from hdbridge.drive.supervision import Fault
+from hdbridge.errors import DriveError, IdentityError
+from hdbridge.sim.node import SimulatedDrive
+
+S, K, E = AxisState, CommandKind, EventKind
+INT32 = 1 << 31
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[DaemonBench]:
+    """Two axes, at rest and not verified."""
+    with daemon_bench(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def moving(bench: DaemonBench) -> DaemonBench:
+    """Both at constant speed."""
+    bench.set_off()
+    return bench
+
+
+def faults(bench: DaemonBench, axis: int = 0) -> set[Fault]:
+    return {event.fault for event in bench.daemon.axes[axis].supervision.events}
+
+
+def powered(node: SimulatedDrive) -> bool:
+    """Whether a drive would follow a set-point."""
+    return node.firmware.state.name == State.OPERATION_ENABLED.name
+
+
+def turns_until(bench: DaemonBench, state: AxisState, most: int = 1000) -> int:
+    """Turns until the first axis is in a state."""
+    for turns in range(1, most + 1):
+        bench.daemon.turn()
+        if bench.states[0] is state:
+            return turns
+    raise AssertionError(f"{state.name} not within {most} turns: {bench.states}")
+
+
+# ---------------------------------------------------------------- the bus and the drive
+
+
+def test_the_order_of_tpdos_is_nothing(moving: DaemonBench) -> None:
+    moving.node.faults.reverse_tpdos = 50
+    assert moving.moves_on(0)
+    assert not faults(moving)
+    further("TPDOs come in another order").show(0)
+
+
+def test_a_position_that_wraps_is_nothing(bench: DaemonBench) -> None:
+    end = bench.node.firmware.motion.machine.load_counts + 150_000  # 19 degrees on
+
+    def wrapped(counts: int) -> int:
+        return (counts - end) % (2 * INT32) - INT32
+
+    bench.node.faults.load_reading = wrapped
+    daemon = bench.daemon
+    daemon.run(0.1)
+    bench.set_off()
+    before = wrapped(bench.node.firmware.motion.machine.load_counts)
+    daemon.run(2.0)
+    after = wrapped(bench.node.firmware.motion.machine.load_counts)
+    assert before > 0 > after, "the counts were to pass the end"
+    assert not faults(bench)
+    assert bench.moves_on(0)
+    further("the load encoder's counts pass the end of their 32 bits").show(0)
+
+
+def test_a_motor_that_does_not_follow(moving: DaemonBench) -> None:
+    daemon, axis = moving.daemon, moving.daemon.axes[0]
+    limit = axis.config.motor_encoder.counts(axis.config.drive.following_error_deg)
+    moving.node.firmware.motion.machine.torque_limit_permille = 0.0
+    beyond = 0
+    while axis.state is S.ENABLED:
+        daemon.turn()
+        feedback = axis.cycle.feedback
+        beyond += abs(feedback.demand_counts - feedback.motor_counts) > limit
+    stop = axis.supervision.stop
+    assert stop is not None
+    assert stop.fault is Fault.FOLLOWING_ERROR
+    assert axis.state is S.QUICK_STOPPED
+    moving.stays_stopped(0)
+    assert moving.moves_on(1)
+    further("the motor does not follow").show(beyond)
+
+
+def test_a_drive_that_is_another_is_never_spoken_to(bench: DaemonBench) -> None:
+    daemon = bench.daemon
+    sent: list[int] = []
+    daemon.bus.spy = lambda can_id, data: sent.append(can_id) if can_id == RPDO + 1 else None
+    dictionary = bench.node.dictionary
+    others = (((0x1018, 1), 1), ((0x1018, 2), 0x403), ((0x608F, 1), 8001), ((0x6091, 1), 100))
+    for (index, sub), wrong in others:
+        entry = dictionary[index, sub]
+        right, entry.value = entry.value, wrong
+        with pytest.raises((IdentityError, DriveError)):
+            daemon.drive(0).boot(reset=False)
+        entry.value = right
+        refused = daemon.order(K.ENABLE, 0, i=0, j=0, k=0x0040)
+        assert "verified first" in refused.text
+    daemon.run(0.2)
+    assert daemon.states == [S.UNVERIFIED] * 2
+    assert sent == []
+    further("the drive's identity, encoder or gear is another").show(0)
+
+
+def test_the_service_verifies_a_bus_that_comes_back(moving: DaemonBench) -> None:
+    daemon = moving.daemon
+    daemon.bus.down = errno.ENODEV
+    assert turns_until(moving, S.LATCHED) == 1
+    daemon.run(1.3)
+    daemon.bus.down = None
+    turns = 0
+    while not daemon.told(E.BUS_UP):
+        daemon.turn()
+        turns += 1
+    moving.stays_stopped(0)
+    moving.leads_back()  # the service verifies, and it stays disabled until it is enabled
+    further("the interface comes back").show(turns)
+
+
+# ---------------------------------------------------------------- targets and commands
+
+
+def test_a_step_beyond_the_limits_is_not_sent(moving: DaemonBench) -> None:
+    axis = moving.daemon.axes[0]
+    sent: list[int] = []
+    moving.daemon.bus.spy = lambda can_id, data: (
+        sent.append(struct.unpack_from("<i", data, 2)[0]) if can_id == RPDO + 1 else None
+    )
+    wrong = axis.image.target_counts + 20_000
+    moving.bad_target(wrong)
+    turns = turns_until(moving, S.QUICK_STOPPED)
+    assert axis.supervision.stop is not None
+    assert axis.supervision.stop.fault is Fault.BAD_TARGET
+    moving.stays_stopped(0)
+    assert all(abs(each - wrong) > 5_000 for each in sent)
+    assert moving.moves_on(1)
+    further("a model asks for a step beyond the limits of speed and slew").show(turns)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 400.1, -1e300])
+def test_a_target_that_makes_no_sense_is_refused(moving: DaemonBench, bad: float) -> None:
+    daemon = moving.daemon
+    before = daemon.axes[0].set_point.velocity_deg_s
+    for kind in (K.MOVE, K.JOG):
+        id_ = daemon.post(kind, 0, a=bad, b=math.nan if kind is K.MOVE else 1.0, c=math.nan)
+        daemon.turn()
+        (answer,) = [each for each in daemon.events if each.id == id_]
+        if kind is K.JOG and math.isfinite(bad):
+            continue  # a jog is cut to the axis's speed
+        assert answer.kind is E.REFUSED
+        assert answer.text
+        assert daemon.axes[0].set_point.velocity_deg_s == before
+    assert moving.moves_on(0)
+    further("a client's target is not a number, infinite or out of limits").show(1)
+
+
+def test_a_stream_with_a_number_that_is_none_brakes(bench: DaemonBench) -> None:
+    daemon = bench.daemon
+    daemon.verify()
+    daemon.enable()
+    here = daemon.axes[0].set_point.position_deg
+    assert daemon.stream({0: [(0.1, here + 0.05, 1.0), (0.2, here + 0.15, 1.0)]}).kind is E.DONE
+    daemon.run(0.1)
+    daemon.memory.knots[0].put([Knot(1, 0.3, math.nan, 0.0)])
+    daemon.turn()
+    assert daemon.told(E.STREAM_REFUSED)
+    daemon.run(0.5)
+    assert daemon.axes[0].set_point.at_rest
+    assert abs(daemon.axes[0].set_point.position_deg - here) < 0.3
+    assert daemon.states[0] is S.ENABLED
+    further("a client streams a set-point that is not a number").show(1)
+
+
+def test_a_mailbox_of_nonsense_is_refused_and_nothing_else(moving: DaemonBench) -> None:
+    daemon = moving.daemon
+    posted = 0
+    with suppress(MailboxFullError):
+        while posted < 10_000:
+            kind = (K.MOVE, K.VERIFIED, K.CHANGE, K.UNLEND, K.STREAM_BEGIN)[posted % 5]
+            daemon.memory.commands.post(kind, (7, -1, 0, 99, 1)[posted % 5], i=1 << 40, j=-1, a=math.nan)
+            posted += 1
+    assert 100 < posted < 10_000
+    turns = 0
+    while len(daemon.told(E.REFUSED)) < posted:
+        daemon.turn()
+        turns += 1
+    assert not daemon.told(E.DONE)
+    assert moving.moves_on(0)
+    assert moving.moves_on(1)
+    further("a mailbox full of commands that make no sense").show(turns)
+
+
+def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: DaemonBench) -> None:
+    daemon = moving.daemon
+    frames = [(0x601, b"\x2b\x40\x60\x00\x06\x00\0\0"), (0x000, b"\x81\x01"), (0x201, bytes(6)), (0x080, b"")]
+    sent: list[tuple[int, bytes]] = []
+    daemon.bus.spy = lambda can_id, data: sent.append((can_id, data))
+    for can_id, data in frames:
+        daemon.memory.outgoing.put(0, can_id, data)
+    daemon.run(0.1)
+    assert not set(frames[:3]) & set(sent)
+    assert sum(1 for can_id, _ in sent if can_id == 0x080) == 25  # one SYNC a cycle and no more
+    assert daemon.told(E.REFUSED)
+    assert moving.moves_on(0)
+    further("an SDO write, an NMT reset, a set-point from the service in motion").show(len(frames))
+
+
+def test_a_stale_place_at_enable_moves_nothing(bench: DaemonBench) -> None:
+    daemon = bench.daemon
+    daemon.verify()
+    seeds = daemon.prepare()
+    before = bench.motor_counts()
+    targets: list[tuple[int, int]] = []
+    daemon.bus.spy = lambda can_id, data: (
+        targets.append(struct.unpack("<Hi", data)) if can_id == RPDO + 1 else None
+    )
+    daemon.done(K.ENABLE, 0, **{**seeds, "i": seeds["i"] + 3_000})
+    daemon.run(0.5)
+    enabled = [target for word, target in targets if word & 0x0F == ENABLE_OPERATION]
+    assert enabled
+    assert abs(enabled[0] - before) <= 1
+    # All that it moves from there on is the compensation's, as it is faded in.
+    assert abs(bench.motor_counts() - before) < 20
+    further("the place told with the enable command is stale").show(0)
+
+
+# ---------------------------------------------------------------- processes
+
+
+def test_a_killed_control_process(moving: DaemonBench) -> None:
+    daemon = moving.daemon
+    cycles = 0
+    assert all(powered(each) for each in daemon.nodes)
+    while any(powered(each) for each in daemon.nodes):
+        daemon.hang(daemon.period_s)
+        cycles += 1
+    daemon.hang(1.0)
+    places = [moving.motor_counts(axis) for axis in range(2)]
+    sent: list[int] = []
+    daemon.bus.spy = lambda can_id, data: sent.append(can_id) if can_id in (RPDO + 1, RPDO + 2) else None
+    daemon.begin_again()
+    daemon.turn()
+    assert daemon.states == [S.UNVERIFIED] * 2
+    further("the control process begins again").show(1)
+    daemon.run(0.5)
+    assert sent == []
+    for axis in range(2):
+        daemon.verify(axis)
+    daemon.run(0.5)
+    assert daemon.states == [S.DISABLED] * 2
+    assert [moving.motor_counts(axis) for axis in range(2)] == pytest.approx(places, abs=2)
+    further("the control process is killed in motion").show(cycles)
+
+
+def test_a_jog_whose_service_dies_runs_out(moving: DaemonBench) -> None:
+    daemon = moving.daemon
+    axis = daemon.axes[0]
+    direction = math.copysign(1.0, axis.set_point.velocity_deg_s)
+    daemon.done(K.JOG, 0, a=10.0 * direction, b=0.5)
+    turns = 0
+    while not axis.set_point.at_rest:
+        daemon.controller.turn()  # nobody reads what is told, nobody posts
+        turns += 1
+    daemon.run(0.5)
+    assert daemon.states[0] is S.ENABLED
+    further("the service dies during a jog").show(turns)
+
+
+def test_a_full_disk_costs_the_loop_nothing(moving: DaemonBench, tmp_path: Path) -> None:
+    told: list[str] = []
+    recorder = FlightRecorder(tmp_path / "flights", about(2), tell=told.append, free=lambda _: 0)
+
+    async def story() -> None:
+        async with moving.service.bridge() as bridge:
+            bridge.core.observer.add(recorder)
+            await bridge.core.timing.sleep(1.0)
+            await until(bridge, lambda: bridge.core.observer.newest is not None)
+
+    play(story())
+    recorder.close()
+    assert any("nothing is recorded" in each for each in told)
+    assert recorder.counts.refused >= 200
+    assert moving.moves_on(0)
+    samples, lost = moving.daemon.samples.read()
+    assert lost == 0
+    further("the disk is full").show(int(samples["skipped"][-1]))

@@ -1,0 +1,186 @@
+"""The daemon as a bench for the rows of `reliability`: two axes in motion on virtual time."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.daemon.loop.follower import AxisSetup
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind
+from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.drive.supervision import Reaction
+from hdbridge.effects import Moment
+from hdbridge.errors import RefusedError
+from hdbridge.units import DEG_PER_TURN
+from support.service import Service, play, stepped_service, until
+
+FAR_DEG = 390.0
+"""Where the axes are on the way to, or the other way."""
+RPDO = 0x200
+ENABLE_OPERATION = 0x0F
+SETTLED_S = 1.2
+"""By then a stop is over, one that the drive makes by itself included."""
+_NOWHERE = Moment()
+STATES = {
+    Reaction.GO: AxisState.ENABLED,
+    Reaction.FREEZE: AxisState.ENABLED,
+    Reaction.QUICK_STOP: AxisState.QUICK_STOPPED,
+    Reaction.LATCH: AxisState.LATCHED,
+}
+
+
+class WrongOnce(Compensation):
+    """A compensation that gives, once, what a test wants."""
+
+    wrong_deg: float | None = None
+
+    def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
+        right = super().command(load_deg, moment)
+        wrong, self.wrong_deg = self.wrong_deg, None
+        return right if wrong is None else wrong
+
+
+class DaemonBench:
+    """Two axes under way; what goes wrong concerns the first."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        daemon = self.daemon = service.daemon
+        self.node = daemon.nodes[0]
+        self.supervision = daemon.axes[0].supervision
+        self.period_s = daemon.period_s
+        self._counts_per_turn = daemon.axes[0].config.motor_encoder.counts_per_turn
+
+    def set_off(self) -> None:
+        """Both axes at constant speed, enabled if they are not."""
+        daemon = self.daemon
+        for axis, state in enumerate(daemon.states):
+            if state is not AxisState.ENABLED:
+                daemon.verify(axis)
+                daemon.enable(axis)
+        for axis in range(2):
+            daemon.move(-FAR_DEG if daemon.axes[axis].set_point.position_deg > 0.0 else FAR_DEG, axis)
+        daemon.run(0.6)
+        daemon.events.clear()
+
+    # ---------------------------------------------------------------- as `reliability.Bench` has it
+
+    def move(self) -> None:
+        self.daemon.turn()
+
+    def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
+        self.daemon.interfere(can_id, data, **kind)
+
+    def hang(self, duration_s: float) -> None:
+        self.daemon.hang(duration_s)
+
+    def interface_down(self) -> None:
+        self.daemon.bus.down = errno.ENETDOWN
+
+    def interface_deleted(self) -> None:
+        self.daemon.bus.down = errno.ENODEV
+
+    def transmit_queue_full(self) -> None:
+        self.daemon.bus.no_room_for = RPDO + 1
+
+    def bad_target(self, counts: float) -> None:
+        wrong = self.daemon.axes[0].follower.correction.command
+        assert isinstance(wrong.__self__, WrongOnce)  # type: ignore[attr-defined]
+        wrong.__self__.wrong_deg = counts * DEG_PER_TURN / self._counts_per_turn  # type: ignore[attr-defined]
+
+    # ---------------------------------------------------------------- what is true afterwards
+
+    @property
+    def states(self) -> list[AxisState]:
+        return self.daemon.states
+
+    def motor_counts(self, axis: int = 0) -> int:
+        """Where the motor really is."""
+        return self.daemon.nodes[axis].firmware.motion.machine.motor_counts
+
+    def moves_on(self, axis: int) -> bool:
+        """Whether an axis is on its way as if nothing had been."""
+        before = self.motor_counts(axis)
+        self.daemon.run(0.1)
+        return self.states[axis] is AxisState.ENABLED and abs(self.motor_counts(axis) - before) > 500
+
+    def stays_stopped(self, axis: int) -> None:
+        """It comes to rest and stays there whatever is commanded; nothing asks for power any more."""
+        daemon, state = self.daemon, self.states[axis]
+        sent: list[int] = []
+
+        def spy(can_id: int, data: bytes) -> None:
+            if can_id == RPDO + 1 + axis:
+                sent.append(data[0])
+
+        daemon.bus.spy = spy
+        daemon.run(SETTLED_S)
+        place = self.motor_counts(axis)
+        for kind in (CommandKind.MOVE, CommandKind.JOG, CommandKind.ENABLE, CommandKind.VERIFIED):
+            assert daemon.order(kind, axis).kind is EventKind.REFUSED
+        daemon.run(0.3)
+        assert abs(self.motor_counts(axis) - place) <= 2
+        assert daemon.states[axis] is state
+        assert ENABLE_OPERATION not in sent
+        if state is AxisState.LATCHED:
+            assert sent == []
+        daemon.bus.spy = None
+
+    def mend(self) -> None:
+        """What was wrong is put right."""
+        self.daemon.bus.down = None
+        faults = self.node.faults
+        faults.silent = faults.mute_heartbeat = False
+        faults.load_jump_counts = faults.drop_tpdos = faults.shorten_tpdos = 0
+        faults.load_reading = None
+        self.daemon.run(0.6)
+
+    def leads_back(self) -> None:
+        """The service resets each stopped axis: it is disabled, and where it was. Enabled again, it moves."""
+        stopped = [axis for axis, state in enumerate(self.states) if state is not AxisState.ENABLED]
+        places = [self.motor_counts(axis) for axis in range(2)]
+
+        async def story() -> None:
+            async with self.service.bridge() as bridge:
+                token = bridge.lease.take("test")
+                for place in stopped:
+                    axis = bridge.axes[f"axis{place + 1}"]
+                    if self.states[place] is AxisState.QUICK_STOPPED:
+                        await until(bridge, lambda axis=axis: free(axis))
+                        await axis.reset(token)
+                    await until(bridge, lambda axis=axis: free(axis) and axis.state().state == "disabled")
+                    await bridge.core.timing.sleep(0.2)
+                    assert axis.state().state == "disabled"
+                    await axis.enable(token)
+                    assert abs(self.motor_counts(place) - places[place]) <= 2
+                    await axis.move(token, axis.state().load_target_deg + 1.0)
+
+        play(story())
+
+
+def free(axis: ServiceAxis) -> bool:
+    """Whether nothing has its drive to itself."""
+    try:
+        axis.check_free()
+    except RefusedError:
+        return False
+    return True
+
+
+def _wrong_once(config: AxisConfig, made: AxisSetup) -> AxisSetup:
+    caps = config.compensation
+    limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
+    return replace(made, compensation=WrongOnce(made.compensation.model, limits, config.drive.cycle_s))
+
+
+@contextmanager
+def daemon_bench(folder: Path) -> Iterator[DaemonBench]:
+    """Two axes, at rest and not verified."""
+    with stepped_service(folder, axes=2, setup=_wrong_once) as service:
+        yield DaemonBench(service)
