@@ -123,17 +123,6 @@ class ServiceBridge:
         for axis in self.axes.values():
             await axis.close()
 
-    async def end(self) -> None:
-        """Stop every axis in order and switch power off: the daemon ends."""
-        for axis in self.axes.values():
-            axis.give_up("the daemon ends")
-        await self.book.close()
-        for axis in self.axes.values():
-            with suppress(HdbridgeError):
-                await axis.power.disable()
-        with suppress(HdbridgeError):
-            await self.core.dispatch.do(CommandKind.ENDING)
-
     async def _watch(self) -> None:
         """Every `PERIOD_S`: what the control process tells, the lease, drives that must be verified again."""
         core = self.core
@@ -357,4 +346,10 @@ class ServiceBridge:
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        """An error that nobody foresaw is logged. Without `_watch` the keeper starts the service again."""
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("an error in hdbridge", exc_info=error)

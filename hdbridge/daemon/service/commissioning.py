@@ -174,6 +174,7 @@ class Commissioning:
         if not self._busy.acquire(timeout=BUSY_S):
             raise RefusedError(f"the drive of axis '{self._drive.axis.name}' is busy: {self._doing}")
         self._doing = doing
+        self.bus.begin()
         try:
             yield
         finally:

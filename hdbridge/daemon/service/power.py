@@ -53,13 +53,22 @@ class AxisPower:
         if link.state is not AxisState.DISABLED:
             await link.do(CommandKind.ENABLE)  # refused, with the reason
         seeds = await self._work(self._drive.prepare)
-        await link.do(CommandKind.ENABLE, POWER_S, **seeds.arguments())
+        try:
+            await link.do(CommandKind.ENABLE, POWER_S, **seeds.arguments())
+        except HdbridgeError:
+            await self._rest()
+            raise
 
     async def disable(self) -> None:
         """Brake to rest, then power off."""
         await self._link.do(CommandKind.DISABLE, POWER_S)
-        if self._link.state is AxisState.DISABLED:
-            await self._work(self._drive.rest)
+        await self._rest()
+
+    async def _rest(self) -> None:
+        """Where power is off the drive need no longer watch the master."""
+        if self._link.state is AxisState.DISABLED and self._link.power is not State.FAULT:
+            with suppress(HdbridgeError):  # it is asked for again each time that power is switched on
+                await self._work(self._drive.rest)
 
     async def reset(self) -> None:
         """Release what is latched; disabled then."""
@@ -76,6 +85,7 @@ class AxisPower:
                     f"{link.name}: the drive's fault stays after a reset; remove its cause (603Fh and the "
                     "drive's manual tell it), then reset again"
                 )
+        await self._rest()
 
     async def verify(self, *, clear_fault: bool = False) -> None:
         """Boot the drive, compare it with its axis file, and let the control process speak to it."""

@@ -49,6 +49,10 @@ class RelayBus(can.BusABC):
         self._reason = reason
         self._interrupted.set()
 
+    def begin(self) -> None:
+        """Something else begins: an interruption that came too late for what was before is none of it."""
+        self._interrupted.clear()
+
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame over. The master's heartbeat is left out: the control process sends it."""
         can_id = msg.arbitration_id
