@@ -151,7 +151,7 @@ def test_the_axis_waits_at_the_end_of_its_move_when_the_service_is_gone(enabled:
         enabled.controller.turn()
     assert enabled.states == [S.ENABLED]
     assert enabled.axes[0].set_point.position_deg == 15.0
-    for _ in range(20_000):
+    for _ in range(3000):
         enabled.controller.turn()
     assert enabled.states == [S.ENABLED]
 
