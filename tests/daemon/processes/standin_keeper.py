@@ -22,6 +22,6 @@ if __name__ == "__main__":
     with Memory.create(1, machine.cycle_s) as memory:
         keeper = Keeper(
             Start(machine, memory.fd, os.getpid()), memory, (), Notifier.of_environment(), programs,
-            Times(hung_s=1.0, service_hung_s=1.5),
+            Times(hung_s=3.0, service_hung_s=4.0),
         )  # fmt: skip
         sys.exit(keeper.run())
