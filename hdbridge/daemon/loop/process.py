@@ -73,7 +73,12 @@ def run(start: Start) -> None:
         # A simulation that is late does not sleep: it would keep everything else from its processor.
         real = interface is not None
         with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext() as conditions:
-            log_once(start.log, __name__, "control process", {"conditions": str(conditions or "simulated")})
+            log_once(
+                start.log,
+                "hdbridge.daemon.loop",
+                "control process",
+                {"conditions": str(conditions or "simulated")},
+            )
             while not controller.ended:
                 if terminated or status.stop_asked:
                     controller.end(at_once=status.stop_asked >= AT_ONCE)

@@ -28,6 +28,7 @@ from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.recording import Recording
 from hdbridge.daemon.service.timing import RealTiming
+from hdbridge.daemon.service.watching import Watching
 from hdbridge.daemon.start import Start, begin_child
 from hdbridge.errors import HdbridgeError
 
@@ -69,8 +70,10 @@ async def serve(start: Start, memory: Memory) -> None:
         metrics = Metrics()
         recording = Recording(machine, bridge)
         stack.callback(recording.close)
+        watching = Watching(machine, bridge, recording.recorder)
+        stack.callback(watching.close)
         adapting = _adaptations(machine, bridge, stack)
-        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, *adapting]
+        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, watching, *adapting]
         for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)

@@ -24,44 +24,45 @@ class Recording:
         self._folder = machine.recorder_folder()
         self._bridge = bridge
         self._note: str | None = None
-        self._recorder: FlightRecorder | None = None
+        self.recorder: FlightRecorder | None = None
+        """None where there is no folder for it."""
         self._told: dict[str, InUse] = {}
         about = About.of(
             machine.name, tuple(AxisAbout.of(axis.config) for axis in machine.axes), machine.cycle_s
         )
         try:
-            self._recorder = FlightRecorder(self._folder, about, machine.recorder, tell=self._tell)
+            self.recorder = FlightRecorder(self._folder, about, machine.recorder, tell=self._tell)
         except OSError as problem:
             self._tell(f"{self._folder}: cannot be made: {problem.strerror}; nothing is recorded")
         else:
-            bridge.marks.append(self._recorder.mark)
+            bridge.marks.append(self.recorder.mark)
         bridge.recorder = self.state
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """From the observer."""
-        if self._recorder is None:
+        if self.recorder is None:
             return
         for name, axis in self._bridge.axes.items():
             in_use = axis.models.in_use
             if self._told.get(name) is not in_use:
                 self._told[name] = in_use
                 version = str(in_use.version) if in_use.version is not None else ""
-                self._recorder.use_model(name, in_use.compensating.dump(), version)
-        self._recorder.take(samples, events, lost)
+                self.recorder.use_model(name, in_use.compensating.dump(), version)
+        self.recorder.take(samples, events, lost)
 
     def state(self) -> messages.RecorderState:
         """What clients are told."""
-        if self._recorder is None:
+        if self.recorder is None:
             return messages.RecorderState(on=False, folder=str(self._folder), note=self._note)
-        counts = self._recorder.counts
+        counts = self.recorder.counts
         return messages.RecorderState(
             on=True, folder=str(self._folder), dropped=counts.dropped + counts.refused, note=self._note
         )
 
     def close(self) -> None:
         """Finish the file; returns when it is on the disk."""
-        if self._recorder is not None:
-            self._recorder.close()
+        if self.recorder is not None:
+            self.recorder.close()
 
     def _tell(self, text: str) -> None:
         """From the recorder's thread, too."""

@@ -1,0 +1,49 @@
+"""The watch of the load encoders behind the service: which model predicts, and what it says to whom."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.watch.sink import WatchSink
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.model import TransmissionModel
+
+_log = logging.getLogger(__name__)
+
+
+class Watching:
+    """A sink of the observer; what it has to say is the bridge's advice from now on."""
+
+    def __init__(self, machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None) -> None:
+        """``recorder`` is what a diagnosis reads; without one nothing is diagnosed."""
+        self._names = [axis.name for axis in machine.axes]
+        self._bridge = bridge
+        self._sink = WatchSink.of(machine, self._tell, recorder)
+        self._used: list[tuple[TransmissionModel, Scheme]] = [
+            (port.models.in_use.model, Scheme.EXTENDED) for port in bridge.axes.values()
+        ]
+        bridge.advice = self._sink.advice
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """From the observer. What the adaptation moves is the same model to the watch."""
+        for place, port in enumerate(self._bridge.axes.values()):
+            in_use = port.models.in_use
+            model, scheme = self._used[place]
+            if in_use.model is not model or in_use.scheme is not scheme:
+                self._used[place] = in_use.model, in_use.scheme
+                self._sink.use(place, in_use.compensating)
+        self._sink.take(samples, events, lost)
+
+    def close(self) -> None:
+        """End its thread and what it has started."""
+        self._sink.close()
+
+    def _tell(self, words: str, place: int) -> None:
+        """From the watch's thread."""
+        self._bridge.core.log.note(words, place)
+        _log.warning("watch", {"axis": self._names[place], "text": words})
