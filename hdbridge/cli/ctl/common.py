@@ -103,8 +103,8 @@ def tell(state: AxisState, json_file: Path | None) -> None:
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
     target = "" if state.load_target_deg is None else f": target {state.load_target_deg:.4f} deg{load}{error}"
     console.print(f"axis '{state.name}' is {state.state}{target}", markup=False, soft_wrap=True)
-    for line in concerns(state):
-        console.print(line, markup=False, soft_wrap=True)
+    if state.fault is not None:
+        console.print(f"stopped: {state.fault}", markup=False, soft_wrap=True)
 
 
 def concerns(state: AxisState) -> Iterator[str]:

@@ -131,19 +131,17 @@ def _option(text: str) -> tuple[str, Any]:
 
 
 def _print(found: list[Job]) -> None:
-    table = Table("job", "axis", "state", "done", "", "recording")
+    table = Table("job", "axis", "state", "done", "begun")
+    for each in found:
+        begun = f"{each.started.astimezone():%Y-%m-%d %H:%M:%S}"
+        done = f"{100 * each.share:.0f} %"
+        table.add_row(escape(each.id), escape(each.axis), str(each.state), done, begun)
+    print_table(table)
     for each in found:
         words = each.text if each.problem is None else each.problem.detail
-        folder = "" if each.folder is None else str(Path(each.folder))
-        table.add_row(
-            escape(each.id),
-            escape(each.axis),
-            str(each.state),
-            f"{100 * each.share:.0f} %",
-            escape(words),
-            escape(folder),
-        )
-    print_table(table)
+        for line in (words, each.folder and f"recorded in {each.folder}"):
+            if line:
+                console.print(f"{each.id}: {line}", markup=False, soft_wrap=True)
 
 
 def _print_object(found: SdoValue, json_file: Path | None) -> None:
