@@ -15,52 +15,63 @@ STALE_KNOTS_A_TURN: Final = 64
 
 
 class KnotFeed:
-    """Of one axis; idle until a stream begins."""
+    """Of one axis; idle until a stream begins.
 
-    __slots__ = ("_ending", "_knots", "_set_point", "_stream")
+    Streams are numbered upwards. Knots of a stream that is over are thrown away; those of a later one stay
+    until it begins, for they may be handed over while the one before has not quite ended.
+    """
+
+    __slots__ = ("_ending", "_following", "_knots", "_set_point", "_stream")
 
     def __init__(self, knots: KnotQueue, set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
-        self._stream: int | None = None
+        self._stream = 0
+        """The number of the stream, or of the last one."""
+        self._following = False
         self._ending = False
 
     def begin(self, stream: int, timeout_s: float) -> None:
-        """Follow the knots of this number from the next turn on. InputError in motion, or of the time-out."""
+        """Follow the knots of this number from the next turn on.
+
+        InputError in motion, of the time-out, or of a number that is not above the last one.
+        """
+        if stream <= self._stream:
+            raise InputError(
+                f"a stream of number {stream} after number {self._stream}: expected a greater one"
+            )
         self._set_point.stream(timeout_s)
         self._set_point.begin_stream()
-        self._stream, self._ending = stream, False
+        self._stream, self._following, self._ending = stream, True, False
 
     def end(self) -> None:
         """No more knots come: at the last one the stream ends."""
         self._ending = True
 
     def leave(self) -> None:
-        """The axis does something else: what waits is thrown away."""
-        if self._stream is not None:
-            self._stream = None
-            self._knots.clear()
+        """The axis does something else: what waits of the stream is thrown away."""
+        self._following = False
 
     def feed(self) -> str | None:
         """Hand over the next knots; why one was refused (the axis then brakes), else None."""
-        if self._stream is None:
-            return None
-        set_point, take = self._set_point, self._knots.take
+        knots, set_point, stream = self._knots, self._set_point, self._stream
         taken = 0
         for _ in range(STALE_KNOTS_A_TURN):
+            knot = knots.peek()
+            if knot is None or knot.stream > stream:
+                break
+            if knot.stream < stream or not self._following:
+                knots.drop()
+                continue
             if taken == KNOTS_A_TURN or not set_point.room:
                 return None
-            knot = take()
-            if knot is None:
-                break
-            if knot.stream != self._stream:
-                continue
             taken += 1
+            knots.drop()
             try:
                 set_point.knot(knot.time_s, knot.position_deg, knot.velocity_deg_s)
             except InputError as error:
                 self.leave()
                 set_point.stop()
                 return str(error)
-        if self._ending and not taken and set_point.at_rest:
+        if self._following and self._ending and not taken and set_point.at_rest:
             set_point.stop()
         return None

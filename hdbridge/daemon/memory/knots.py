@@ -29,10 +29,14 @@ class KnotQueue:
             taken += 1
         return taken
 
-    def take(self) -> Knot | None:
+    def peek(self) -> Knot | None:
         """The loop's end: the next knot."""
-        slot = self._queue.take()
+        slot = self._queue.peek()
         return None if slot is None else Knot(*slot[1])
+
+    def drop(self) -> None:
+        """The loop's end: make an end of the knot that `peek` gave."""
+        self._queue.drop()
 
     def clear(self) -> None:
         """The loop's end: throw away what waits."""

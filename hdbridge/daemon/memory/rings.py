@@ -134,7 +134,7 @@ class Queue(_Slots):
         self._head[0] = sequence
         return sequence
 
-    def take(self) -> tuple[int, tuple[Any, ...]] | None:
+    def peek(self) -> tuple[int, tuple[Any, ...]] | None:
         """The next slot at the consumer's end, with its sequence number; None where there is none (yet)."""
         sequence: int = self._tail[0] + 1
         if sequence > self._head[0]:
@@ -143,11 +143,22 @@ class Queue(_Slots):
         if values is None:
             # Not visible as a whole yet. One that stays so must not hold up those behind it.
             self._misses += 1
-            if self._misses < MISSES:
-                return None
+            if self._misses >= MISSES:
+                self.drop()
+            return None
+        return sequence, values
+
+    def drop(self) -> None:
+        """Make an end of the slot that `peek` gave."""
         self._misses = 0
-        self._tail[0] = sequence
-        return None if values is None else (sequence, values)
+        self._tail[0] += 1
+
+    def take(self) -> tuple[int, tuple[Any, ...]] | None:
+        """The next slot as `peek` gives it, with an end made of it."""
+        slot = self.peek()
+        if slot is not None:
+            self.drop()
+        return slot
 
     def clear(self) -> None:
         """Throw away what waits, at the consumer's end."""

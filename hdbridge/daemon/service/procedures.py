@@ -27,7 +27,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, SampleArray, SampleFlag, SampleReader
 from hdbridge.daemon.service.reports import fault_of
 from hdbridge.errors import DaemonError, RefusedError, SafetyStop
-from hdbridge.motion.stream import Cubic
+from hdbridge.motion.stream import BEGIN_DEG, Cubic
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
 from hdbridge.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
@@ -262,7 +262,11 @@ class DaemonBench:
                     samples.append(sample)
                     # Counted in cycles that were run, as a stream's time is: one may have been skipped.
                     elapsed_s = (len(samples) - 1) * self._period_s
-                    if elapsed_s >= path.duration_s - _ROUNDING_S and move.ended(samples):
+                    if elapsed_s < path.duration_s - _ROUNDING_S:
+                        continue
+                    if begin is not None and not self._arrived(sample, path, elapsed_s):
+                        continue
+                    if move.ended(samples):
                         self._keep(place)
                         self._place = path.at(path.duration_s)
                         if begin is not None:
@@ -276,6 +280,17 @@ class DaemonBench:
                 self._measured.legs.append(
                     Segment(kind=move.kind, start_s=samples[0].time_s, end_s=samples[-1].time_s)
                 )
+
+    def _arrived(self, sample: Sample, path: Path, elapsed_s: float) -> bool:
+        """Whether the set-point stands at the end of a leg: knots that came late have delayed it."""
+        if abs(sample.load_target_deg - path.at(path.duration_s)) <= BEGIN_DEG:
+            return True
+        if elapsed_s > path.duration_s + STREAM_TIMEOUT_S:
+            raise DaemonError(
+                f"{self._axis.name}: a leg's set-points were handed over, but {STREAM_TIMEOUT_S:g} s after its "
+                f"time the axis was sent to {sample.load_target_deg:.6g} deg, not {path.at(path.duration_s):.6g}"
+            )
+        return False
 
     def _hand_over(self, knots: Iterator[Knot]) -> Iterator[Knot]:
         """As many knots as there is room for; the rest of them."""

@@ -352,13 +352,29 @@ def test_a_knot_beyond_the_limits_ends_the_stream(enabled: SteppedDaemon) -> Non
     assert len(enabled.memory.knots[0]) == 0
 
 
-def test_knots_of_another_stream_are_thrown_away(enabled: SteppedDaemon) -> None:
+def test_knots_of_an_earlier_stream_are_thrown_away(enabled: SteppedDaemon) -> None:
     begin = enabled.axes[0].set_point.position_deg
-    enabled.memory.knots[0].put([Knot(77, 0.0, 300.0, 0.0)] * 200)
+    enabled.memory.knots[0].put([Knot(0, 0.0, 300.0, 0.0)] * 200)
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=0.1)
     enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
     assert enabled.told(E.STREAM_REFUSED) == []
     assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0)
+
+
+def test_knots_that_come_before_the_stream_before_them_is_over_are_kept(enabled: SteppedDaemon) -> None:
+    """A leg's end is told, and the next one is handed over within the same period."""
+    begin = enabled.axes[0].set_point.position_deg
+    enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=10.0)
+    enabled.until(lambda: enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0))
+    enabled.order(K.STREAM_END, 0)
+    onward = [Knot(2, t, begin + 1.0 + p, v) for t, p, v in quintic(0.4, 1.0)]
+    enabled.memory.knots[0].put(onward)
+    enabled.run(0.1)
+    assert enabled.axes[0].set_point.mode is MotionMode.HOLD
+    assert enabled.order(K.STREAM_BEGIN, 0, a=0.1, j=2).kind is E.DONE
+    enabled.until(lambda: len(enabled.told(E.MOTION_ENDED)) == 2)
+    assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 2.0)
+    assert enabled.order(K.STREAM_BEGIN, 0, a=0.1, j=2).kind is E.REFUSED
 
 
 def test_a_stream_in_motion_is_refused(enabled: SteppedDaemon) -> None:

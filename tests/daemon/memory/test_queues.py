@@ -102,12 +102,14 @@ def test_knots_of_two_axes_do_not_mix_and_are_bounded(memory: Memory) -> None:
     assert first.put(wanted) == KNOT_SLOTS
     assert first.free == 0
     assert second.put(wanted[:1]) == 1
-    assert first.take() == wanted[0]
-    assert second.take() == wanted[0]
-    assert second.take() is None
+    for each in (first, second):
+        assert each.peek() == each.peek() == wanted[0]
+        each.drop()
+    assert first.peek() == wanted[1]
+    assert second.peek() is None
     assert first.free == 1
     first.clear()
-    assert first.take() is None
+    assert first.peek() is None
 
 
 def test_the_blob_gives_only_what_was_stored_under_that_number(memory: Memory) -> None:
