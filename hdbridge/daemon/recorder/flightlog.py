@@ -114,11 +114,6 @@ class FlightLog:
         """Where the recordings are."""
         return self._store.folder
 
-    @property
-    def trouble(self) -> str:
-        """Why nothing is recorded at present; empty when it is."""
-        return self._trouble
-
     def mend(self) -> None:
         """Finish what a process that died has left; keep those of them that a fault is in."""
         for path in mend_folder(self._store.folder, self._tell):

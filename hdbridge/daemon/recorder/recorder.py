@@ -15,17 +15,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final
 
-from hdbridge.client import messages
 from hdbridge.daemon.memory import Event, SampleArray
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.about import About
 from hdbridge.daemon.recorder.flightlog import MARK, Batch, Counts, FlightLog, Item, ModelUse, Note
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.daemon.recorder.store import Store, free_bytes
-
-if TYPE_CHECKING:
-    from hdbridge.daemon.machine import Machine
 
 FLUSH_S: Final = 1.0
 QUEUE_BATCHES: Final = 500
@@ -61,30 +57,10 @@ class FlightRecorder:
         self._mender = threading.Thread(target=self._mend, name="recorder-mend", daemon=True)
         self._mender.start()
 
-    @classmethod
-    def of(cls, machine: Machine, tell: Callable[[str], None]) -> Self:
-        """As the machine file says. OSError where the folder cannot be made."""
-        axes = tuple(AxisAbout.of(each.config) for each in machine.axes)
-        about = About.of(machine.name, axes, machine.cycle_s)
-        recorder = cls(machine.recorder_folder(), about, machine.recorder, tell=tell)
-        for each in machine.axes:
-            recorder.use_model(each.name, each.model().dump())
-        return recorder
-
     @property
     def folder(self) -> Path:
         """Where the recordings are."""
         return self._flight.folder
-
-    def state(self) -> messages.RecorderState:
-        """For clients."""
-        counts = self.counts
-        return messages.RecorderState(
-            on=True,
-            folder=str(self.folder),
-            dropped=counts.dropped + counts.refused,
-            note=self._flight.trouble or None,
-        )
 
     @property
     def counts(self) -> Counts:

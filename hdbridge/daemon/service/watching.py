@@ -10,7 +10,6 @@ from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.watch.sink import WatchSink
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 
 _log = logging.getLogger(__name__)
@@ -24,19 +23,16 @@ class Watching:
         self._names = [axis.name for axis in machine.axes]
         self._bridge = bridge
         self._sink = WatchSink.of(machine, self._tell, recorder)
-        self._used: list[tuple[TransmissionModel, Scheme]] = [
-            (port.models.in_use.model, Scheme.EXTENDED) for port in bridge.axes.values()
-        ]
+        self._used: list[TransmissionModel | None] = [None] * len(self._names)
         bridge.advice = self._sink.advice
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer. What the adaptation moves is the same model to the watch."""
+        """From the observer. The whole committed model is watched, whatever part compensates or adapts."""
         for place, port in enumerate(self._bridge.axes.values()):
-            in_use = port.models.in_use
-            model, scheme = self._used[place]
-            if in_use.model is not model or in_use.scheme is not scheme:
-                self._used[place] = in_use.model, in_use.scheme
-                self._sink.use(place, in_use.compensating)
+            model = port.models.in_use.model
+            if self._used[place] is not model:
+                self._used[place] = model
+                self._sink.use(place, model)
         self._sink.take(samples, events, lost)
 
     def close(self) -> None:

@@ -4,9 +4,9 @@ The observed error less the model's is, if the model holds, noise plus what its 
 
     observed - predicted = columns @ change + zero + its trend + disc of the load encoder + noise
 
-with ``change`` drawn from the model file's intervals, and noise of the size that the model left on data that
-it had not seen (or of the motor encoder's counts, where that is more). Three questions, by generalised least
-squares:
+with ``change`` drawn from the model file's intervals (where it has none, from those of a usual calibration,
+as `diagnose.changes` has them), and noise of the size that the model left on data that it had not seen (or of
+the motor encoder's counts, where that is more). Three questions, by generalised least squares:
 
 * has a part of the model moved by more than its interval and the errors of this fit allow (chi square)?
 * has the zero moved since it was learned?
@@ -32,7 +32,7 @@ from hdbridge.daemon.adaptation.prior import bounds_arcsec, estimator_of
 from hdbridge.daemon.adaptation.proposal import changes_between
 from hdbridge.daemon.adaptation.regressors import Regressors, Term
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
-from hdbridge.diagnose.changes import LOOP_ARCSEC, LOOP_SHARE, ORDER_ARCSEC
+from hdbridge.diagnose.changes import CALIBRATED, LOOP_ARCSEC, LOOP_SHARE, ORDER_ARCSEC
 from hdbridge.effects import FloatArray
 from hdbridge.model import TransmissionModel
 
@@ -140,6 +140,12 @@ class Judge:
         settings = AdaptationSettings()
         prior = estimator_of(regressors, settings)
         self._calibrated = prior.covariance
+        for each in regressors.terms:
+            if each.effect.name not in regressors.model.uncertainty:
+                share = CALIBRATED * float(np.linalg.norm(each.effect.coefficients(), np.inf))
+                self._calibrated[each.columns, each.columns] = share**2 * np.eye(
+                    len(each.effect.coefficients())
+                )
         self._scale = prior.scale
         self._bounds = bounds_arcsec(regressors, settings)
         questions = (len(regressors.terms) + 2) * DAY_S / allowed.every_s

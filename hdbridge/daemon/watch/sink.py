@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
@@ -53,7 +54,8 @@ class WatchSink:
         self._tell = tell
         self._diagnose = diagnose
         self._ending = ending
-        self._queue: queue.Queue[_Batch | _Use | None] = queue.Queue(QUEUE_BATCHES)
+        self._queue: queue.Queue[_Batch | None] = queue.Queue(QUEUE_BATCHES)
+        self._uses: deque[_Use] = deque()
         self._missed = 0
         self._words: dict[str, str] = {}
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
@@ -73,23 +75,25 @@ class WatchSink:
                 recorder.note(kind, f"{axis}: {words}")
             tell(words, places[axis])
 
-        diagnosis = None
-        if recorder is not None:
-            diagnosis = AutoDiagnosis(recorder.folder, lambda axis, words: say("DIAGNOSIS", axis, words))
+        diagnosis = (
+            AutoDiagnosis(recorder.folder, lambda axis, words: say("DIAGNOSIS", axis, words))
+            if recorder is not None
+            else None
+        )
 
         def diagnose(raised: Raised, model: TransmissionModel) -> None:
             if diagnosis is not None:
                 diagnosis.ask(raised.axis, model.dump(), settings.window_s / 60.0, raised.words)
 
+        watches = [
+            Watch(each.config, each.model(), place, settings) for place, each in enumerate(machine.axes)
+        ]
         return cls(
-            [
-                Watch(each.config, each.model(), place, settings)
-                for place, each in enumerate(machine.axes)
-            ],
+            watches,
             lambda raised: say("WATCH", raised.axis, raised.words),
             diagnose=diagnose,
             ending=diagnosis.close if diagnosis is not None else lambda: None,
-        )  # fmt: skip
+        )
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """From the observer."""
@@ -101,7 +105,7 @@ class WatchSink:
 
     def use(self, place: int, model: TransmissionModel) -> None:
         """Another model predicts on the axis at ``place`` from now on."""
-        self._queue.put(_Use(place, model))
+        self._uses.append(_Use(place, model))
 
     def advice(self, axis: str) -> list[str]:
         """What a person should know of an axis; empty while its model holds."""
@@ -117,16 +121,18 @@ class WatchSink:
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
             try:
+                while self._uses:
+                    self._use(self._uses.popleft())
                 self._do(item)
             except Exception:
                 _log.exception("the watch failed; it goes on")
 
-    def _do(self, item: _Batch | _Use) -> None:
-        if isinstance(item, _Use):
-            watch = self._watches[item.place]
-            watch.use(item.model)
-            self._words.pop(watch.axis, None)
-            return
+    def _use(self, item: _Use) -> None:
+        watch = self._watches[item.place]
+        watch.use(item.model)
+        self._words.pop(watch.axis, None)
+
+    def _do(self, item: _Batch) -> None:
         for watch in self._watches:
             if item.lost:
                 watch.lost()

@@ -198,8 +198,9 @@ class Watch:
         self._judged_s = self._now_s
         while self._seen and not 0.0 <= self._now_s - self._seen[0].time_s <= self._settings.window_s:
             self._seen.popleft()
-        if not self._fresh or not self._believed:
-            return []  # an axis that rests says nothing new
+        # An axis that rests says nothing new, and one that was never calibrated has not changed.
+        if not self._fresh or not self._believed or not self._model.effects:
+            return []
         self._fresh = 0
         evidence = self._judge_of.judge(self._seen, self._zero)
         if evidence is None:

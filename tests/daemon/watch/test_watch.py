@@ -138,6 +138,18 @@ def test_another_model_begins_anew():
     assert watch.evidence is None
 
 
+def test_an_axis_without_a_model_has_not_changed():
+    watch, raised = watched(MODEL, watch=Watch(AXIS, TransmissionModel(50.0)))
+    assert raised == []
+    assert watch.verdict is Verdict.HOLDS
+
+
+def test_a_model_without_intervals_is_taken_for_a_usual_calibration():
+    bare = replace(MODEL, uncertainty={})
+    _, raised = watched(model_of(offset=31.6 * 1.3), watch=Watch(AXIS, bare))
+    assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
+
+
 def test_an_axis_that_rests_says_nothing():
     watch, raised = watched(model_of(offset=60.0), path=np.zeros(10_000))
     assert raised == []
