@@ -283,12 +283,13 @@ class DaemonBench:
 
     def _arrived(self, sample: Sample, path: Path, elapsed_s: float) -> bool:
         """Whether the set-point stands at the end of a leg: knots that came late have delayed it."""
-        if abs(sample.load_target_deg - path.at(path.duration_s)) <= BEGIN_DEG:
+        end_deg = path.at(path.duration_s)
+        if abs(sample.load_target_deg - end_deg) <= BEGIN_DEG:
             return True
         if elapsed_s > path.duration_s + STREAM_TIMEOUT_S:
             raise DaemonError(
-                f"{self._axis.name}: a leg's set-points were handed over, but {STREAM_TIMEOUT_S:g} s after its "
-                f"time the axis was sent to {sample.load_target_deg:.6g} deg, not {path.at(path.duration_s):.6g}"
+                f"{self._axis.name}: {STREAM_TIMEOUT_S:g} s after a leg was to end at {end_deg:.6g} deg the "
+                f"axis was sent to {sample.load_target_deg:.6g} deg: its set-points did not get through"
             )
         return False
 
