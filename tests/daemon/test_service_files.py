@@ -48,7 +48,8 @@ def test_the_unit_of_the_system(folder: Path) -> None:
     assert unit.path == Path("/etc/systemd/system/hdbridge-cell.service")
     service = options(unit)["Service"]
     assert service["ExecStart"].endswith(f'-P -m hdbridge run "{folder}/machine.yaml"'.replace("%", "%%"))
-    assert (service["Type"], service["NotifyAccess"], service["KillMode"]) == ("notify", "main", "mixed")
+    assert (service["Type"], service["NotifyAccess"]) == ("notify", "main")
+    assert service["KillMode"] == "control-group"
     assert (service["User"], service["LimitRTPRIO"], service["LimitMEMLOCK"]) == ("daemon", "70", "infinity")
     assert service["RestrictAddressFamilies"] == "AF_UNIX AF_CAN"
     assert service["ReadWritePaths"] == f'"{folder}"'.replace("%", "%%")
