@@ -9,7 +9,7 @@ from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.timing import POLL_S, Timing
 from hdbridge.errors import DaemonError, RefusedError
 
-ANSWER_S = 2.0
+ANSWER_S = 5.0
 """The control process answers within a few cycles; after so long it is not there. ENABLE and DISABLE are
 answered when they are done."""
 

@@ -17,7 +17,7 @@ from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.interface import Batch
 
 PERIOD_S = 0.02
-GONE_S = 1.0
+GONE_S = 3.0
 """Without a turn for so long the control process hangs or is gone."""
 _log = logging.getLogger(__name__)
 

@@ -63,7 +63,9 @@ class ServiceAxis:
         self._changed = changed
         self._changing = asyncio.Lock()
         self._doing = ""
-        """What has the drive to itself at present, in words."""
+        """What a client has begun that has the drive to itself, in words."""
+        self._drive = asyncio.Lock()
+        """Held by whatever has the drive to itself, also by what nobody asked for: that is waited for."""
 
     # ---------------------------------------------------------------- who may
 
@@ -89,7 +91,8 @@ class ServiceAxis:
         self.check_free()
         self._doing = doing
         try:
-            yield
+            async with self._drive:
+                yield
         finally:
             self._doing = ""
 
@@ -133,14 +136,14 @@ class ServiceAxis:
 
     async def take_over(self) -> None:
         """The service begins: take the axis as an earlier one has left it."""
-        async with self._alone("its drive is being compared with its axis file"):
+        async with self._drive:
             await self.power.take_over()
 
     async def verify(self) -> None:
         """Boot the drive and compare it with its axis file, where that is due; disabled then."""
-        if self._doing or self.link.state not in UNKNOWN:
-            return
-        async with self._alone("its drive is being verified"):
+        async with self._drive:
+            if self.link.state not in UNKNOWN:
+                return
             await self.power.verify()
         self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
 

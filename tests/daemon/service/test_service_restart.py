@@ -7,7 +7,7 @@ from support.service import Service, play, stepped_service, until
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
-from hdbridge.errors import LeaseError, RefusedError
+from hdbridge.errors import LeaseError
 from hdbridge.evaluation.stepping import Scheme
 
 
@@ -56,18 +56,17 @@ def test_nothing_is_asked_of_an_axis_before_its_state_is_known(service: Service)
     daemon.run(0.5)
     daemon.done(CommandKind.QUICK_STOP)
     daemon.run(0.5)
+    sent: set[int] = set()
+    daemon.bus.spy = lambda can_id, _: sent.add(can_id)
 
     async def story() -> None:
         async with service.bridge() as bridge:
             axis = bridge.axes["axis1"]
             token = bridge.lease.take("at once")
-            with pytest.raises(RefusedError, match="being compared"):
-                await axis.reset(token)
-            assert daemon.states == [AxisState.QUICK_STOPPED]
-            await until(bridge, lambda: axis.commissioning.report is not None)
-            await bridge.core.timing.sleep(0.1)
-            await axis.reset(token)
+            await axis.reset(token)  # waits until it is
+            assert axis.commissioning.report is not None
             assert daemon.states == [AxisState.DISABLED]
+            assert 0x000 not in sent  # no NMT command
 
     play(story())
 
