@@ -51,10 +51,11 @@ blind: $(READY)  ## a blind suite of diagnoses into build/blind (hours; BLIND_SE
 	$(BIN)/python tools/blind/generate.py --out build/blind --seed $(BLIND_SEED) --cases $(BLIND_CASES)
 	$(BIN)/python tools/blind/score.py build/blind --json build/blind/verdicts.json | tee build/blind/figures.md
 
-bench-realtime: $(READY)  ## what a cycle of 1 ms costs on PREEMPT_RT, in instructions (some ten minutes; root, QEMU)
+bench-realtime: $(READY)  ## what a cycle and the daemon's loop cost on PREEMPT_RT, in instructions (some twenty minutes; root, QEMU)
 	@mkdir -p build/realtime
 	$(CC) -O2 -o build/realtime/master tools/bench/master.c
 	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_cycle.py --master build/realtime/master --json build/realtime/figures.json
+	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_daemon.py --json build/realtime/daemon.json
 
 $(VENV)/.docs: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

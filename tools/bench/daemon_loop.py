@@ -32,6 +32,7 @@ from can.interfaces.virtual import VirtualBus
 from cycle import PROFILE, NeverSleeping, answers, block_us
 
 from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.cycle import Cycle
@@ -97,11 +98,21 @@ def configs_of(count: int) -> list[AxisConfig]:
     ]
 
 
-def bench_cycle(bus: can.BusABC, model: TransmissionModel) -> Callable[[], None]:
-    """The bench's own cycle: `Bench._leg` without what keeps the samples."""
-    (axis,) = configs_of(1)
-    image = ProcessImage(axis)
-    cycle = Cycle(Link(bus, NeverSleeping()), NeverSleeping(), image, Supervision(), axis.drive.cycle_s)
+def bench_cycle(
+    bus: can.BusABC,
+    model: TransmissionModel,
+    axis: AxisConfig | None = None,
+    clock: Clock | None = None,
+    image: ProcessImage | None = None,
+) -> tuple[Callable[[], None], Cycle]:
+    """The bench's own cycle: `Bench._leg` without what keeps the samples; by default it never sleeps.
+
+    ``image`` is that of a drive that was made ready for power.
+    """
+    axis = axis or configs_of(1)[0]
+    clock = clock or NeverSleeping()
+    image = image or ProcessImage(axis)
+    cycle = Cycle(Link(bus, clock), clock, image, Supervision(), axis.drive.cycle_s)
     compensation = compensation_for(axis, model.bound_to(axis))
     compensation.engage()
     observer, sensed = Observer(), Sensed(axis)
@@ -135,7 +146,7 @@ def bench_cycle(bus: can.BusABC, model: TransmissionModel) -> Callable[[], None]
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)
 
-    return turn
+    return turn, cycle
 
 
 def controller_of(bus: can.BusABC, memory: Memory, model: TransmissionModel) -> Controller:
@@ -171,7 +182,7 @@ def bench_block(model: TransmissionModel, cycles: int) -> float:
     """The same of the bench's cycle."""
     for _ in range(20):
         with suppress(SafetyStop), AnsweringNodes(1) as bus:
-            turn = bench_cycle(bus, model)
+            turn, _ = bench_cycle(bus, model)
             block_us(turn, 50)
             own = block_us(turn, cycles)
             return own - block_us(bus.answer, cycles)

@@ -1,0 +1,321 @@
+"""What a turn of the daemon's control loop costs on a PREEMPT_RT kernel, in instructions; is one ever missed?
+
+    make bench-realtime
+    tools/realtime/run.sh .venv/bin/python tools/bench/realtime_daemon.py
+
+Runs on the kernel of `tools/realtime/run.sh`, as `realtime_cycle.py`: one axis at 1 kHz, then six at 250 Hz,
+compensated, and before them the bench's cycle (`Cycle.tick`) with the same compensation and set-point. The
+loop (`Controller.turn`) is in this process, with SCHED_FIFO and locked memory. A second process is the
+service, on the same processor: it empties the rings of samples and events, and posts what clients ask for,
+all of it again and again:
+
+    moves, re-targeted in motion - jogs - stops - streams of knots - compensation off and on - another model
+    in motion - SDO requests
+
+  busy    from the wake-up to the next time that the loop sleeps: all of a turn, sample and commands included
+  missed  turns that began more than half a period late or were busy beyond the next deadline
+
+It fails where a period was skipped, an axis stopped by itself, or a sample was lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import pickle
+import select
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+from cycle import PROFILE, answering_kernel
+from daemon_loop import bench_cycle
+from realtime_cycle import WARM_UP, Figures, Waking, table
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.buscycle import BusCycle
+from hdbridge.control.realtime import prepare_realtime
+from hdbridge.daemon.loop.controller import Controller
+from hdbridge.daemon.loop.follower import AxisSetup
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory
+from hdbridge.drive.link import Link
+from hdbridge.model import TransmissionModel
+
+VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
+"""Axes, and the cycle in milliseconds."""
+STATUS_OFF = 0x0250
+POLL_S = 0.02
+JOG_EVERY_S = 0.05
+SDO_UPLOAD = bytes.fromhex("4041600000000000")
+SPEED = 5.0
+"""Of the moves, deg/s at the load."""
+
+
+class TurnClock(Waking):
+    """It keeps how long the loop was busy between two sleeps, and how late it woke."""
+
+    def __init__(self, turns: int) -> None:
+        super().__init__()
+        self.busy_s, self.lateness_s = np.zeros(turns), np.zeros(turns)
+        self.turns = 0
+        """That were kept."""
+        self.keeping = False
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Sleep to the absolute deadline."""
+        if self.keeping and self.turns < len(self.busy_s):
+            self.busy_s[self.turns] = time.monotonic() - self.woke_s
+            self.lateness_s[self.turns] = self.late_s
+            self.turns += 1
+        super().sleep_until(deadline_s)
+
+    @property
+    def full(self) -> bool:
+        """All turns are kept that there is room for."""
+        return self.turns == len(self.busy_s)
+
+
+# -------------------------------------------------------------------- the service's process
+
+
+class Clients:
+    """What the clients of one axis ask for, as time passes; about six seconds, and again."""
+
+    def __init__(self, memory: Memory, axis: int, model: bytes) -> None:
+        """``model`` is a pickled compensation, to change to in motion."""
+        self._memory, self._axis, self._model = memory, axis, model
+        self._stream = 0
+        self.steps = self._steps()
+
+    def _post(self, kind: CommandKind, **fields: float) -> None:
+        self._memory.commands.post(kind, self._axis, **fields)  # type: ignore[arg-type]
+
+    def _steps(self) -> Iterator[float]:
+        """Each `next` is one thing that is asked; what it gives is how long to wait for the next, s."""
+        while True:
+            for target in (2.0, -2.0, 3.0, 0.5):
+                self._post(CommandKind.MOVE, a=target, b=SPEED, c=math.nan)
+                yield 0.3
+            for _ in range(10):
+                self._post(CommandKind.JOG, a=1.0, b=0.3)
+                yield JOG_EVERY_S
+            self._post(CommandKind.STOP)
+            yield 0.7
+            self._post(CommandKind.COMPENSATE, i=0)
+            yield 0.3
+            self._post(CommandKind.COMPENSATE, i=1)
+            self._post(CommandKind.MOVE, a=0.0, b=SPEED, c=math.nan)
+            yield 0.1
+            self._post(CommandKind.CHANGE, i=self._memory.blobs.put(self._model))
+            yield 1.4
+            yield from self._streamed()
+
+    def _streamed(self) -> Iterator[float]:
+        """A slow sine about the place where it stands, 100 knots a second."""
+        self._stream += 1
+        knots = self._memory.knots[self._axis]
+
+        def knot(time_s: float) -> Knot:
+            phase = math.pi * time_s
+            position, velocity = math.sin(phase) ** 2, math.pi * math.sin(2.0 * phase)
+            return Knot(self._stream, time_s, position, velocity)
+
+        knots.put([knot(0.01 * place) for place in range(30)])
+        self._post(CommandKind.STREAM_BEGIN, a=0.2, j=self._stream)
+        for burst in range(3, 10):
+            yield 0.1
+            knots.put([knot(0.01 * place) for place in range(10 * burst, 10 * burst + 10)])
+        knots.put([knot(1.0)])
+        self._post(CommandKind.STREAM_END)
+        yield 1.0
+
+
+def serve(fd: int, axes: int) -> int:
+    """The service's side until its standard input is closed; what it saw, as JSON."""
+    with Memory.attach(fd) as memory:
+        samples, events = memory.reader(), memory.event_reader()
+        seen: dict[str, Any] = {"samples": 0, "lost": 0, "told": {}, "refused": []}
+        model = TransmissionModel.load(PROFILE / "model.yaml")
+        clients = [
+            Clients(memory, axis, pickle.dumps(compensation_for(config, model.bound_to(config))))
+            for axis, config in enumerate(configs_of(axes, 1e3 * memory.period_s))
+        ]
+        due: list[float] = []
+        enabled = 0
+        print("ready", flush=True)
+        polls = 0
+        while not select.select([sys.stdin], [], [], POLL_S)[0]:
+            now = time.monotonic()
+            arrays, lost = samples.read()
+            told, missed = events.read()
+            seen["samples"] += len(arrays)
+            seen["lost"] += lost + missed
+            for event in told:
+                name = event.kind.name
+                seen["told"][name] = seen["told"].get(name, 0) + 1
+                if event.kind in (EventKind.REFUSED, EventKind.STREAM_REFUSED, EventKind.STOPPED):
+                    seen["refused"].append(event.text)
+                enabled += event.kind is EventKind.STATE and event.code == AxisState.ENABLED
+            if enabled < axes:
+                continue
+            due = due or [now + 0.1 * axis for axis in range(axes)]
+            for axis, each in enumerate(clients):
+                if now >= due[axis]:
+                    due[axis] = now + next(each.steps)
+            memory.outgoing.put(time.monotonic_ns(), 0x601 + polls % axes, SDO_UPLOAD)
+            polls += 1
+    print(json.dumps({**seen, "refused": seen["refused"][:10]}), flush=True)
+    return 0
+
+
+@contextmanager
+def service(memory: Memory) -> Iterator[subprocess.Popen[str]]:
+    """Its process, which posts nothing before this says so."""
+    process = subprocess.Popen(
+        [sys.executable, __file__, "--serve", str(memory.fd), "--axes", str(memory.axes)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(memory.fd,),
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+# -------------------------------------------------------------------- the loop
+
+
+def configs_of(axes: int, cycle_ms: float) -> list[AxisConfig]:
+    """So many of the article's axis on one bus."""
+    first = AxisConfig.load(PROFILE)
+    drives = [
+        first.drive.model_copy(update={"node_id": node, "cycle_ms": cycle_ms}) for node in range(1, axes + 1)
+    ]
+    return [first.model_copy(update={"name": f"axis{drive.node_id}", "drive": drive}) for drive in drives]
+
+
+def enabled(controller: Controller, memory: Memory) -> None:
+    """All axes under power."""
+    for axis in range(memory.axes):
+        memory.commands.post(CommandKind.VERIFIED, axis, k=STATUS_OFF)
+        memory.commands.post(CommandKind.ENABLE, axis, k=STATUS_OFF)
+        for _ in range(10):
+            controller.turn()
+    check(controller)
+
+
+def check(controller: Controller) -> None:
+    """Every axis goes on, and no period was left out."""
+    for axis in controller.axes:
+        if axis.state is not AxisState.ENABLED:
+            raise SystemExit(f"{axis.config.name} is {axis.state.name}: {axis.supervision.stop}")
+    if controller.cycle.skipped:
+        raise SystemExit(f"{controller.cycle.skipped} periods were skipped")
+
+
+def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figures, dict[str, Any]]:
+    """The turns of so many axes, and what the service saw of them."""
+    configs = configs_of(axes, cycle_ms)
+    model = TransmissionModel.load(PROFILE / "model.yaml")
+    clock = TurnClock(turns)
+    with ExitStack() as stack:
+        stack.enter_context(answering_kernel(channel, *range(1, axes + 1)))
+        bus = stack.enter_context(can.Bus(interface="socketcan", channel=channel, ignore_config=True))
+        memory = stack.enter_context(Memory.create(axes, configs[0].drive.cycle_s))
+        cycle = BusCycle(Link(bus, clock), clock, memory.period_s, bitrate_bps=1_000_000)
+        setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
+        controller = Controller(cycle, setups, memory)
+        process = stack.enter_context(service(memory))
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        stack.enter_context(prepare_realtime())
+        cycle.restart()
+        enabled(controller, memory)
+        for _ in range(WARM_UP):
+            controller.turn()
+        clock.keeping = True
+        while not clock.full:
+            controller.turn()
+        check(controller)
+        assert process.stdin is not None
+        process.stdin.close()
+        for _ in range(2 * WARM_UP):
+            controller.turn()
+        seen = json.loads(process.stdout.readline())
+    if seen["lost"] or not seen["samples"]:
+        raise SystemExit(f"the service saw {seen['samples']} samples and lost {seen['lost']}")
+    name = "daemon's loop, one axis" if axes == 1 else f"daemon's loop, {axes} axes"
+    return Figures.of(name, 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms), seen
+
+
+def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
+    """The bench's cycle on the path of a move, with nobody else on the processor."""
+    (axis,) = configs_of(1, cycle_ms)
+    clock = TurnClock(turns)
+    with (
+        answering_kernel(channel, 1),
+        can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
+        prepare_realtime(),
+    ):
+        turn, _ = bench_cycle(bus, TransmissionModel.load(PROFILE / "model.yaml"), axis, clock)
+        for _ in range(WARM_UP):
+            turn()
+        clock.keeping = True
+        while not clock.full:
+            turn()
+    return Figures.of(
+        "bench's cycle, compensated", 1e6 * clock.lateness_s, 1e6 * clock.busy_s, 1e3 * cycle_ms
+    )
+
+
+def report(seen: dict[str, Any]) -> None:
+    """What the service saw, where there was one."""
+    if seen:
+        told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
+        print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)
+        for text in seen["refused"]:
+            print(f"  {text}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--channel", default="vcan0")
+    parser.add_argument("--turns", type=int, default=20_000)
+    parser.add_argument("--only", choices=tuple(VARIANTS), action="append", help="measure these only")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--serve", type=int, metavar="FD", help=argparse.SUPPRESS)
+    parser.add_argument("--axes", type=int, default=1, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    if options.serve is not None:
+        return serve(options.serve, options.axes)
+    results = []
+    for kind in options.only or VARIANTS:
+        axes, cycle_ms = VARIANTS[kind]
+        if kind == "bench":
+            figures, seen = of_bench(cycle_ms, options.turns, options.channel), {}
+        else:
+            figures, seen = measured(axes, cycle_ms, options.turns, options.channel)
+        print(table([figures], 1e-3 * cycle_ms), flush=True)
+        report(seen)
+        results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
+    if options.json is not None:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
