@@ -1,0 +1,230 @@
+"""Clients of a running daemon, in one process: pollers, watchers of the live samples, a page, one that moves.
+
+    python tools/bench/clients.py SOCKET [--polling 4] [--watching 5] [--moving stream|story|none]
+
+What each does:
+
+  polling   the machine's state five times a second
+  watching  every sample of every axis, over a WebSocket
+  page      as the live page: a WebSocket with what a screen can use, the state and the events once a second
+  stream    set-points of a slow sine to the first axis, 100 a second, without an end
+  story     moves, a re-target in motion, jogs, a queue, a stream, compensation off and on, now and then a
+            quick stop and a reset: again and again
+
+A line ``on`` on standard input lets them begin, ``off`` ends them (answered by ``on`` and ``off``); at its
+end what they saw is printed as JSON: samples, lost ones, requests, longest answer, errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager, suppress
+from typing import Any, Final
+
+from hdbridge.client import AsyncClient
+from hdbridge.client.aioaxis import AsyncAxis
+from hdbridge.errors import HdbridgeError
+
+POLL_S: Final = 0.2
+PAGE_HZ: Final = 50.0
+KNOTS_HZ: Final = 100.0
+AT_A_TIME: Final = 20
+"""Set-points that are sent."""
+AHEAD_S: Final = 1.0
+"""Path that is sent before it is due."""
+QUICK_STOP_EVERY: Final = 20
+"""Rounds of the story."""
+
+
+class Seen:
+    """What the clients of this process have seen."""
+
+    def __init__(self) -> None:
+        self.samples = self.lost = self.requests = self.points = self.rounds = 0
+        self.longest_s = 0.0
+        self.errors: Counter[str] = Counter()
+
+    @asynccontextmanager
+    async def request(self) -> AsyncIterator[None]:
+        """How long it took, and that it was."""
+        begin_s = time.monotonic()
+        yield
+        self.requests += 1
+        self.longest_s = max(self.longest_s, time.monotonic() - begin_s)
+
+    def report(self) -> dict[str, Any]:
+        """As JSON."""
+        return {**vars(self), "errors": dict(self.errors.most_common(20))}
+
+
+async def poll(client: AsyncClient, seen: Seen) -> None:
+    """The machine's state, again and again."""
+    while True:
+        async with seen.request():
+            await client.state()
+        await asyncio.sleep(POLL_S)
+
+
+async def watch(client: AsyncClient, seen: Seen, every: int = 1) -> None:
+    """The live samples."""
+    async for samples in client.live(every=every):
+        seen.samples += len(samples.cycle)
+        seen.lost += samples.lost
+
+
+async def page(client: AsyncClient, seen: Seen) -> None:
+    """What the page asks for."""
+    state = await client.state()
+    every = max(1, round(1.0 / (PAGE_HZ * state.cycle.period_s)))
+
+    async def ask() -> None:
+        newest = 0
+        while True:
+            async with seen.request():
+                await client.state()
+            async with seen.request():
+                events = (await client.events(newest)).events
+            newest = events[-1].sequence if events else newest
+            await asyncio.sleep(1.0)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(ask())
+        group.create_task(watch(client, seen, every))
+
+
+async def ready(axis: AsyncAxis) -> None:
+    """Under power, whatever it was before."""
+    state = await axis.state()
+    if state.state in ("quick-stopped", "latched"):
+        await axis.reset()
+    if (await axis.state()).state != "enabled":
+        await axis.enable()
+
+
+async def sine(axis: AsyncAxis, seen: Seen, knots: int | None) -> None:
+    """So many set-points on a sine of 1 deg from where it stands; None: without an end."""
+    middle_deg = (await axis.state()).load_target_deg
+    assert middle_deg is not None
+    async with axis.stream() as stream:
+        place, begin_s = 0, time.monotonic()
+        while knots is None or place < knots:
+            points = []
+            for _ in range(AT_A_TIME if knots is None else min(AT_A_TIME, knots - place)):
+                time_s, phase = place / KNOTS_HZ, math.pi * place / KNOTS_HZ
+                points.append((time_s, middle_deg + math.sin(phase) ** 2, math.pi * math.sin(2.0 * phase)))
+                place += 1
+            await stream.put(points)
+            seen.points += len(points)
+            await asyncio.sleep(max(begin_s + place / KNOTS_HZ - AHEAD_S - time.monotonic(), 0.0))
+
+
+async def stream_on(client: AsyncClient, seen: Seen) -> None:
+    """Set-points to the first axis."""
+    async with client.lease(force=True):
+        axis = next(iter((await client.axes()).values()))
+        await ready(axis)
+        await axis.stop()
+        await axis.rest()
+        await sine(axis, seen, None)
+
+
+async def story(client: AsyncClient, seen: Seen) -> None:
+    """All that a client may ask of an axis, round after round."""
+    chance = random.Random(1)
+    async with client.lease(force=True):
+        axis = next(iter((await client.axes()).values()))
+        while True:
+            await ready(axis)
+            await axis.move(chance.uniform(-10.0, 10.0))
+            await axis.move(chance.uniform(-10.0, 10.0), wait=False)
+            await asyncio.sleep(0.2)
+            await axis.move(chance.uniform(-10.0, 10.0))
+            await axis.jog(chance.uniform(-3.0, 3.0), 0.5)
+            await axis.rest()
+            await axis.queue([chance.uniform(-10.0, 10.0) for _ in range(3)])
+            await axis.compensate("none")
+            await axis.move(chance.uniform(-10.0, 10.0), wait=False)
+            await axis.compensate("extended")
+            await axis.rest()
+            await sine(axis, seen, 301)  # whole periods, so that it ends at rest
+            seen.rounds += 1
+            if seen.rounds % QUICK_STOP_EVERY == 0:
+                await axis.quick_stop()
+                await asyncio.sleep(0.5)
+                await axis.reset()
+            elif seen.rounds % 3 == 0:
+                await axis.activate_model("active")
+
+
+async def persistent(
+    socket: str, seen: Seen, what: Callable[[AsyncClient, Seen], Coroutine[Any, Any, None]]
+) -> None:
+    """What a client does; after an error, which is counted, it begins anew."""
+    while True:
+        try:
+            async with AsyncClient(socket, name=what.__name__, timeout_s=60.0) as client:
+                await what(client, seen)
+        except* (HdbridgeError, OSError) as group:
+            for error in group.exceptions:
+                seen.errors[f"{what.__name__}: {error}"] += 1
+            await asyncio.sleep(0.5)
+
+
+async def serve(options: argparse.Namespace) -> None:
+    """Begin and end as standard input says."""
+    seen = Seen()
+    moving = {"stream": [stream_on], "story": [story], "none": []}[options.moving]
+    wanted = [poll] * options.polling + [watch] * options.watching + [page] * options.pages + moving
+    tasks: list[asyncio.Task[None]] = []
+    async for line in lines():
+        if line == "on" and not tasks:
+            tasks = [asyncio.create_task(persistent(options.socket, seen, each)) for each in wanted]
+        elif line == "off":
+            await end(tasks)
+            tasks = []
+        print(line, flush=True)
+    await end(tasks)
+    print(json.dumps(seen.report()), flush=True)
+
+
+async def lines() -> AsyncIterator[str]:
+    """Of standard input."""
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    while line := await reader.readline():
+        yield line.decode().strip()
+
+
+async def end(tasks: list[asyncio.Task[None]]) -> None:
+    """And wait until they have ended."""
+    for task in tasks:
+        task.cancel()
+    for task in tasks:
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("socket")
+    parser.add_argument("--polling", type=int, default=4)
+    parser.add_argument("--watching", type=int, default=5)
+    parser.add_argument("--pages", type=int, default=1)
+    parser.add_argument("--moving", choices=("stream", "story", "none"), default="stream")
+    asyncio.run(serve(parser.parse_args()))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
