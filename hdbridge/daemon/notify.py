@@ -6,11 +6,14 @@ import os
 import socket
 from collections.abc import MutableMapping
 from contextlib import suppress
-from typing import Self
+from typing import Final, Self
+
+PATIENCE_S: Final = 1.0
+"""How long a manager is waited for that has ten messages to read yet, when it must not miss this one."""
 
 
 class Notifier:
-    """Tells the service manager; nobody, where there is none. It never fails and never waits."""
+    """Tells the service manager; nobody, where there is none. It never fails."""
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
         """``address`` is that of the manager's socket; one that begins with @ is an abstract one."""
@@ -29,7 +32,7 @@ class Notifier:
 
     def ready(self) -> None:
         """All that was started works."""
-        self._tell("READY=1")
+        self._tell("READY=1", PATIENCE_S)
 
     def alive(self) -> None:
         """What is watched goes on."""
@@ -38,17 +41,21 @@ class Notifier:
 
     def stopping(self) -> None:
         """It ends."""
-        self._tell("STOPPING=1")
+        self._tell("STOPPING=1", PATIENCE_S)
 
     def status(self, words: str) -> None:
         """A line for ``systemctl status``; told when it changes."""
-        if words != self._status:
+        if words != self._status and self._tell(f"STATUS={words}"):
             self._status = words
-            self._tell(f"STATUS={words}")
 
-    def _tell(self, line: str) -> None:
+    def _tell(self, line: str, patience_s: float = 0.0) -> bool:
+        """Whether the manager has taken it. The axis is worth more than who watches it: who does not listen
+        is not waited for longer.
+        """
         if self._address is None:
-            return
+            return True
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-            # The axis is worth more than who watches it: a manager that does not listen is not waited for.
-            sender.sendto(line.encode(), socket.MSG_DONTWAIT, self._address)
+            sender.settimeout(patience_s)
+            sender.sendto(line.encode(), self._address)
+            return True
+        return False

@@ -31,7 +31,6 @@ class Daemon:
         """Of its log, all processes together."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._manager.bind(str(folder / "notify"))
-        self._manager.settimeout(PATIENCE_S)
         environment = {
             **os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder),
             "NOTIFY_SOCKET": str(folder / "notify"),
@@ -40,8 +39,12 @@ class Daemon:
             [sys.executable, "-m", "hdbridge", "run", *map(str, arguments)],
             env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
+        self.told: list[str] = []
+        """What the service manager was told."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
         self.socket = folder / "hdbridge" / f"{name}.sock"
         self.client = httpx.Client(
             transport=httpx.HTTPTransport(uds=str(self.socket)),
@@ -49,6 +52,11 @@ class Daemon:
             timeout=60.0,
         )
         self._lease: str | None = None
+
+    def _listen(self) -> None:
+        """At once: of messages that are not read, the kernel keeps ten."""
+        while line := self._manager.recv(4096).decode():
+            self.told.append(line)
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -62,8 +70,7 @@ class Daemon:
 
     def until_told(self, line: str) -> None:
         """The service manager has been told this."""
-        while self._manager.recv(4096).decode() != line:
-            pass
+        self.until(lambda: line in self.told, line)
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
         """Wait for something that is asked for again and again; what it gave."""
@@ -157,6 +164,9 @@ class Daemon:
         self._reader.join()
         assert self.process.stderr is not None
         self.process.stderr.close()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+            own.sendto(b"", self._manager.getsockname())
+        self._listener.join()
         self._manager.close()
         self.client.close()
 

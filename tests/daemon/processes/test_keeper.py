@@ -25,7 +25,6 @@ class Kept:
     def __init__(self, folder: Path, **environment: str) -> None:
         self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.manager.bind(str(folder / "notify"))
-        self.manager.settimeout(PATIENCE_S)
         told = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000", **environment}
         self.process = subprocess.Popen(
             [sys.executable, str(PROGRAM)], env={**os.environ, **told},
@@ -33,12 +32,19 @@ class Kept:
         )  # fmt: skip
         self.said: list[str] = []
         self.events: list[dict[str, object]] = []
+        self.told: list[str] = []
         self._readers = [
+            threading.Thread(target=self._read_told, daemon=True),
             threading.Thread(target=self._read_said, daemon=True),
             threading.Thread(target=self._read_events, daemon=True),
         ]
         for each in self._readers:
             each.start()
+
+    def _read_told(self) -> None:
+        """At once: of messages that are not read, the kernel keeps ten."""
+        while line := self.manager.recv(4096).decode():
+            self.told.append(line)
 
     def _read_said(self) -> None:
         assert self.process.stdout is not None
@@ -66,11 +72,12 @@ class Kept:
 
     def until_told(self, line: str) -> None:
         """The service manager has been told this."""
-        while self.manager.recv(4096).decode() != line:
-            pass
+        self.until(lambda: line in self.told, line)
 
     def until_ended(self) -> int:
         status = self.process.wait(PATIENCE_S)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+            own.sendto(b"", self.manager.getsockname())
         for each in self._readers:
             each.join()
         return status
