@@ -118,10 +118,17 @@ def test_a_fault_has_its_reaction_in_time(bench: VcanBench, row: Row) -> None:
 # ------------------------------------------------------------------ manners
 
 
-@pytest.mark.parametrize("command", ["step", "doctor", "scan"])
+@pytest.mark.parametrize("command", ["step", "doctor", "scan", "run"])
 def test_a_bus_that_another_master_has_is_left_alone(
-    command: str, interface: str, profile: Path, intruder: can.BusABC
+    command: str,
+    interface: str,
+    profile: Path,
+    intruder: can.BusABC,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    for each in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        monkeypatch.setenv(each, str(tmp_path))
     ended = threading.Event()
 
     def drive_on() -> None:

@@ -2,202 +2,206 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import struct
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from contextlib import suppress
 from typing import Final
 
-import can
+import pytest
 
-from hdbridge.drive.states import State, decode
-from tests.support.reliability import RECORD, Seen
-from tests.support.running import Daemon, gone
+from hdbridge.drive.supervision import Fault
+from tests.support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, DaemonBench, DaemonRow
+from tests.support.running import gone
 
-DAEMON: Final = "daemon"
-"""What stands for the bus in the record."""
-NODE: Final = 1
-STATE_TPDO: Final = 0x180 + NODE
-EMERGENCY: Final = 0x080 + NODE
-FAR_DEG: Final = 60.0
-SLOW_DEG_S: Final = 2.0
-STANDS: Final = 3
-"""Cycles in which the motor keeps its place when it stands."""
-
-
-class Witness:
-    """Another node's end of the bus: it only listens, and counts time in cycles of the master."""
-
-    def __init__(self, channel: str, period_s: float) -> None:
-        self._bus = can.Bus(interface="socketcan", channel=channel, ignore_config=True)
-        self._period_s = period_s
-        self._begun_s = time.time()
-
-    def begin(self) -> None:
-        """Forget what was heard; count from now on."""
-        while self._bus.recv(0) is not None:
-            pass
-        self._begun_s = time.time()
-
-    def cycles_until(self, met: Callable[[can.Message], bool], most: int) -> int:
-        """After how many cycles a frame came, its own included; AssertionError when not within ``most``."""
-        while (waited_s := time.time() - self._begun_s) < (most + 1) * self._period_s:
-            message = self._bus.recv((most + 1) * self._period_s - waited_s)
-            if message is not None and met(message):
-                return 1 + int((message.timestamp - self._begun_s) / self._period_s)
-        raise AssertionError(f"not within {most} cycles")
-
-    def cycles_until_standing(self, most: int) -> int:
-        """The same until the motor stands, by what the drive sends of it."""
-        places: list[int] = []
-
-        def standing(message: can.Message) -> bool:
-            if message.arbitration_id == STATE_TPDO:
-                places.append(struct.unpack_from("<Hi", message.data)[1])
-            return len(places) > STANDS and len(set(places[-STANDS - 1 :])) == 1
-
-        return self.cycles_until(standing, most)
-
-    def cycles_until_disabled(self, most: int) -> int:
-        """The same until the motor is without power; AssertionError where it was in motion just before."""
-        places: list[int] = []
-
-        def disabled(message: can.Message) -> bool:
-            if message.arbitration_id != STATE_TPDO:
-                return False
-            status, place = struct.unpack_from("<Hi", message.data)
-            places.append(place)
-            return decode(status) is not State.OPERATION_ENABLED
-
-        cycles = self.cycles_until(disabled, most)
-        assert len(places) < 3 or max(places[-3:]) - min(places[-3:]) <= 2, f"power off in motion: {places}"
-        return cycles
-
-    def sync(self) -> None:
-        """Be another master, once."""
-        self._bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
-
-    def close(self) -> None:
-        self._bus.shutdown()
-
-
-@dataclass
-class DaemonBench:
-    """A daemon that holds one axis on a real interface, and what can be done to both."""
-
-    daemon: Daemon
-    interface: str
-    configure: Callable[..., None]
-    restart_drive: Callable[[], None]
-    period_s: float
-    heartbeat_timeout_s: float
-    witness: Witness
-    target_deg: float = FAR_DEG
-
-    def under_way(self) -> None:
-        """The axis moves, slowly and for long, whatever there was before."""
-        daemon = self.daemon
-        state = daemon.until(
-            lambda: daemon.axis().get("state") not in {"", None, "unverified"} and daemon.axis(), "verified"
-        )
-        if state["state"] in {"latched", "quick-stopped"}:
-            daemon.ask("reset")
-        if daemon.axis()["state"] != "enabled":
-            daemon.until_axis("disabled")
-            daemon.ask("enable")
-        self.target_deg = -self.target_deg
-        daemon.ask("move", target_deg=self.target_deg, velocity_deg_s=SLOW_DEG_S, wait=False)
-        daemon.until(lambda: abs(daemon.axis().get("velocity_deg_s") or 0.0) > 0.9 * SLOW_DEG_S, "it moves")
-        self.witness.begin()
-
-    def cycles_since(self, cycle: int, kind: str, within: int) -> int:
-        """How many cycles after ``cycle`` an event of a kind came; AssertionError when it came later."""
-        names = (kind, kind.replace("_", " "))
-        event = self.daemon.until(
-            lambda: next(
-                (each for each in self.daemon.events if each["event"] in names and each["cycle"] >= cycle),
-                None,
-            ),
-            kind,
-        )
-        taken = int(event["cycle"]) - cycle
-        assert taken <= within, f"{kind} after {taken} cycles: {event}"
-        return max(taken, 1)
-
-
-@dataclass(frozen=True)
-class DaemonRow:
-    """One fault: how it is made and what has to come of it, and within how many cycles."""
-
-    name: str
-    expected: str
-    within: str
-    """In words, for the page."""
-    try_out: Callable[[DaemonBench], tuple[str, int, int]]
-    """Makes it and checks what comes of it: in words, the cycles that it took, those allowed."""
-    last: bool = False
-    """It ends the daemon."""
-
-
-def try_out(row: DaemonRow, bench: DaemonBench) -> None:
-    """Make a row's fault on an axis under way, check it, and note what came of it."""
-    bench.under_way()
-    seen, cycles, allowed = row.try_out(bench)
-    assert cycles <= allowed, f"{row.name}: {cycles} cycles, allowed are {allowed}"
-    if path := os.environ.get(RECORD):
-        with Path(path).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(Seen(DAEMON, row.name, seen, cycles, allowed))) + "\n")
-
+CAN_ERR_BUSOFF: Final = 0x40
+"""Of linux/can/error.h."""
 
 # ------------------------------------------------------------------ the bus
 
 
-def _interface_goes(bench: DaemonBench, back: Callable[[], None], *how: str) -> tuple[str, int, int]:
+def _is_back(bench: DaemonBench) -> None:
+    """The bus is opened again and the drive verified, in the same processes; the axis is disabled."""
+    daemon = bench.daemon
+    daemon.until(lambda: (daemon.state() or {}).get("bus", {}).get("up"), "the bus is opened again")
+    axis = daemon.until_axis("disabled")
+    assert axis["power"] != "operation enabled"
+
+
+def _bus_goes(
+    bench: DaemonBench,
+    goes: Callable[[], None],
+    comes: Callable[[], None] = lambda: None,
+    pause_s: float = 2.0,
+) -> tuple[str, int, int]:
     daemon = bench.daemon
     processes = daemon.pids("control"), daemon.pids("service")
     cycle = daemon.cycle()
-    bench.configure("link", *how, bench.interface)
-    cycles = bench.cycles_since(cycle, "bus_down", within=NOTICED)
-    daemon.until_axis("latched")
-    time.sleep(2.0)
-    back()
-    bench.witness.close()
-    bench.witness = Witness(bench.interface, bench.period_s)
-    daemon.until(lambda: "bus up" in daemon.names(), "the bus is opened again")
-    daemon.until(lambda: (daemon.state() or {}).get("bus", {}).get("up"), "and it is said")
-    daemon.ask("reset")
-    axis = daemon.until_axis("disabled")
-    assert axis["power"] != "operation enabled"
+    goes()
+    cycles = bench.told(cycle, "bus-down", NOTICED)
+    if pause_s:
+        bench.stopped("latched", "BUS_DOWN")
+        time.sleep(pause_s)
+    comes()
+    _is_back(bench)
     assert (daemon.pids("control"), daemon.pids("service")) == processes
     return "latch; opened again, verified, disabled, in the same processes", cycles, NOTICED
 
 
 def _goes_down(bench: DaemonBench) -> tuple[str, int, int]:
-    return _interface_goes(
-        bench, lambda: bench.configure("link", "set", "up", bench.interface), "set", "down"
-    )
+    return _bus_goes(bench, bench.cable.down, bench.cable.up)
 
 
 def _is_deleted(bench: DaemonBench) -> tuple[str, int, int]:
     def made_again() -> None:
-        bench.configure("link", "add", "dev", bench.interface, "type", "vcan")
-        bench.configure("link", "set", "up", bench.interface)
-        bench.restart_drive()
+        bench.cable.plug()
+        bench.look_again()
 
-    return _interface_goes(bench, made_again, "delete")
+    return _bus_goes(bench, bench.cable.unplug, made_again)
+
+
+def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
+    return _bus_goes(
+        bench, lambda: bench.witness.send(CAN_ERR_BUSOFF, bytes(8), is_error_frame=True), pause_s=0.0
+    )
+
+
+def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
+    """What leaves an end of the cable is spoilt so that the axis has to stop; then it is whole again."""
+    cycle = bench.daemon.cycle()
+    with bench.cable.spoilt(end, *how):
+        cycles = bench.told(cycle, "fault", NOTICED, Fault[fault].value, "quick stop")
+        bench.stopped("quick-stopped", fault)
+        time.sleep(1.0)
+    return "quick stop, latched", cycles, NOTICED
+
+
+def _all_lost(bench: DaemonBench) -> tuple[str, int, int]:
+    return _stops(bench, "LOST_TPDO", THEIRS, "loss", "100%")
+
+
+def _pulled(bench: DaemonBench) -> tuple[str, int, int]:
+    with bench.cable.spoilt(OURS, "loss", "100%"):
+        return _stops(bench, "LOST_TPDO", THEIRS, "loss", "100%")
+
+
+def _delayed(bench: DaemonBench) -> tuple[str, int, int]:
+    # After the window and before the next SYNC. Later ones would pass for those of the next SYNC.
+    return _stops(bench, "LOST_TPDO", THEIRS, "delay", f"{900 * bench.period_s:.0f}ms")
+
+
+def _queue_full(bench: DaemonBench) -> tuple[str, int, int]:
+    return _stops(bench, "TRANSMIT_FULL", OURS, "delay", "100s", "limit", "1")
+
+
+def _doubled(bench: DaemonBench) -> tuple[str, int, int]:
+    bench.goes_on(60)  # what changes nothing is told once a second: nothing has been for so long
+    cycle = bench.daemon.cycle()
+    with bench.cable.spoilt(THEIRS, "duplicate", "100%"):
+        cycles = bench.told(cycle, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
+        bench.goes_on()
+    return "counted; the axis goes on", cycles, NOTICED
+
+
+def _reordered(bench: DaemonBench) -> tuple[str, int, int]:
+    with bench.cable.spoilt(THEIRS, "delay", "3ms", "reorder", "50%"):
+        bench.goes_on()
+    return "the axis goes on", 0, 0
 
 
 def _second_master(bench: DaemonBench) -> tuple[str, int, int]:
     cycle = bench.daemon.cycle()
-    bench.witness.sync()
-    cycles = bench.cycles_since(cycle, "fault", within=NOTICED)
-    axis = bench.daemon.until_axis("quick-stopped")
-    assert axis["fault"]["name"] == "FOREIGN_SYNC"
+    bench.witness.send(0x080)
+    cycles = bench.told(cycle, "fault", NOTICED, Fault.FOREIGN_SYNC.value, "quick stop")
+    bench.stopped("quick-stopped", "FOREIGN_SYNC")
     return "quick stop, latched; the motor stands", cycles, NOTICED
+
+
+def _node_reset(bench: DaemonBench) -> tuple[str, int, int]:
+    daemon = bench.daemon
+    processes = daemon.pids("control"), daemon.pids("service")
+    cycle = daemon.cycle()
+    bench.witness.send(0x000, bytes([0x81, 0x01]))
+    bench.told(cycle, "fault", NOTICED, Fault.OWN_ID_ELSEWHERE.value, "quick stop")
+    cycles = bench.told(cycle, "fault", NOTICED, Fault.BOOT_UP.value, "latch")
+    _is_back(bench)
+    assert (daemon.pids("control"), daemon.pids("service")) == processes
+    return "quick stop, latch; verified again, disabled", cycles, NOTICED
+
+
+# ------------------------------------------------------------------ around it
+
+
+def _clock_step(bench: DaemonBench) -> tuple[str, int, int]:
+    if os.environ.get("SOCKETCAN_KERNEL") != "user-mode-linux":
+        pytest.skip("sets the clock: only in user-mode-linux, not on this machine")
+    for step_s in (-86_400.0, 86_400.0):
+        time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + step_s)
+        bench.goes_on(20)
+    return "no effect", 0, 0
+
+
+def _disk_full(bench: DaemonBench) -> tuple[str, int, int]:
+    daemon = bench.daemon
+
+    def recorder() -> dict[str, object]:
+        return dict((daemon.state() or {}).get("recorder") or {})
+
+    filler = bench.disk / "filler"
+    with filler.open("wb", buffering=0) as file:
+        while True:
+            try:
+                file.write(bytes(65_536))
+            except OSError:
+                break
+    daemon.until(lambda: recorder().get("dropped"), "the recorder drops")
+    assert recorder()["note"]
+    bench.goes_on(20)
+    filler.unlink()
+    return "the recorder drops and says so; the loop goes on", 0, 0
+
+
+def _hostile(bench: DaemonBench) -> tuple[str, int, int]:
+    daemon = bench.daemon
+    before = daemon.state()["cycle"]["skipped"]  # type: ignore[index]
+    mute = []
+    for number in range(40):
+        client = socket.socket(socket.AF_UNIX)
+        client.connect(str(daemon.socket))
+        if number % 2:
+            client.send(bytes(range(256)) * 8)
+        mute.append(client)
+    for body in (b"POST /api/v1/axes/article/move HTTP/1.1\r\nHost: x\r\nContent-Length: 999999999\r\n\r\n{",
+                 b"GET /" + bytes(200_000)):  # fmt: skip
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(daemon.socket))
+            client.settimeout(1.0)
+            with suppress(OSError):
+                client.sendall(body)
+    bench.goes_on()
+    for client in mute:
+        client.close()
+    skipped = daemon.state()["cycle"]["skipped"] - before  # type: ignore[index]
+    return "the API goes on, and the loop; no cycle is missed", skipped, 0
+
+
+def _second_daemon(bench: DaemonBench) -> tuple[str, int, int]:
+    daemon = bench.daemon
+    other = daemon.folder / "other"
+    other.mkdir(exist_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "hdbridge", "run", *map(str, daemon.arguments)],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(other), "XDG_STATE_HOME": str(other)},
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr
+    assert "another hdbridge on this machine masters it" in done.stderr
+    bench.goes_on(20)
+    return "refused with exit status 3; the first goes on", 0, 0
 
 
 # ------------------------------------------------------------------ the processes
@@ -257,9 +261,22 @@ def _service_hangs(bench: DaemonBench) -> tuple[str, int, int]:
     controls, services = daemon.pids("control"), daemon.pids("service")
     cycles, allowed = _jog_runs_out(bench, signal.SIGSTOP)
     os.kill(services[-1], signal.SIGCONT)
-    assert daemon.until_axis("enabled")["at_rest"]
+    assert (
+        daemon.until(lambda: daemon.axis().get("at_rest") and daemon.axis(), "at rest")["state"] == "enabled"
+    )
     assert (daemon.pids("control"), daemon.pids("service")) == (controls, services)
     return "the jog runs out; the loop holds the axis; the service goes on", cycles, allowed
+
+
+def _keeper_hangs(bench: DaemonBench) -> tuple[str, int, int]:
+    daemon = bench.daemon
+    processes = daemon.pids("control"), daemon.pids("service")
+    daemon.process.send_signal(signal.SIGSTOP)
+    bench.goes_on()
+    daemon.process.send_signal(signal.SIGCONT)
+    bench.goes_on(20)
+    assert (daemon.pids("control"), daemon.pids("service")) == processes
+    return "the axis goes on; nobody is started again", 0, 0
 
 
 def _terminal_closed(bench: DaemonBench) -> tuple[str, int, int]:
@@ -291,20 +308,35 @@ BRAKING: Final = 15
 IN_ORDER: Final = 25
 """The same, with the signal's way from process to process."""
 
+_SAME: Final = "latch; verified again, disabled, no restart"
+_BY_ITSELF: Final = "the drive stops by itself; another process, disabled"
+
 DAEMON_ROWS: Final = (
-    DaemonRow("the interface goes down, and up again", "latch; verified again, disabled, no restart",
-        f"{NOTICED}", _goes_down),
-    DaemonRow("the interface is deleted, and made again", "latch; verified again, disabled, no restart",
-        f"{NOTICED}", _is_deleted),
+    DaemonRow("the interface goes down, and up again", _SAME, f"{NOTICED}", _goes_down),
+    DaemonRow("the interface is deleted, and made again", _SAME, f"{NOTICED}", _is_deleted),
+    DaemonRow("the controller goes bus-off (its error frame)", _SAME, f"{NOTICED}", _bus_off),
+    DaemonRow("the cable is pulled, and plugged again", "quick stop, latched", f"{NOTICED}", _pulled),
+    DaemonRow("every frame of the drive is lost", "quick stop, latched", f"{NOTICED}", _all_lost),
+    DaemonRow("every frame of the drive comes after its window", "quick stop, latched", f"{NOTICED}",
+        _delayed),
+    DaemonRow("every frame of the drive comes twice", "go on, count", f"{NOTICED}", _doubled),
+    DaemonRow("the drive's frames change places within the cycle", "go on", "0", _reordered),
+    DaemonRow("the transmit queue is full (ENOBUFS)", "quick stop, latched", f"{NOTICED}", _queue_full),
     DaemonRow("SYNC of a second master", "quick stop, latched", f"{NOTICED}", _second_master),
-    DaemonRow("the control process is killed (-9)", "the drive stops by itself; another process, disabled",
-        "two heartbeats", _control_killed),
-    DaemonRow("the control process hangs (SIGSTOP)", "the drive stops by itself; another process, disabled",
-        "two heartbeats", _control_hangs),
+    DaemonRow("NMT reset of the drive by a second master", "quick stop, latch; verified again, disabled",
+        f"{NOTICED}", _node_reset),
+    DaemonRow("a second daemon is started on the interface", "refused; the first goes on", "0",
+        _second_daemon),
+    DaemonRow("the wall clock is put back and forth by a day", "no effect", "0", _clock_step),
+    DaemonRow("the recorder's disk is full", "the recorder drops; the loop goes on", "0", _disk_full),
+    DaemonRow("clients that say nothing, or rubbish", "the loop goes on; no cycle is missed", "0", _hostile),
+    DaemonRow("the control process is killed (-9)", _BY_ITSELF, "two heartbeats", _control_killed),
+    DaemonRow("the control process hangs (SIGSTOP)", _BY_ITSELF, "two heartbeats", _control_hangs),
     DaemonRow("the service is killed (-9) in a jog", "the loop goes on, the jog runs out; another service",
         "the jog's time-out", _service_killed),
     DaemonRow("the service hangs (SIGSTOP) in a jog", "the loop goes on, the jog runs out",
         "the jog's time-out", _service_hangs),
+    DaemonRow("the keeper hangs (SIGSTOP)", "the loop goes on", "0", _keeper_hangs),
     DaemonRow("the terminal is closed (SIGHUP)", "stop in order, end", f"{IN_ORDER}", _terminal_closed,
         last=True),
     DaemonRow("the keeper is killed (-9)", "stop in order, end", f"{IN_ORDER}", _keeper_killed, last=True),

@@ -1,7 +1,8 @@
 """The faults that an axis under way has to survive, as rows, and where each is tried.
 
 A *place* is a control cycle on a bus: the bench's on the virtual bus and on vcan, the daemon's on the virtual
-bus. Each has a `Bench`. What only a daemon can show is in `FURTHER`, each with a test of its own.
+bus. Each has a `Bench`. What only a daemon can show is in `FURTHER`, each with a test of its own, and in
+`daemon_faults`, for a daemon in processes of its own on vcan.
 `docs/reliability.md` is made of what came of all, by ``tools/reliability_page.py``.
 """
 
@@ -30,7 +31,8 @@ WORDS: Final = {
     Reaction.LATCH: "latch",
 }
 VIRTUAL, VCAN, DAEMON = "virtual", "vcan", "daemon"
-DAEMON_VCAN = "daemon on vcan"
+DAEMON_VCAN = "daemon, vcan"
+"""Where: the bench twice, the daemon's loop, the whole daemon in processes."""
 
 
 class Bench(Protocol):
@@ -163,38 +165,36 @@ ROWS: Final = (
 
 @dataclass(frozen=True)
 class Further:
-    """What a daemon shows that a bench cannot; each has a test of its own, which says what it saw."""
+    """What the daemon's loop shows that a bench cannot; each has a test of its own."""
 
-    place: str
     name: str
     expected: str
     allowed: float
-    """Cycles on the virtual bus, seconds on vcan."""
 
     def show(self, taken: float) -> None:
-        """It was seen, after so many cycles or seconds; AssertionError where that was too long."""
+        """It was seen, after so many cycles; AssertionError where that was too long."""
         assert taken <= self.allowed, f"{self.name}: {taken:g}, allowed are {self.allowed:g}"
-        _record(Seen(self.place, self.name, self.expected, taken, self.allowed))
+        record(Seen(DAEMON, self.name, self.expected, taken, self.allowed))
 
 
 FURTHER: Final = (
-    Further(DAEMON, "TPDOs come in another order", "no effect", 0),
-    Further(DAEMON, "the load encoder's counts pass the end of their 32 bits", "no effect", 0),
-    Further(DAEMON, "the motor does not follow", "quick stop, once the error is beyond the limit", 2),
-    Further(DAEMON, "a model asks for a step beyond the limits of speed and slew",
-            "quick stop; the target is not sent", 1),
-    Further(DAEMON, "a client's target is not a number, infinite or out of limits",
-            "refused; the motion goes on", 1),
-    Further(DAEMON, "a client streams a set-point that is not a number", "the stream ends, braking", 1),
-    Further(DAEMON, "a mailbox full of commands that make no sense", "each refused; the motion goes on", 32),
-    Further(DAEMON, "an SDO write, an NMT reset, a set-point from the service in motion", "not sent", 4),
-    Further(DAEMON, "the place told with the enable command is stale", "enabled where it is; no motion", 0),
-    Further(DAEMON, "the drive's identity, encoder or gear is another", "no set-point; not enabled", 0),
-    Further(DAEMON, "the control process is killed in motion", "the drives stop by themselves", 25),
-    Further(DAEMON, "the control process begins again", "every axis disabled and unverified", 1),
-    Further(DAEMON, "the service dies during a jog", "the jog runs out and brakes", 150),
-    Further(DAEMON, "the interface comes back", "opened; verified again; disabled", 126),
-    Further(DAEMON, "the disk is full", "the recorder drops and says so; no cycle is missed", 0),
+    Further("TPDOs come in another order", "no effect", 0),
+    Further("the load encoder's counts pass the end of their 32 bits", "no effect", 0),
+    Further("the motor does not follow", "quick stop, once the error is beyond the limit", 2),
+    Further("a model asks for a step beyond the limits of speed and slew",
+        "quick stop; the target is not sent", 1),
+    Further("a client's target is not a number, infinite or out of limits",
+        "refused; the motion goes on", 1),
+    Further("a client streams a set-point that is not a number", "the stream ends, braking", 1),
+    Further("a mailbox full of commands that make no sense", "each refused; the motion goes on", 32),
+    Further("an SDO write, an NMT reset, a set-point from the service in motion", "not sent", 0),
+    Further("the place told with the enable command is stale", "enabled where it is; no motion", 0),
+    Further("the drive's identity, encoder or gear is another", "no set-point; not enabled", 0),
+    Further("the control process is killed in motion", "the drives stop by themselves", 25),
+    Further("the control process begins again", "every axis disabled and unverified", 1),
+    Further("the service dies during a jog", "the jog runs out and brakes", 150),
+    Further("the interface comes back", "opened; verified again; disabled", 126),
+    Further("the disk is full", "the recorder drops and says so; no cycle is missed", 0),
 )  # fmt: skip
 """In the order of the page."""
 
@@ -213,7 +213,7 @@ class Seen:
     name: str
     seen: str
     taken: float
-    """Cycles, or seconds where the row says so."""
+    """Cycles."""
     allowed: float
 
 
@@ -252,7 +252,7 @@ def try_out(row: Row, bench: Bench, place: str, heartbeat_timeout_s: float) -> S
     latched = bench.supervision.stop
     assert (latched is not None) == (row.reaction >= Reaction.QUICK_STOP or row.fault is Fault.HANG)
     seen = Seen(place, row.name, _words(bench.supervision, hits[0]), cycles, allowed)
-    _record(seen)
+    record(seen)
     return seen
 
 
@@ -264,7 +264,8 @@ def _words(supervision: Supervision, hit: Event) -> str:
     return f"{WORDS[gravest.reaction]}: {stop.fault.value}{then}"
 
 
-def _record(seen: Seen) -> None:
+def record(seen: Seen) -> None:
+    """Write down what was seen, where somebody wants it (`RECORD`)."""
     path = os.environ.get(RECORD)
     if path:
         with Path(path).open("a", encoding="utf-8") as file:

@@ -26,7 +26,7 @@ class Daemon:
 
     def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
         """``folder`` is its runtime folder's and its own to write into; ``name`` that of the machine."""
-        self.folder, self.name = folder, name
+        self.folder, self.arguments, self.name = folder, arguments, name
         self.events: list[dict[str, Any]] = []
         """Of its log, all processes together."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -102,6 +102,21 @@ class Daemon:
         except httpx.HTTPError:
             return None
 
+    def told(self, since: int = 0) -> list[dict[str, Any]]:
+        """Events after a numbered one; none while the API does not answer."""
+        try:
+            answer = self.client.get("/events", params={"since": since}).raise_for_status()
+        except httpx.HTTPError:
+            return []
+        return list(answer.json()["events"])
+
+    def newest_event(self) -> int:
+        """Number of the newest."""
+        newest = 0
+        while told := self.told(newest):
+            newest = int(told[-1]["sequence"])
+        return newest
+
     def axis(self, place: int = 0) -> dict[str, Any]:
         """An axis; empty while the API does not answer."""
         state = self.state()
@@ -121,23 +136,28 @@ class Daemon:
 
         Where it has to wait, for the drive that is being verified or brought to rest, it does.
         """
-        if self._lease is None:
-            granted = self.client.post("/lease", json={"client": "test", "force": True})
-            assert granted.status_code == 201, granted.text
-            self._lease = granted.json()["token"]
         axis = self.axis()["name"]
-        headers = {"X-Lease": self._lease}
 
         def answered() -> httpx.Response | None:
+            headers = {"X-Lease": self._lease or self._take_lease()}
             answer = self.client.post(f"/axes/{axis}/{name}", json=body or None, headers=headers)
+            if answer.status_code == 423:
+                self.forget_lease()
+                return None
             return None if answer.status_code == 409 and "wait " in answer.text else answer
 
         answer: httpx.Response = self.until(answered, name)
         assert answer.is_success, answer.text
         return answer
 
+    def _take_lease(self) -> str:
+        granted = self.client.post("/lease", json={"client": "test", "force": True})
+        assert granted.status_code == 201, granted.text
+        self._lease = str(granted.json()["token"])
+        return self._lease
+
     def forget_lease(self) -> None:
-        """A new service knows of no lease."""
+        """A new service knows of no lease, and one that is not used runs out."""
         self._lease = None
 
     # ------------------------------------------------------------------ its end

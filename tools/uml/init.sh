@@ -27,6 +27,7 @@ for module in net/can/can net/can/can-raw net/can/can-bcm drivers/net/can/dev/ca
     insmod "$modules/$module.ko" || { echo "socketcan: cannot load $module" >&2; end 70; }
 done
 insmod "$modules/net/can/can-gw.ko" 2>/dev/null # only for measuring: answers frames within the kernel
+insmod "$modules/net/sched/sch_netem.ko" 2>/dev/null # only where a test loses, doubles or delays frames
 ip link set up lo
 ip link add dev vcan0 type vcan && ip link set up vcan0 || end 70
 : >"$work/ready"

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 from support.daemon import SteppedDaemon, stepped_daemon
+from support.reliability_daemon import DaemonBench, daemon_bench
+
+from hdbridge.daemon.loop.states import AxisState
 
 
 @pytest.fixture
@@ -30,3 +34,25 @@ def pair() -> Iterator[SteppedDaemon]:
         for axis in range(2):
             made.enable(axis)
         yield made
+
+
+@pytest.fixture(scope="module")
+def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], DaemonBench]]:
+    """Gives the bench of the test before, as a daemon goes on after a fault; a new one where that failed."""
+    with ExitStack() as stack:
+        made: list[DaemonBench] = []
+
+        def bench() -> DaemonBench:
+            if not made or any(state is not AxisState.ENABLED for state in made[-1].states):
+                made.append(stack.enter_context(daemon_bench(tmp_path_factory.mktemp("machine"))))
+            return made[-1]
+
+        yield bench
+
+
+@pytest.fixture
+def moving(benches: Callable[[], DaemonBench]) -> DaemonBench:
+    """Two axes of a daemon with a service, at constant speed. To be left enabled."""
+    made = benches()
+    made.set_off()
+    return made

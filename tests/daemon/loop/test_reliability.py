@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-
 import pytest
 from support.reliability import DAEMON, Row, rows_of, try_out
-from support.reliability_daemon import STATES, DaemonBench, daemon_bench
+from support.reliability_daemon import STATES, DaemonBench
 
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
@@ -15,30 +12,9 @@ from hdbridge.daemon.memory import EventKind
 from hdbridge.drive.supervision import Fault, Reaction
 
 
-@pytest.fixture(scope="module")
-def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], DaemonBench]]:
-    """Gives the bench of the row before, as a daemon goes on after a fault; a new one where that failed."""
-    with ExitStack() as stack:
-        made: list[DaemonBench] = []
-
-        def bench() -> DaemonBench:
-            if not made or any(state is not AxisState.ENABLED for state in made[-1].states):
-                made.append(stack.enter_context(daemon_bench(tmp_path_factory.mktemp("machine"))))
-            return made[-1]
-
-        yield bench
-
-
-@pytest.fixture
-def bench(benches: Callable[[], DaemonBench]) -> DaemonBench:
-    """Both axes at constant speed."""
-    made = benches()
-    made.set_off()
-    return made
-
-
 @pytest.mark.parametrize("row", rows_of(DAEMON), ids=lambda row: row.name)
-def test_a_fault_has_its_reaction_in_time_and_is_latched(bench: DaemonBench, row: Row) -> None:
+def test_a_fault_has_its_reaction_in_time_and_is_latched(moving: DaemonBench, row: Row) -> None:
+    bench = moving
     try_out(row, bench, DAEMON, bench.daemon.axes[0].image.heartbeat_timeout_s)
     stops = row.reaction >= Reaction.QUICK_STOP or row.fault is Fault.HANG
     concerned = ((0, 1) if row.everybody else (0,)) if stops else ()
