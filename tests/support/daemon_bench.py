@@ -186,7 +186,7 @@ class DaemonBench:
         """How many cycles after ``cycle`` a client was told it; AssertionError when it was later."""
 
         def found() -> dict[str, Any] | None:
-            for each in self.daemon.told(self.since):
+            for each in self.daemon.events_since(self.since):
                 wanted = each["kind"] == kind and (each["cycle"] or 0) >= cycle
                 if wanted and each["text"].startswith(words) and each["text"].endswith(reaction):
                     return each

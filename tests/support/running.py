@@ -102,7 +102,7 @@ class Daemon:
         except httpx.HTTPError:
             return None
 
-    def told(self, since: int = 0) -> list[dict[str, Any]]:
+    def events_since(self, since: int = 0) -> list[dict[str, Any]]:
         """Events after a numbered one; none while the API does not answer."""
         try:
             answer = self.client.get("/events", params={"since": since}).raise_for_status()
@@ -113,7 +113,7 @@ class Daemon:
     def newest_event(self) -> int:
         """Number of the newest."""
         newest = 0
-        while told := self.told(newest):
+        while told := self.events_since(newest):
             newest = int(told[-1]["sequence"])
         return newest
 
