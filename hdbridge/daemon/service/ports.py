@@ -22,6 +22,7 @@ from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import RefusedError
 from hdbridge.evaluation.stepping import Scheme
+from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
@@ -203,11 +204,19 @@ class ServiceAxis:
 
     async def end_without_lease(self) -> None:
         """Stop what must not go on, because the lease has ended under which it began."""
-        if self.motion.without_lease():
-            assert self.motion.activity is not None
-            what = self.motion.activity.kind.value
-            self.core.log.note(f"{what} was stopped: the lease of its client has ended", self.link.index)
+        if not self.motion.without_lease():
+            return
+        async with self.motion.commanding:
+            # Meanwhile the motion of another client may have taken its place: that one goes on.
+            activity = self.motion.activity
+            if activity is None or not self.motion.without_lease():
+                return
             self.motion.replace(None, "the lease has ended")
+            if activity.kind is Kind.JOG and self.link.value("mode") == MotionMode.HOLD:
+                return  # it has run out by itself
+            self.core.log.note(
+                f"{activity.kind.value} was stopped: the lease of its client has ended", self.link.index
+            )
             await self.link.do(CommandKind.STOP)
 
     # ---------------------------------------------------------------- what compensates it

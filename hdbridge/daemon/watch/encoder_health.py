@@ -7,6 +7,9 @@ Four faults are looked for, each by what a gear cannot do (`signs`):
 * noisy: a reading's own jitter is several times what it was, or readings jump there and back;
 * drifting: the zero runs away faster than a gear warms up, or farther than one ever does.
 
+Jumps, drifts and noise in motion are looked for beside a model that predicts something: the gear's own error
+does all of that. An axis that is not calibrated yet is watched for what is left.
+
 An encoder that drifts as slowly as a gear warms up, or reads eccentrically, looks like the gear: the load
 encoder alone cannot tell. A reading that freezes while the axis rests is seen when it next moves.
 
@@ -140,6 +143,8 @@ class EncoderHealth:
         self._count_arcsec = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
         self._load_count_arcsec = axis.load_encoder.resolution_arcsec
         self._residual_arcsec = residual_of(model)
+        self._predicted = bool(model.effects)
+        """Without a prediction the gear's own error may do what else only an encoder does."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
         self._learned: dict[bool, float] = {}
         """What the jitter usually is, at rest and in motion."""
@@ -178,6 +183,7 @@ class EncoderHealth:
     def use(self, model: TransmissionModel) -> None:
         """Another model predicts from now on; what its zero is has to be learned anew."""
         self._residual_arcsec = residual_of(model)
+        self._predicted = bool(model.effects)
         self._zero = _Zero()
         self._forget_place()
 
@@ -203,7 +209,7 @@ class EncoderHealth:
         self._now_s = float(found.time_s[-1])
         old = len(together) - len(samples)
         frozen = self._judge_frozen(found.rows(slice(old, None)))
-        if not frozen:
+        if self._predicted and not frozen:
             self._judge_steps(found.rows(slice(max(old - 2 * SIDE + 1, 0), None)))
         self._gather(found.rows(slice(old, None)))
         self._recover()
@@ -285,7 +291,8 @@ class EncoderHealth:
         block = joined(self._pending)
         self._pending, self._pending_samples = [], 0
         self._judge_noise(block)
-        self._judge_zero(block)
+        if self._predicted:
+            self._judge_zero(block)
 
     def _judge_noise(self, block: Residuals) -> None:
         if np.count_nonzero(block.fresh) < max(BLOCK_SAMPLES, 0.9 * len(block)) or not np.any(block.usable):
@@ -294,8 +301,10 @@ class EncoderHealth:
         if np.any(moving) and not np.all(moving):
             return  # what begins or ends to move swings
         standing = not np.any(moving)
-        # What the load itself does in motion is slow: third differences do not see it.
-        jitter = jitter_deg(block.load_deg) * ARCSEC_PER_DEG
+        if not (standing or self._predicted):
+            return  # at speed the gear's own orders pass for jitter
+        # What the load itself does in motion is slow, or predicted: noise is in what is neither.
+        jitter = min(jitter_deg(block.load_deg) * ARCSEC_PER_DEG, jitter_deg(block.residual_arcsec))
         usual = self._usual(standing=standing)
         noisy = jitter > self.limits.noise_ratio * usual
         self._noisy_blocks = self._noisy_blocks + 1 if noisy else 0

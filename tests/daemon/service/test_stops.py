@@ -176,6 +176,23 @@ def test_everybody_may_stop(service: Service) -> None:
     play(story())
 
 
+def test_a_jog_that_has_run_out_costs_the_next_client_nothing(service: Service) -> None:
+    async def story() -> None:
+        async with service.ready() as bridge:
+            axis = bridge.axes["axis1"]
+            token = bridge.lease.take("first")
+            await axis.enable(token)
+            await axis.jog(token, 5.0, 0.2)
+            await bridge.core.timing.sleep(1.0)
+            token = bridge.lease.take("second", force=True)
+            await axis.move(token, 8.0)
+            assert axis.state().load_target_deg == 8.0
+            notes = [each.text for each in bridge.events(0).events if each.kind == "note"]
+            assert not [each for each in notes if "lease of its client has ended" in each]
+
+    play(story())
+
+
 def test_homes_and_stays_disabled(service: Service) -> None:
     async def story() -> None:
         async with service.ready() as bridge:

@@ -139,3 +139,14 @@ def test_while_the_memory_is_not_known_the_model_blames_nobody():
     samples["axes"]["flags"] &= ~np.uint16(8)
     samples["axes"]["predicted_arcsec"] += np.where(samples["cycle"] % 1000 < 500, 40.0, 0.0)[:, None]
     assert [each.believed for _, each in judged(samples)] == [True]
+
+
+def test_an_axis_that_is_not_calibrated_yet_is_not_blamed_for_its_gear():
+    """A loop of 160 arcsec that no model predicts does all that an encoder does that has faults."""
+    nothing = TransmissionModel(AXIS.gear.ratio)
+    maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)
+    samples = maker.make(moves_and_rests(120.0, PERIOD_S, 3, 60.0))
+    assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # what it would be called
+    assert [each.believed for _, each in judged(samples, EncoderHealth(AXIS, nothing))] == [True]
+    samples["axes"]["load_position_deg"][len(samples) // 2 :] = samples["axes"]["load_position_deg"][0]
+    assert EncoderHealth(AXIS, nothing).take(samples).fault is EncoderFault.FROZEN
