@@ -13,6 +13,7 @@ After each fault the axis is reset, verified where that is due, and enabled agai
 from __future__ import annotations
 
 import asyncio
+import errno
 import gc
 import logging
 import math
@@ -25,7 +26,7 @@ import warnings
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,7 +44,7 @@ from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.daemon.recorder.store import Store
 from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.eventlog import KEPT
+from hdbridge.daemon.service.eventlog import ANSWERS_KEPT, KEPT
 from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.errors import HdbridgeError
@@ -114,7 +115,7 @@ class Story:
         self.node = service.daemon.nodes[0]
         self.done: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
-        self.token = ""
+        self.token = self.last = ""
         self.sleep = bridge.core.timing.sleep
         self.wishes: tuple[Callable[[], Awaitable[object]], ...] = (
             self.move, self.retarget, self.jog, self.queue, self.stream, self.compensate, self.activate,
@@ -128,12 +129,20 @@ class Story:
     def target(self) -> float:
         return self.chance.uniform(-SPAN_DEG, SPAN_DEG)
 
+    async def fill(self) -> None:
+        """What keeps the newest only is full before anything is measured: the log, answers to commands."""
+        for _ in range(KEPT):
+            self.bridge.core.log.note("the log is full")
+        for _ in range(ANSWERS_KEPT):
+            await self.axis.stop()
+
     async def step(self) -> None:
         """One thing, and what it takes to go on after it."""
         await self.ready()
         table = self.faults if self.chance.random() < FAULT_SHARE else self.wishes
         wish = self.chance.choice(table)
         self.done[wish.__name__] += 1
+        self.last = wish.__name__
         try:
             await wish()
         except HdbridgeError as error:
@@ -148,17 +157,19 @@ class Story:
         if not self.token or not lease.holds(self.token):
             self.token = lease.take("endurance", force=True)
         lease.renew(self.token)
-        end_s = self.service.daemon.clock.now() + SETTLE_S
+        end_s, why = self.service.daemon.clock.now() + SETTLE_S, ""
         while (state := self.axis.state().state) != "enabled":
             if self.service.daemon.clock.now() > end_s:
-                told = [each.text for each in self.bridge.events().events[-8:]]
-                raise SystemExit(f"the axis stays {state}: {told}")
+                told = [each.text for each in self.bridge.events(self.bridge.core.log.newest - 12).events]
+                raise SystemExit(f"the axis stays {state} after {self.last}: {why}; {told}")
             lease.renew(self.token)
-            with suppress(HdbridgeError):
+            try:
                 if state in ("quick-stopped", "latched"):
                     await self.axis.reset(self.token)
                 elif state == "disabled":
                     await self.axis.enable(self.token)
+            except HdbridgeError as error:
+                why = str(error)
             await self.sleep(0.05)
 
     # ---------------------------------------------------------------- what clients do
@@ -267,9 +278,9 @@ class Story:
 
     async def bus_down(self) -> None:
         await self.axis.move(self.token, self.target(), wait=False)
-        self.service.daemon.bus.down = True
+        self.service.daemon.bus.down = self.chance.choice((errno.ENETDOWN, errno.ENODEV))
         await self.sleep(0.5)
-        self.service.daemon.bus.down = False
+        self.service.daemon.bus.down = None
         await self.sleep(1.0)
 
 
@@ -319,9 +330,8 @@ async def day(
                 bridge.core.observer.add(sink)
             bridge.subscribe()  # a client that never reads
             reading = asyncio.create_task(_read(bridge.subscribe()))
-            for _ in range(KEPT):
-                bridge.core.log.note("the log is full before anything is measured")
             story = Story(service, bridge, seed)
+            await story.fill()
             first_turn = daemon.controller.cycle.count
             begin_s = due_s = daemon.clock.now()
             end_s = begin_s + 3600.0 * hours
