@@ -178,6 +178,31 @@ def test_a_job_is_followed_and_its_failure_is_the_commands(ctl, machine, monkeyp
     assert "check the cable" in ctl("job", "joint-1", "step", status=5)
 
 
+@pytest.mark.parametrize(
+    ("kind", "result", "said"),
+    [
+        (
+            "step",
+            {
+                "none": {"pooled": {"three_sigma_arcsec": 101.842}},
+                "quantisation_floor_arcsec": 2.806,
+                "survived": [],
+            },
+            "pooled 3 sigma in arcsec: none 101.84; quantisation floor 2.81",
+        ),
+        (
+            "calibrate",
+            {"reason": "101.50 to 2.92", "pending": "p.yaml"},
+            "hdbridge ctl model joint-1 pending",
+        ),
+    ],
+)
+def test_what_came_out_of_a_job_is_told(ctl, machine, monkeypatch, kind, result, said):
+    done = {"state": messages.JobState.DONE, "share": 1.0, "result": result}
+    monkeypatch.setattr(machine, "jobs", lambda: [each.model_copy(update=done) for each in machine.ran])
+    assert said in ctl("job", "joint-1", kind)
+
+
 def test_an_object_is_read(ctl):
     assert "6041h:00 'Statusword': 4663 (0x1237)  uint16" in ctl("get", "joint-1", "Statusword")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -139,9 +140,27 @@ def _print(found: list[Job]) -> None:
     print_table(table)
     for each in found:
         words = each.text if each.problem is None else each.problem.detail
-        for line in (words, each.folder and f"recorded in {each.folder}"):
+        for line in (words, each.folder and f"recorded in {each.folder}", *_figures(each)):
             if line:
                 console.print(f"{each.id}: {line}", markup=False, soft_wrap=True)
+
+
+def _figures(job: Job) -> Iterator[str]:
+    """What came out, in a line: the whole is in its recording, and in `--json`."""
+    result = job.result or {}
+    schemes = [
+        f"{name} {told['pooled']['three_sigma_arcsec']:.2f}"
+        for name, told in result.items()
+        if isinstance(told, dict) and "pooled" in told
+    ]
+    if schemes:
+        floor = result.get("quantisation_floor_arcsec")
+        least = f"; quantisation floor {floor:.2f}" if floor is not None else ""
+        yield f"load error at rest, pooled 3 sigma in arcsec: {', '.join(schemes)}{least}"
+    if reason := result.get("reason"):
+        yield str(reason)
+    if result.get("pending"):
+        yield f"to use the model that it proposes: hdbridge ctl model {job.axis} pending"
 
 
 def _print_object(found: SdoValue, json_file: Path | None) -> None:
