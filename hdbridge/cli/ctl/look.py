@@ -63,9 +63,6 @@ def events(
         int, typer.Option("--since", min=0, help="Only those after the event of this number.")
     ] = 0,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
-    all_: Annotated[
-        bool, typer.Option("--all", help="Also each command that was carried out without more to say.")
-    ] = False,
     json_file: JsonOption = None,
 ) -> None:
     """List what happened: faults, states, refused commands, remarks; oldest first."""
@@ -76,8 +73,6 @@ def events(
             if found.lost:
                 console.print(f"{found.lost} older ones are kept no more")
             for each in found.events:
-                if each.kind == "done" and not each.text and not all_:
-                    continue
                 console.print(_event(each), markup=False, soft_wrap=True)
             if not follow:
                 return

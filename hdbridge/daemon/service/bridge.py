@@ -24,7 +24,7 @@ from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import Core
-from hdbridge.daemon.service.eventlog import KEPT, Entry
+from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
 from hdbridge.daemon.service.models import recall, remember
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
@@ -263,15 +263,13 @@ class ServiceBridge:
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:
-        """Events with a higher sequence number than ``since``, oldest first."""
-        log = self.core.log
-        entries = log.since(since)
-        lost = entries[0].number - since - 1 if entries else 0
-        told = entries[:EVENTS_TOLD]
+        """Events with a higher sequence number than ``since``, oldest first; the newest where it is many."""
+        told = self.core.log.told(since)[-EVENTS_TOLD:]
+        newest = told[-1].number if told else self.core.log.newest_told
         return messages.Events(
             events=[reports.event_message(each, self._names) for each in told],
-            lost=max(lost, 0),
-            newest=told[-1].number if told else log.newest,
+            lost=max(newest - since - len(told), 0),
+            newest=newest,
         )
 
     def subscribe(self, most: int = 512) -> Subscription:
@@ -279,8 +277,9 @@ class ServiceBridge:
         return Subscription(self.core.observer, self._messages_since, most)
 
     def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
-        entries = self.core.log.since(number)[-KEPT:]
-        return [reports.event_message(each, self._names) for each in entries], self.core.log.newest
+        entries = self.core.log.told(number)
+        newest = entries[-1].number if entries else self.core.log.newest_told
+        return [reports.event_message(each, self._names) for each in entries], newest
 
     def jobs(self) -> list[messages.Job]:
         """The jobs that run and the last ones that ran, newest last."""

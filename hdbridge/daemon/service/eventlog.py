@@ -1,7 +1,8 @@
-"""What has happened: the control process's events and the service's own notes, in one bounded list.
+"""What has happened: the control process's events and the service's own notes, in bounded lists.
 
-Thread-safe: whoever waits for something polls. Each entry has a number of the service's own count, so that a
-client asks for those since the last one that it has seen.
+Thread-safe: whoever waits for something polls. All of it is in one list, for the service itself. What is
+routine (`_routine`) is left out of a second one, which clients see: a calibration ends thousands of legs, and
+must not push out what stopped an axis yesterday. Each has a count of its own.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from hdbridge.daemon.memory import Event, EventKind, EventReader
+from hdbridge.motion import MotionMode
 
 KEPT = 4096
 ANSWERS_KEPT = 1024
@@ -23,7 +25,7 @@ class Entry(NamedTuple):
     """Something that happened."""
 
     number: int
-    """Counts from 1 at the start of the service."""
+    """Counts from 1 at the start of the service, within its list."""
     date: datetime
     axis: int
     """Index of the axis; -1: the machine."""
@@ -42,8 +44,9 @@ class EventLog:
         self._date = now
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=KEPT)
+        self._told: deque[Entry] = deque(maxlen=KEPT)
         self._answers: dict[int, Event] = {}
-        self._number = 0
+        self._number = self._told_number = 0
         self.lost = 0
         """Events that came faster than they were read."""
 
@@ -51,6 +54,11 @@ class EventLog:
     def newest(self) -> int:
         """Number of the newest entry; 0 before the first."""
         return self._number
+
+    @property
+    def newest_told(self) -> int:
+        """Number of the newest entry that clients see; 0 before the first."""
+        return self._told_number
 
     def poll(self) -> None:
         """Take in what the control process has told since."""
@@ -76,10 +84,12 @@ class EventLog:
     def since(self, number: int) -> list[Entry]:
         """The entries after that number that are kept, oldest first."""
         with self._lock:
-            if number >= self._number:
-                return []
-            new = min(self._number - number, len(self._entries))
-            return [self._entries[place] for place in range(len(self._entries) - new, len(self._entries))]
+            return _newest(self._entries, self._number - number)
+
+    def told(self, number: int) -> list[Entry]:
+        """Those that clients see after that number of theirs, oldest first."""
+        with self._lock:
+            return _newest(self._told, self._told_number - number)
 
     def of_axis(self, axis: int, since: int) -> list[Event]:
         """The control process's events of one axis, those of the whole machine included."""
@@ -87,5 +97,20 @@ class EventLog:
         return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
 
     def _add(self, axis: int, event: Event | None, text: str, hint: str = "") -> None:
+        date = self._date()
         self._number += 1
-        self._entries.append(Entry(self._number, self._date(), axis, event, text, hint))
+        self._entries.append(Entry(self._number, date, axis, event, text, hint))
+        if event is None or not _routine(event):
+            self._told_number += 1
+            self._told.append(Entry(self._told_number, date, axis, event, text, hint))
+
+
+def _newest(entries: deque[Entry], count: int) -> list[Entry]:
+    new = min(max(count, 0), len(entries))
+    return [entries[place] for place in range(len(entries) - new, len(entries))]
+
+
+def _routine(event: Event) -> bool:
+    """An answer to a command, and the end of a stream: who asked for it is told."""
+    stream = event.kind is EventKind.MOTION_ENDED and event.code == MotionMode.STREAM
+    return stream or event.kind is EventKind.DONE

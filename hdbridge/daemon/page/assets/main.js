@@ -13,7 +13,6 @@ const SLOW_MS = 1000;
 const ARCSEC = 3600;
 // Upper ends of the classes of lateness, microseconds; the last one is open.
 const CLASSES_US = [10, 30, 100, 300, 1000, 3000, Infinity];
-const QUIET = new Set(["done"]);
 
 const kept = new Map(); // of each axis: its history and what repeats with the angles
 const lateness = new Float64Array(CLASSES_US.length);
@@ -62,7 +61,7 @@ async function refresh() {
 async function begin() {
   // Not before the events that were: the feed brings those that come.
   feed = "beginning";
-  view.events((await ask("GET", "/events?since=0")).events.filter((each) => !QUIET.has(each.kind)));
+  view.events((await ask("GET", "/events?since=0")).events);
   feed = new Feed(machine.cycle.period_s, take, (state) => view.connection(state, state === "live" ? `live, hdbridge ${machine.version}` : "connection lost; the axes are as the daemon has them"));
 }
 
@@ -89,7 +88,7 @@ function take(batch) {
     const { load_position_deg, load_target_deg, velocity_deg_s, error_arcsec, correction_arcsec, predicted_arcsec } = columns;
     history.push(batch.time_s, { load_position_deg, load_target_deg, velocity_deg_s, error_arcsec, correction_arcsec, predicted_arcsec, transmission });
   }
-  view.events(batch.events.filter((each) => !QUIET.has(each.kind)));
+  view.events(batch.events);
 }
 
 /** The zero between the encoders is arbitrary: measured and predicted are laid upon each other. */

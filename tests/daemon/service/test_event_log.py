@@ -1,0 +1,67 @@
+"""What clients are told of: the newest, whatever many legs a job has ended meanwhile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support.service import Service, play, stepped_service
+
+from hdbridge.daemon.memory import Event, EventKind
+from hdbridge.daemon.service.bridge import EVENTS_TOLD
+from hdbridge.daemon.service.eventlog import KEPT, EventLog
+from hdbridge.motion import MotionMode
+
+
+class Told:
+    """A reader of events that a test has told."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def read(self) -> tuple[list[Event], int]:
+        events, self.events = self.events, []
+        return events, 0
+
+
+def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
+    return Event(sequence=1, cycle=1, time_ns=1, axis=0, kind=kind, id=7, code=code, text=text)
+
+
+def test_routine_does_not_push_out_what_stopped_an_axis() -> None:
+    reader = Told()
+    log = EventLog(reader)
+    reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
+    leg = [event(EventKind.DONE), event(EventKind.MOTION_ENDED, MotionMode.STREAM)]
+    reader.events += leg * KEPT
+    reader.events.append(event(EventKind.MOTION_ENDED, MotionMode.GOTO))
+    log.poll()
+    assert [(each.number, each.text) for each in log.told(0)] == [(1, "cycle 1: lost"), (2, "")]
+    assert log.newest_told == 2
+    assert log.told(1)[0].event == event(EventKind.MOTION_ENDED, MotionMode.GOTO)
+    assert log.told(2) == log.told(99) == []
+    assert log.newest == 2 * KEPT + 2  # the service itself sees all
+    assert log.answer(7) is not None
+
+
+@pytest.fixture
+def service(tmp_path: Path):
+    with stepped_service(tmp_path) as made:
+        yield made
+
+
+def test_of_many_the_newest_are_told_and_the_others_counted(service: Service) -> None:
+    async def story() -> None:
+        async with service.ready() as bridge:
+            before = bridge.events(0).newest
+            for number in range(EVENTS_TOLD + 5):
+                bridge.mark(f"remark {number}")
+            found = bridge.events(before)
+            assert found.events[-1].text.endswith(f"remark {EVENTS_TOLD + 4}")
+            assert len(found.events) == EVENTS_TOLD
+            assert found.lost == 5
+            assert bridge.events(found.newest).events == []
+            bridge.mark("one more")
+            assert [each.text.endswith("one more") for each in bridge.events(found.newest).events] == [True]
+
+    play(story())
