@@ -62,6 +62,19 @@ def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
     return frozenset(each for each in Channel if each.axis_key in {"", *axis.channels})
 
 
+def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
+    """The record of a bench's samples, without a channel that was lost on the way."""
+    names = Sample._fields[:-1]
+    table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
+    columns = dict(zip(names, table.T, strict=True))
+    columns.pop("load_target_deg")
+    for place, key in enumerate(axis.channels):
+        reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
+        if not np.isnan(reading).any():
+            columns[BY_KEY[key].value] = reading
+    return Record(columns)
+
+
 def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
     """The axis file's keys of the channels that a record of `Bench` does without."""
     return tuple(key for key in axis.channels if BY_KEY[key].value not in record.columns)
@@ -228,16 +241,7 @@ class Bench:
         A channel that was lost on the way is left out: what was held would pass for measured.
         """
         # Made into arrays only here: between two legs there is no time for it on a real bus.
-        rows = [sample for samples in self._measured for sample in samples]
-        names = Sample._fields[:-1]
-        table = np.array([row[:-1] for row in rows], dtype=np.float64).reshape(-1, len(names))
-        columns = dict(zip(names, table.T, strict=True))
-        columns.pop("load_target_deg")
-        for place, key in enumerate(self._image.axis.channels):
-            reading = np.array([row.readings[place] for row in rows], dtype=np.float64)  # None: NaN
-            if not np.isnan(reading).any():
-                columns[BY_KEY[key].value] = reading
-        return Record(columns)
+        return record_of([sample for samples in self._measured for sample in samples], self._image.axis)
 
     @property
     def legs(self) -> tuple[Segment, ...]:

@@ -16,11 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-import numpy as np
-
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.channels import BY_KEY
-from hdbridge.control.bench import Run, axis_view
+from hdbridge.control.bench import Run, axis_view, record_of
 from hdbridge.control.compensation import Compensation
 from hdbridge.control.survived import PERIODS_SKIPPED, Survived
 from hdbridge.daemon.loop.states import AxisState
@@ -166,16 +163,7 @@ class DaemonBench:
 
     def record(self) -> Record:
         """What the present procedure has measured so far; without a channel that was lost on the way."""
-        samples = self._measured.samples
-        names = Sample._fields[:-1]
-        table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
-        columns = dict(zip(names, table.T, strict=True))
-        columns.pop("load_target_deg")
-        for place, key in enumerate(self._axis.channels):
-            reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
-            if not np.isnan(reading).any():
-                columns[BY_KEY[key].value] = reading
-        return Record(columns)
+        return record_of(self._measured.samples, self._axis)
 
     def run(
         self,
