@@ -62,6 +62,33 @@ def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
     return frozenset(each for each in Channel if each.axis_key in {"", *axis.channels})
 
 
+def walk(
+    procedure: Procedure[Outcome],
+    view: AxisView,
+    rehearsal: Rehearsal,
+    progress: Callable[[float], None],
+    place_deg: Callable[[], float],
+    leg: Callable[[Move, Path], Sequence[Sample]],
+) -> Outcome:
+    """The procedure's legs, one after the other; between two there is no time to lose.
+
+    ``place_deg`` tells where the load target stands; ``leg`` runs a move on its path for its samples.
+    """
+    done_s = 0.0
+    steps = procedure.moves(view)
+    try:
+        move = next(steps)
+        while True:
+            path = move.path(place_deg(), view.limits)
+            samples = leg(move, path)
+            done_s += path.duration_s
+            progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
+            move = steps.send(samples)
+    except StopIteration as end:
+        outcome: Outcome = end.value
+        return outcome
+
+
 def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
     """The record of a bench's samples, without a channel that was lost on the way."""
     names = Sample._fields[:-1]
@@ -212,7 +239,7 @@ class Bench:
         """The procedure, from power on to power off."""
         self._enable()
         try:
-            outcome = self._walk(procedure, rehearsal, progress)
+            outcome = walk(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
             raise  # the drive stands, or stops by itself; the latch stays
         except BaseException:
@@ -292,24 +319,6 @@ class Bench:
             f"{image.axis.where(waiting[0].key)}: no reading came that can be believed ({waiting[0].why}); "
             "check the sensor, or leave the key out"
         )
-
-    def _walk(
-        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
-    ) -> Outcome:
-        """The procedure's legs, one after the other; between two there is no time to lose."""
-        done_s = 0.0
-        steps = procedure.moves(self.view)
-        try:
-            move = next(steps)
-            while True:
-                path = move.path(self._place, self.view.limits)
-                samples = self._leg(move, path)
-                done_s += path.duration_s
-                progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
-                move = steps.send(samples)
-        except StopIteration as end:
-            outcome: Outcome = end.value
-            return outcome
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
         """One move, cycle by cycle, from where the load target stands."""

@@ -164,7 +164,7 @@ class Knot(NamedTuple):
     """A point that a streamed set-point goes through."""
 
     stream: int
-    """Number of the stream that it belongs to; others are thrown away."""
+    """Number of the stream that it belongs to; those of an earlier one are thrown away."""
     time_s: float
     """Since the stream has begun."""
     position_deg: float

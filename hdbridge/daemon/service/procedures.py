@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.bench import Run, axis_view, record_of
+from hdbridge.control.bench import Run, axis_view, record_of, walk
 from hdbridge.control.compensation import Compensation
 from hdbridge.control.survived import PERIODS_SKIPPED, Survived
 from hdbridge.daemon.loop.states import AxisState
@@ -26,7 +26,7 @@ from hdbridge.daemon.service.reports import fault_of
 from hdbridge.errors import DaemonError, RefusedError, SafetyStop
 from hdbridge.motion.stream import BEGIN_DEG, Cubic
 from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
-from hdbridge.procedures.rehearsal import Rehearsal, rehearse
+from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment, versions_here
 
@@ -183,7 +183,7 @@ class DaemonBench:
         rig.enable(self._compensation)
         try:
             self._begin()
-            outcome = self._walk(procedure, rehearsal, progress)
+            outcome = walk(procedure, self._view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
             raise  # it stands, or stops by itself; the latch stays
         except BaseException:
@@ -213,23 +213,6 @@ class DaemonBench:
         while not self._pending:
             self._take()
         self._place = self._pending[-1][1].load_target_deg
-
-    def _walk(
-        self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
-    ) -> Outcome:
-        done_s = 0.0
-        steps = procedure.moves(self._view)
-        try:
-            move = next(steps)
-            while True:
-                path = move.path(self._place, self._view.limits)
-                samples = self._leg(move, path)
-                done_s += path.duration_s
-                progress(min(done_s / rehearsal.duration_s, 1.0) if rehearsal.duration_s else 1.0)
-                move = steps.send(samples)
-        except StopIteration as end:
-            outcome: Outcome = end.value
-            return outcome
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
         """One move, from where the load target stands."""
