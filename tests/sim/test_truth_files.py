@@ -161,3 +161,13 @@ def test_every_cause_is_off_unless_the_file_says_so() -> None:
 def test_a_cause_that_makes_no_sense_is_refused(old: str, new: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         changed(old, new)
+
+
+def test_where_a_twin_s_values_come_from_is_kept_and_changes_nothing() -> None:
+    told = "\nintervals: {gear.stiffness_nm_per_rad: [15500, 16400]}\nprovenance: {axis: article}\n"
+    twin = Truth.from_text(ARTICLE.read_text() + told)
+    assert twin.intervals == {"gear.stiffness_nm_per_rad": (15500.0, 16400.0)}
+    assert twin.provenance == {"axis": "article"}
+    assert twin.model_copy(update={"intervals": {}, "provenance": {}}) == Truth.load(ARTICLE)
+    with pytest.raises(InputError, match="expected lower, upper"):
+        Truth.from_text(ARTICLE.read_text() + "\nintervals: {gear.ratio: [51, 49]}\n")

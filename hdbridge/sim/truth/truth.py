@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -65,6 +65,12 @@ class Truth(Part):
     gear: TrueGear = Field(description="the harmonic gear")
     load_: TrueLoad = Field(alias="load", description="load and load encoder")
     temperature: TrueTemperature = Field(default_factory=TrueTemperature, description="heat")
+    intervals: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="95 % intervals of the values that were fitted, by their place"
+    )
+    provenance: dict[str, Any] = Field(
+        default_factory=dict, description="where the values come from; the simulated drive does not read it"
+    )
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -92,6 +98,13 @@ class Truth(Part):
         """The stiffest spring whose resonance the time step resolves."""
         reflected = self.motor.inertia_kg_m2 * self.gear.ratio**2
         return 1.0 / (self.substep_s**2 * (1.0 / self.load_.whole_inertia_kg_m2 + 1.0 / reflected))
+
+    @model_validator(mode="after")
+    def _intervals_are_intervals(self) -> Self:
+        for place, (lower, upper) in self.intervals.items():
+            if lower > upper:
+                raise wrong(f"found {lower:g} above {upper:g}; expected lower, upper", "intervals", place)
+        return self
 
     @model_validator(mode="after")
     def _step_resolves_the_spring(self) -> Self:
