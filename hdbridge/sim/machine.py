@@ -48,6 +48,8 @@ class Machine:
         self._late_motor = Late(motor.late_ms / 1e3, self.dt_s, start_deg) if motor.late_ms else None
         start_deg = self._plant.encoder_deg
         self._late_load = Late(load.late_ms / 1e3, self.dt_s, start_deg) if load.late_ms else None
+        dead_s = truth.servo.dead_time_ms / 1e3
+        self._late_demand = Late(dead_s, self.dt_s, 0.0) if dead_s else None
         self._watched = bool(self._body or self._late_motor or self._late_load)
         self._motor_is_wrong = bool(self._motor_errors or motor.losses)
         self._friction = warmth_factor(truth, truth.temperature.friction_growth_per_k)
@@ -65,7 +67,8 @@ class Machine:
             return
         plant, servo = self._plant, self._servo
         conditions = plant.now
-        if not self._powered:
+        engaged = not self._powered
+        if engaged:
             self._powered = True
             self._hold_deg = servo.engage(self._seen_deg(conditions.motor_deg), plant.motor_deg_s)
             near = abs(self._motor_reading(conditions.motor_deg) - start_counts) <= 1.0
@@ -78,10 +81,22 @@ class Machine:
                 demand = self._hold_deg
             else:
                 self._hold_counts = None
+        if engaged and self._late_demand is not None:
+            self._late_demand = Late(self.truth.servo.dead_time_ms / 1e3, self.dt_s, demand)
         dt = self.dt_s
         torque_of, advance = servo.torque_nm, plant.advance
         torque = squares = 0.0
-        if self._watched or self._motor_is_wrong:
+        late = self._late_demand
+        if late is not None:
+            for substep in range(substeps):
+                before = late.deg
+                late.feed(demand + (substep + 1) * dt * speed)
+                seen_deg = self._seen_deg(conditions.motor_deg)
+                torque = torque_of(before, (late.deg - before) / dt, seen_deg)
+                advance(torque, 0.0)
+                self._watch()
+                squares += torque * torque
+        elif self._watched or self._motor_is_wrong:
             for substep in range(substeps):
                 seen_deg = self._seen_deg(conditions.motor_deg)
                 torque = torque_of(demand + substep * dt * speed, speed, seen_deg)
@@ -132,6 +147,11 @@ class Machine:
     def velocity_counts_s(self) -> float:
         """The motor's speed as the drive measures it."""
         return self._servo.measured_deg_s * self._motor_counts_per_deg
+
+    @property
+    def torque_nm(self) -> float:
+        """The motor's torque, not rounded, in the sense of the motor encoder."""
+        return self.truth.motor.encoder.direction * self._torque_nm
 
     @property
     def torque_permille(self) -> int:

@@ -65,4 +65,5 @@ class TrueServo(Part):
     friction_feedforward_nm: float = Field(
         0.0, ge=0, le=10_000, description="torque in the direction of the last demanded motion"
     )
+    dead_time_ms: float = Field(0.0, ge=0, le=100, description="age of the demand when the loops take it in")
     torque_limit_percent: float = Field(gt=0, le=1_000, description="highest torque, of the rated one")

@@ -1,0 +1,195 @@
+"""What a twin may change of the simulated drive: one row for each parameter of the plant.
+
+A parameter lives at a path of the truth file. Positive ones are fitted by their logarithm, so that half and
+double are equally far; a delay and what may be zero are fitted as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from hdbridge.sim.truth import Truth
+
+FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
+"""The channels that a replay is held against."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter of the plant that a fit may change."""
+
+    name: str
+    path: tuple[str, ...]
+    """Keys of the truth file."""
+    unit: str
+    least: float
+    most: float
+    """Values that a fit stays within."""
+    spread: float
+    """Prior standard deviation about the start: of the natural logarithm, or in ``unit`` if `linear`."""
+    cause: str
+    """What is said where this has changed; parameters of one cause belong together."""
+    shows_in: tuple[str, ...]
+    """The channels that depend on it."""
+    move: str
+    """The motion that distinguishes it from those it looks like."""
+    least_change: float
+    """Change that matters to somebody at the bench, as `spread` is given; less is not reported."""
+    linear: bool = False
+
+    def coordinate(self, value: float) -> float:
+        """Where a value lies on the axis that the fit moves along."""
+        return value if self.linear else math.log(value)
+
+    def value(self, coordinate: float) -> float:
+        """The value at a coordinate, kept within its bounds."""
+        value = coordinate if self.linear else math.exp(min(coordinate, 700.0))
+        return min(max(value, self.least), self.most)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Its bounds as coordinates."""
+        return self.coordinate(self.least), self.coordinate(self.most)
+
+
+_STEPS = "steps at the axis's full acceleration, the load left to ring after each"
+_SPEEDS = "motion at constant speed, at three speeds at least"
+_REVERSALS = "slow reversals"
+_SINES = "sines of several frequencies up to the bandwidth of the loops"
+_FULL = "an acceleration at which the drive reaches its torque limit"
+
+FRICTION: Final = "friction"
+SERVO: Final = "servo gains"
+FEEDFORWARD: Final = "feed-forward"
+
+PARAMETERS: Final[tuple[Parameter, ...]] = (
+    Parameter(
+        "motor inertia", ("motor", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, "motor inertia",
+        (TORQUE, FOLLOWING), _STEPS, 0.10,
+    ),
+    Parameter(
+        "Coulomb friction", ("motor", "coulomb_nm"), "Nm", 1e-6, 1e3, 0.7, FRICTION,
+        (TORQUE, FOLLOWING), _REVERSALS, 0.15,
+    ),
+    Parameter(
+        "viscous friction", ("motor", "viscous_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7, FRICTION,
+        (TORQUE,), _SPEEDS, 0.25,
+    ),
+    Parameter(
+        "load inertia", ("load", "inertia_kg_m2"), "kg m2", 1e-7, 1e5, 0.7, "load inertia",
+        (TORQUE, LOAD), _STEPS, 0.10,
+    ),
+    Parameter(
+        "gear stiffness", ("gear", "stiffness_nm_per_rad"), "Nm/rad", 1.0, 1e9, 0.7, "gear stiffness",
+        (LOAD, TORQUE), _STEPS, 0.10,
+    ),
+    Parameter(
+        "gear damping", ("gear", "damping_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e6, 0.7, "gear damping",
+        (LOAD,), _STEPS, 0.40,
+    ),
+    Parameter(
+        "position gain", ("servo", "position_gain_per_s"), "1/s", 1.0, 5_000.0, 0.7, SERVO,
+        (FOLLOWING, TORQUE), _SINES, 0.15,
+    ),
+    Parameter(
+        "velocity gain", ("servo", "velocity_gain_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e3, 0.7, SERVO,
+        (FOLLOWING, TORQUE), _SINES, 0.15,
+    ),
+    Parameter(
+        "integral time", ("servo", "integral_time_ms"), "ms", 0.1, 1e4, 0.7, SERVO,
+        (FOLLOWING, TORQUE), _REVERSALS, 0.25,
+    ),
+    Parameter(
+        "command filter", ("servo", "command_filter_ms"), "ms", 0.05, 100.0, 0.7, "command filter",
+        (FOLLOWING,), _SINES, 0.30,
+    ),
+    Parameter(
+        "velocity feed-forward", ("servo", "velocity_feedforward"), "", 0.0, 1.5, 0.1, FEEDFORWARD,
+        (FOLLOWING,), _SPEEDS, 0.03, linear=True,
+    ),
+    Parameter(
+        "inertia feed-forward", ("servo", "inertia_feedforward_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
+        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
+    ),
+    Parameter(
+        "load feed-forward", ("servo", "load_feedforward", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
+        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
+    ),
+    Parameter(
+        "viscous feed-forward", ("servo", "viscous_feedforward_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7,
+        FEEDFORWARD, (FOLLOWING,), _SPEEDS, 0.50,
+    ),
+    Parameter(
+        "friction feed-forward", ("servo", "friction_feedforward_nm"), "Nm", 1e-6, 1e3, 0.7, FEEDFORWARD,
+        (FOLLOWING, TORQUE), _REVERSALS, 0.20,
+    ),
+    Parameter(
+        "servo dead time", ("servo", "dead_time_ms"), "ms", 0.0, 20.0, 2.0, "servo dead time",
+        (FOLLOWING, TORQUE, LOAD), _SINES, 0.3, linear=True,
+    ),
+    Parameter(
+        "load encoder delay", ("load", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "load encoder delay",
+        (LOAD,), _SPEEDS, 0.3, linear=True,
+    ),
+    Parameter(
+        "motor encoder delay", ("motor", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "motor encoder delay",
+        (FOLLOWING, LOAD), _SPEEDS, 0.3, linear=True,
+    ),
+    Parameter(
+        "current limit", ("servo", "torque_limit_percent"), "%", 1.0, 1000.0, 0.7, "current limit",
+        (TORQUE, FOLLOWING), _FULL, 0.05,
+    ),
+    Parameter(
+        "load friction", ("load", "coulomb_nm"), "Nm", 0.0, 1e4, 5.0, "load friction",
+        (LOAD, TORQUE), _REVERSALS, 0.5, linear=True,
+    ),
+    Parameter(
+        "temperature", ("temperature", "ambient_c"), "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, "warmth",
+        (TORQUE, LOAD), "the same motion with the temperature recorded", 3.0, linear=True,
+    ),
+)  # fmt: skip
+"""In the order in which a fit has them."""
+
+BY_NAME: Final[Mapping[str, Parameter]] = {each.name: each for each in PARAMETERS}
+
+
+def value_in(truth: Truth, parameter: Parameter) -> float | None:
+    """What a truth file has; None where the section that it belongs to is not there."""
+    place: Any = truth
+    for key in parameter.path:
+        place = getattr(place, "load_" if key == "load" else key)
+        if place is None:
+            return None
+    return float(place)
+
+
+def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
+    """The truth with other values, by the parameters' names; what cannot be is refused as in a file."""
+    data = truth.model_dump(by_alias=True, exclude_none=True)
+    for name, value in values.items():
+        *sections, key = BY_NAME[name].path
+        place = data
+        for section in sections:
+            place = place.setdefault(section, {})
+        place[key] = value
+    return Truth.model_validate(data)
+
+
+def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
+    """Where a truth lies; a value beyond a bound counts as the bound."""
+    found = []
+    for each in parameters:
+        value = value_in(truth, each)
+        assert value is not None, each.name
+        found.append(each.coordinate(min(max(value, each.least), each.most)))
+    return found
+
+
+def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:
+    """The truth at coordinates of these parameters."""
+    return with_values(
+        truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)}
+    )

@@ -1,0 +1,308 @@
+"""A recording's commands run once more through a simulated drive: over real frames, or without them.
+
+Both ways give the same numbers. The frames show that a twin is what a master meets; without them a fit can
+afford the hundreds of replays that it needs.
+
+Before each part of a recording nothing is known of the axis, so each begins on a drive that is switched on
+at its angle zero and led to the first command at the axis's limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import BY_KEY
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Channel, FloatArray
+from hdbridge.errors import InputError
+from hdbridge.procedures.moves import AxisView, MotionLimits, Path, Sample, Steps
+from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+LATENCY_CYCLES = 4
+"""A command shows as demand at most so many cycles after it was given."""
+STANDING_S = 0.3
+"""The axis stands so long between the approach and a recording that begins at rest."""
+UNEVEN = 0.25
+"""Share of a cycle by which a sample's time may be off the cycle's grid without being interpolated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What one part of a recording told the drive, cycle by cycle, with the approach before it."""
+
+    counts: tuple[int, ...]
+    """Demand of the motor in counts at the end of each cycle; begins where the drive is switched on."""
+    lead: int
+    """How many of them are the approach."""
+    row_cycles: FloatArray
+    """Where each row of the part lies, in cycles since the approach's end (fractional where uneven)."""
+    time_s: FloatArray
+    """Time of each row."""
+    cycle_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """What a replay gives at each row; unrounded where it was asked to be smooth."""
+
+    motor_deg: FloatArray
+    load_deg: FloatArray
+    torque_nm: FloatArray
+    """Torque of the motor, positive forward."""
+    temperature_c: FloatArray
+    load_torque_nm: FloatArray
+
+
+def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
+    """The record of a simulated drive that got the recording's commands over real frames.
+
+    One row for each of the recording's, with its time. InputError where the recording has no command, or
+    leaves what the axis file allows. SafetyStop where the simulated drive cannot follow the commands as
+    closely as the axis file asks.
+    """
+    records = []
+    for part in recording.record.parts():
+        commands = commands_of(part, axis, truth)
+        bench_axis = at_cycle(axis, commands.cycle_s)
+        with (
+            simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+            Drive(bus, bench_axis, clock) as drive,
+        ):
+            drive.boot()
+            measured = Bench(drive).run(_Again(commands, bench_axis)).record
+        records.append(_at_rows(measured, commands, bench_axis))
+    return records[0] if len(records) == 1 else concatenate(records)
+
+
+def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
+    """As `replay`, without bus and master; the load encoder's noise is another draw.
+
+    What the drive's supervision or its limits would stop or cut is let pass.
+    """
+    records = []
+    for part in recording.record.parts():
+        commands = commands_of(part, axis, truth)
+        traces = run(commands, axis, truth, seed)
+        target = _between(_degrees(commands.counts[commands.lead :], axis), commands.row_cycles)
+        columns = {
+            "time_s": commands.time_s,
+            "motor_target_deg": target,
+            "motor_position_deg": traces.motor_deg,
+            "load_position_deg": traces.load_deg,
+            "motor_torque_nm": traces.torque_nm,
+        }
+        known = {
+            Channel.TEMPERATURE: traces.temperature_c,
+            Channel.LOAD_TORQUE: traces.load_torque_nm,
+        }
+        for key in axis.channels:
+            if BY_KEY[key] in known:
+                columns[BY_KEY[key].value] = known[BY_KEY[key]]
+        records.append(Record(columns))
+    return records[0] if len(records) == 1 else concatenate(records)
+
+
+def run(
+    commands: Commands,
+    axis: AxisConfig,
+    truth: Truth,
+    seed: int = 0,
+    *,
+    fineness: int = 1,
+    smooth: bool = False,
+) -> Traces:
+    """The commands through the machine alone; a ``smooth`` one reports what it does unrounded.
+
+    ``fineness`` is how many counts of the truth's motor encoder make one of the commands'.
+    """
+    machine = Machine(truth, seed)
+    dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
+    n = len(commands.counts) - commands.lead
+    motor, load, torque, warmth, outer = (np.empty(n) for _ in range(5))
+    permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
+    sense = float(axis.motor_encoder.direction)
+    before = commands.counts[0] * fineness
+    for number, counts in enumerate(commands.counts, -commands.lead):
+        owed_s += cycle_s
+        substeps = int(owed_s / dt_s + 1e-6)
+        owed_s -= substeps * dt_s
+        demand = counts * fineness
+        machine.follow(before, demand, substeps)
+        before = demand
+        if number >= 0:
+            motor[number] = machine.motor_counts
+            load[number] = machine.load_counts
+            torque[number] = sense * machine.torque_nm if smooth else machine.torque_permille * permille_nm
+            warmth[number] = machine.temperature_c
+            outer[number] = machine.load_torque_nm
+    encoder = axis.motor_encoder
+    motor = encoder.direction * motor * 360.0 / (encoder.counts_per_turn * fineness)
+    load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
+    place = commands.row_cycles
+    return Traces(*(_between(each, place) for each in (motor, load, torque, warmth, outer)))
+
+
+def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
+    """The commands of a record in one piece, on the grid of its own cycle, with the approach before them."""
+    target = part.motor_target_deg
+    name = f"{part.source}: " if part.source else ""
+    if target is None or np.isnan(target).any():
+        raise InputError(
+            f"{name}no commanded motor angle (motor_target_deg); expected one in each row: what the drive "
+            "was told is what a simulated one is told again"
+        )
+    if len(part) < 2:
+        raise InputError(f"{name}{len(part)} rows; expected at least two in each part of a recording")
+    time_s = part.time_s
+    cycle_s = cycle_of(part, axis)
+    cycles = (time_s - time_s[0]) / cycle_s
+    nearest = np.round(cycles)
+    if np.max(np.abs(cycles - nearest)) <= UNEVEN and np.all(np.diff(nearest) >= 1.0):
+        cycles = nearest
+    grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
+    demand_deg = np.interp(grid, cycles, target)
+    recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).astype(np.int64).tolist()
+    approach = _approach(truth, axis, demand_deg, cycle_s)
+    return Commands((*approach, *recorded), len(approach), cycles, time_s, cycle_s)
+
+
+def cycle_of(part: Record, axis: AxisConfig) -> float:
+    """A record's own cycle in seconds, as 60C2h can express it; the axis's own where they agree."""
+    own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
+    if not own_ms > 0.0:
+        raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
+    if abs(own_ms / axis.drive.cycle_ms - 1.0) < 0.02:
+        return axis.drive.cycle_s
+    rounded = round(own_ms, 1) if own_ms < 25.5 else float(round(own_ms))
+    return min(max(rounded, 0.5), 255.0) / 1e3
+
+
+def at_cycle(axis: AxisConfig, cycle_s: float) -> AxisConfig:
+    """The same axis with another SYNC period."""
+    if cycle_s == axis.drive.cycle_s:
+        return axis
+    cycle_ms = round(1e3 * cycle_s, 1)
+    heartbeat_ms = max(axis.drive.heartbeat_ms, math.ceil(2 * cycle_ms))
+    drive = axis.drive.model_copy(update={"cycle_ms": cycle_ms, "heartbeat_ms": heartbeat_ms})
+    return axis.model_copy(update={"drive": drive})
+
+
+class _Again:
+    """A procedure that gives a recording's commands."""
+
+    def __init__(self, commands: Commands, axis: AxisConfig) -> None:
+        load_deg = _degrees(commands.counts, axis) / axis.gear.ratio
+        self._legs = [
+            _Leg(load_deg[: commands.lead], commands.cycle_s, "approach"),
+            _Leg(load_deg[commands.lead :], commands.cycle_s, "replay"),
+            _Leg(np.full(LATENCY_CYCLES, load_deg[-1]), commands.cycle_s, "approach"),
+        ]
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """The approach, the commands, and as long as the last of them takes to show."""
+        approach, again, after = self._legs
+        yield approach
+        yield again
+        yield after
+
+
+class _Leg:
+    """Commands, one for each cycle."""
+
+    def __init__(self, load_deg: FloatArray, cycle_s: float, kind: str) -> None:
+        self.kind = kind
+        self._load_deg: list[float] = load_deg.tolist()
+        self._cycle_s = cycle_s
+
+    def path(self, start_deg: float, limits: MotionLimits) -> Path:
+        """The commands themselves: they have been an axis's before."""
+        points, cycle_s, last = self._load_deg, self._cycle_s, len(self._load_deg) - 1
+
+        def at(time_s: float) -> float:
+            return points[min(round(time_s / cycle_s), last)]
+
+        return Path((last - 0.5) * cycle_s, at, min(points), max(points))
+
+    def ended(self, samples: Sequence[Sample]) -> bool:
+        """The last command's end is the leg's end."""
+        return True
+
+
+def _at_rows(measured: Record, commands: Commands, axis: AxisConfig) -> Record:
+    """The rows of the recording, from a run that began before them."""
+    wanted = np.array(commands.counts[commands.lead :], dtype=np.float64)
+    target = measured.motor_target_deg
+    assert target is not None  # the bench records it
+    demand = np.round(axis.motor_encoder.counts(1.0) * target)
+    off = [
+        float(np.sum(np.abs(demand[commands.lead + late :][: len(wanted)] - wanted)))
+        for late in range(LATENCY_CYCLES + 1)
+    ]
+    first = commands.lead + int(np.argmin(off))
+    columns = {
+        name: _between(column[first:][: len(wanted)], commands.row_cycles)
+        for name, column in measured.columns.items()
+    }
+    return Record(columns | {"time_s": commands.time_s})
+
+
+def _between(column: FloatArray, cycles: FloatArray) -> FloatArray:
+    """A column by cycle, at fractional cycles."""
+    return np.interp(cycles, np.arange(len(column)), column)
+
+
+def _degrees(counts: Sequence[int], axis: AxisConfig) -> FloatArray:
+    encoder = axis.motor_encoder
+    return encoder.direction * np.asarray(counts, dtype=np.float64) * 360.0 / encoder.counts_per_turn
+
+
+def _approach(truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float) -> list[int]:
+    """From where the simulated drive is switched on to the first command, and its speed, at the limits."""
+    ratio, limits = axis.gear.ratio, axis.limits
+    start_counts = truth.motor.encoder.zero_counts
+    start_deg = axis.motor_encoder.degrees(start_counts) / ratio
+    steps = np.diff(demand_deg[:4]) / ratio / cycle_s
+    speed = float(np.median(steps)) if len(steps) and np.all(steps != 0.0) else 0.0
+    demand = InputParameter(1)
+    demand.current_position = [start_deg]
+    demand.target_position = [float(demand_deg[0]) / ratio]
+    demand.target_velocity = [speed]
+    demand.max_velocity = [max(limits.velocity_deg_s, 1.01 * abs(speed))]
+    demand.max_acceleration = [limits.acceleration_deg_s2]
+    demand.max_jerk = [limits.jerk_deg_s3]
+    trajectory = Trajectory(1)
+    if Ruckig(1).calculate(demand, trajectory) not in {Result.Working, Result.Finished}:
+        raise InputError(
+            f"no way from where the simulated drive is switched on, {start_deg:g} deg, to where the "
+            f"recording begins, {demand_deg[0] / ratio:g} deg, within the limits of {axis.path}"
+        )
+    moving = math.ceil(trajectory.duration / cycle_s)
+    standing = math.ceil(STANDING_S / cycle_s)
+    per_load_deg = axis.motor_encoder.counts(1.0) * ratio
+    # Backwards from its end, so that the last command before the recording has the recording's speed.
+    times = [max(trajectory.duration - (moving - k) * cycle_s, 0.0) for k in range(moving)]
+    way = [round(per_load_deg * float(trajectory.at_time(each)[0][0])) for each in times]
+    here = round(per_load_deg * start_deg)
+    rest = [way[-1] if way else here] if speed else [round(axis.motor_encoder.counts(1.0) * demand_deg[0])]
+    return [here] * standing + way + (rest * standing if not speed else [])
+
+
+def legs_of(recording: Recording) -> tuple[Segment, ...]:
+    """The recording's legs; one for each of its parts where it says nothing of legs."""
+    if recording.segments:
+        return recording.segments
+    return tuple(
+        Segment(kind="motion", start_s=float(part.time_s[0]), end_s=float(part.time_s[-1]))
+        for part in recording.record.parts()
+    )

@@ -1,0 +1,41 @@
+"""The table of what a twin may change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import (
+    BY_NAME,
+    PARAMETERS,
+    Parameter,
+    at_coordinates,
+    coordinates,
+    value_in,
+    with_values,
+)
+
+DEMO = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda each: each.name)
+def test_each_row_names_a_value_of_the_truth_file_within_its_bounds(parameter: Parameter) -> None:
+    value = value_in(DEMO, parameter)
+    assert value is not None
+    assert parameter.least <= value <= parameter.most
+    assert parameter.value(parameter.coordinate(value)) == pytest.approx(value)
+    other = 0.9 * value + 0.001
+    assert value_in(with_values(DEMO, {parameter.name: other}), parameter) == pytest.approx(other)
+
+
+def test_coordinates_lead_there_and_back() -> None:
+    place = coordinates(DEMO, PARAMETERS)
+    again = at_coordinates(DEMO, PARAMETERS, place)
+    assert coordinates(again, PARAMETERS) == pytest.approx(place)
+
+
+def test_a_section_that_is_not_there_has_no_value() -> None:
+    bare = DEMO.model_copy(update={"servo": DEMO.servo.model_copy(update={"load_feedforward": None})})
+    assert value_in(bare, BY_NAME["load feed-forward"]) is None

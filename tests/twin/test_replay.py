@@ -1,0 +1,122 @@
+"""A recording's commands, replayed through the simulated drive: with frames, and without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench, axis_view
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.procedures.moves import MoveTo
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.replay import replay, replay_directly
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+CHANNELS = ("time_s", "motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
+
+
+def demo(noise_arcsec: float = 0.0, **servo: float) -> tuple[AxisConfig, Truth]:
+    """The demo axis with encoders that count backwards, and its truth."""
+    axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))
+    for name in ("motor_encoder", "load_encoder"):
+        axis[name]["direction"] = -1
+    for each in (truth["motor"]["encoder"], truth["load"]["encoder"]):
+        each["direction"] = -1
+    truth["load"]["encoder"]["noise_arcsec"] = noise_arcsec
+    truth["servo"].update(servo)
+    return AxisConfig.from_text(yaml.safe_dump(axis), DEMO / "axis.yaml"), Truth.model_validate(truth)
+
+
+def benched(axis: AxisConfig, truth: Truth, procedure: Any) -> Recording:
+    with (
+        simulated_bench(truth, axis.eds_path, axis.drive.node_id) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        return Bench(drive).run(procedure)
+
+
+@pytest.mark.parametrize("dead_time_ms", [0.0, 1.3])
+def test_the_replay_on_the_true_axis_is_its_recording_with_frames_and_without(dead_time_ms: float) -> None:
+    axis, truth = demo(dead_time_ms=dead_time_ms)
+    recording = benched(axis, truth, Stepping(2, start_deg=0.0))
+    over_frames = replay(recording, axis, truth)
+    directly = replay_directly(recording, axis, truth)
+    for name in CHANNELS:
+        assert np.array_equal(over_frames.columns[name], recording.record.columns[name]), name
+        assert np.array_equal(directly.columns[name], over_frames.columns[name]), name
+
+
+def test_a_replay_begins_where_the_recording_does_and_shows_what_the_drive_is() -> None:
+    axis, truth = demo()
+    recording = benched(axis, truth, Stepping(2, start_deg=3.0))
+    slower = truth.servo.model_copy(update={"dead_time_ms": 2.0})
+    late = replay_directly(recording, axis, truth.model_copy(update={"servo": slower}))
+    same = replay_directly(recording, axis, truth)
+    record = recording.record
+    assert np.array_equal(same.motor_position_deg[0], record.motor_position_deg[0])
+    # At a constant speed v, 2 ms of dead time are v * 2 ms behind.
+    speed = np.gradient(record.columns["motor_target_deg"], record.time_s)
+    steady = np.abs(speed) > 0.8 * np.max(np.abs(speed))
+    behind = (same.motor_position_deg - late.motor_position_deg)[steady] / speed[steady]
+    assert np.median(behind) == pytest.approx(2e-3, abs=2e-4)
+
+
+def test_rows_off_the_cycle_are_interpolated() -> None:
+    axis, truth = demo()
+    record = benched(axis, truth, Stepping(2)).record
+    whole = replay_directly(Recording(record), axis, truth)
+    some = np.sort(np.random.default_rng(0).choice(len(record), len(record) - 100, replace=False))
+    some[0] = 0
+    fewer = Record({name: column[some] for name, column in record.columns.items()})
+    given = replay_directly(Recording(fewer), axis, truth)
+    assert np.array_equal(given.time_s, fewer.time_s)
+    apart = np.abs(given.motor_position_deg - whole.motor_position_deg[some])
+    assert np.max(apart) < 0.2  # the command between two rows is a guess, to some counts of 0.045 deg
+
+
+def test_parts_are_replayed_one_by_one() -> None:
+    axis, truth = demo()
+    recordings = [benched(axis, truth, Stepping(2, start_deg=start)) for start in (0.0, -2.0)]
+    joined = Recording.joined([replace(each) for each in recordings])
+    assert len(joined.record.parts()) == 2
+    given = replay_directly(joined, axis, truth)
+    assert np.array_equal(given.motor_position_deg, joined.record.motor_position_deg)
+
+
+def test_without_a_command_there_is_nothing_to_replay() -> None:
+    axis, truth = demo()
+    time_s = np.arange(10) * 0.004
+    record = Record({"time_s": time_s, "motor_position_deg": time_s, "load_position_deg": time_s})
+    with pytest.raises(InputError, match="motor_target_deg"):
+        replay_directly(Recording(record), axis, truth)
+
+
+def test_a_dead_time_delays_torque_and_motion_alike() -> None:
+    axis, truth = demo()
+    seen = {}
+    for dead_ms in (0.0, 2.0):
+        servo = truth.servo.model_copy(update={"dead_time_ms": dead_ms})
+        machine = Machine(truth.model_copy(update={"servo": servo}), 0)
+        path = MoveTo(5.0).path(0.0, axis_view(axis).limits)
+        demand, rows = 0.0, []
+        for number in range(600):
+            goal = -round(path.at(number * 0.0005) * 50 * 8000 / 360)
+            machine.follow(demand, goal, 1)
+            demand = goal
+            rows.append((machine.motor_counts, machine.torque_nm))
+        seen[dead_ms] = np.array(rows)
+    shift = round(0.002 / truth.substep_s)
+    assert np.allclose(seen[2.0][shift:], seen[0.0][:-shift], atol=1e-3)
