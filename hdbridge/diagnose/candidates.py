@@ -1,18 +1,16 @@
 """The candidates: for each cause of the catalogue the effects, over a grid of shapes, that a record is
 screened for.
 
-Four causes have too many shapes for a grid and are sought by `seek.py`: lost counts, vibration, interpolation
-errors, local defects. The elastic law is chosen together with all of them (`search.py`).
+Four causes have too many shapes for a grid and are sought by `matched_filters.py`: lost counts, vibration,
+interpolation errors, local defects. The elastic law is chosen together with all of them (`search.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.diagnose.evidence import Evidence
 from hdbridge.effects import (
     AmplitudeDrift,
     Backlash,
@@ -42,6 +40,8 @@ from hdbridge.effects import (
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import OrderSeries, orders_from
+from hdbridge.estimation.observed import Observed
+from hdbridge.estimation.screening import Candidate
 
 HIGHEST_MOTOR_ORDER = 24
 LOAD_ORDERS = (1, 2, 3, 4)
@@ -50,24 +50,15 @@ _CROSSINGS_DEG = (0.05, 0.15, 0.4, 1.0, 2.5, 6.0)
 _CREEP_S = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """One effect that might be there."""
-
-    cause: str
-    effect: Effect
-    """With the shape of this point of the grid; its coefficients are of no account."""
-
-
-def candidates(evidence: Evidence, base: Sequence[Effect]) -> list[Candidate]:
+def candidates(data: Observed, base: Sequence[Effect]) -> list[Candidate]:
     """All whose channels are there; orders that the model has already are not among them."""
-    available = evidence.points.motion.available()
-    found = [Candidate(each.name, each) for each in _effects(evidence, base)]
+    available = data.points.motion.available()
+    found = [Candidate(each.name, each) for each in _effects(data, base)]
     return [each for each in found if not unmet([each.effect], available)]
 
 
-def _effects(evidence: Evidence, base: Sequence[Effect]) -> Iterator[Effect]:
-    motion, ratio = evidence.points.motion, evidence.ratio
+def _effects(data: Observed, base: Sequence[Effect]) -> Iterator[Effect]:
+    motion, ratio = data.points.motion, data.ratio
     yield from _orders(base, ratio)
     loop = loop_of(base)
     has_loop = any(isinstance(each, Hysteresis | HysteresisMemory) for each in base)
@@ -90,8 +81,8 @@ def _effects(evidence: Evidence, base: Sequence[Effect]) -> Iterator[Effect]:
             )
     if has_orders:
         yield DirectionPhase(orders=orders_of(base), shift_deg=0.0)
-    yield from _with_torque(base, _torques(evidence), has_orders)
-    yield from _warm(evidence, base, has_orders and has_loop)
+    yield from _with_torque(base, _torques(data), has_orders)
+    yield from _warm(data, base, has_orders and has_loop)
     for tau in _CREEP_S:
         for build_up in (0.03, 0.3, 1.0):
             yield Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau),), build_up=build_up)
@@ -115,8 +106,8 @@ def _orders(base: Sequence[Effect], ratio: float) -> Iterator[Effect]:
             yield each
 
 
-def _torques(evidence: Evidence) -> dict[Channel, float]:
-    motion = evidence.points.motion
+def _torques(data: Observed) -> dict[Channel, float]:
+    motion = data.points.motion
     return {
         channel: float(np.quantile(np.abs(values), 0.98))
         for channel in (Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE)
@@ -150,10 +141,10 @@ def _with_torque(
                     )  # fmt: skip
 
 
-def _warm(evidence: Evidence, base: Sequence[Effect], modulated: bool) -> Iterator[Effect]:
-    temperature = evidence.points.motion.measured.get(Channel.TEMPERATURE)
+def _warm(data: Observed, base: Sequence[Effect], modulated: bool) -> Iterator[Effect]:
+    temperature = data.points.motion.measured.get(Channel.TEMPERATURE)
     driven = "temperature" if temperature is not None and float(np.ptp(temperature)) > 0.3 else "time"
-    time_s = evidence.points.motion.time_s
+    time_s = data.points.motion.time_s
     assert time_s is not None
     span = float(np.ptp(time_s))
     # A sensor on the gear itself is hardly ahead of it. Without one, what settles within a minute is creep.

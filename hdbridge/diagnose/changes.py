@@ -14,7 +14,6 @@ from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import EXTRAPOLATED, PENALTY, Trail
-from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
     DirectionPhase,
     Effect,
@@ -27,6 +26,7 @@ from hdbridge.effects import (
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
 
 LAW_GAIN = 60.0
@@ -46,17 +46,17 @@ ORDER_ARCSEC = 0.8
 
 
 def findings(
-    workshop: Workshop, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
+    estimator: Estimator, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
 ) -> list[Finding]:
     """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
     result: list[Finding] = []
-    for place, (given, now) in enumerate(zip(model.effects, precise.theory.effects, strict=False)):
+    for place, (given, now) in enumerate(zip(model.effects, precise.hypothesis.effects, strict=False)):
         if isinstance(given, Hysteresis | HysteresisMemory):
-            if workshop.evidence.reversals < 2:
+            if estimator.data.reversals < 2:
                 continue  # a loop shows only where the axis reverses
-            found = _law(workshop, trail, precise, place, given, now, spread)
+            found = _law(estimator, trail, precise, place, given, now, spread)
         elif isinstance(given, Synchronous):
-            found = _orders(workshop, precise, place, given, now, spread)
+            found = _orders(estimator, precise, place, given, now, spread)
         else:
             found = None
         if found is not None:
@@ -65,7 +65,7 @@ def findings(
 
 
 def _law(
-    workshop: Workshop,
+    estimator: Estimator,
     trail: Trail,
     precise: Fitted,
     place: int,
@@ -74,24 +74,24 @@ def _law(
     spread: FloatArray,
 ) -> Finding | None:
     fitted = trail.fitted
-    start = fitted.theory.start
+    start = fitted.hypothesis.start
 
     def values(effect: Effect) -> FloatArray:
-        return workshop.columns(effect, start) @ effect.coefficients()
+        return estimator.columns(effect, start) @ effect.coefficients()
 
     if type(given) is not type(now):
         if trail.law_gain < LAW_GAIN or not isinstance(now, HysteresisMemory):
             return None
-        old = workshop.fit(fitted.theory.instead(place, type(given)(**now.parameters())))
-        apart = (old.residual - fitted.residual) / workshop.weight
+        old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
+        apart = (old.residual - fitted.residual) / estimator.weight
         if (
             float(np.sqrt(np.mean(apart**2))) < 0.25 * LAW_ARCSEC
             or float(np.max(np.abs(apart))) < 2.0 * LAW_ARCSEC
         ):
             return None
-        gain = held_out(workshop, fitted, old)
+        gain = held_out(estimator, fitted, old)
         return Finding(
-            "hysteresis_memory", 0.95, (), parameters_of(workshop, precise, place, spread),
+            "hysteresis_memory", 0.95, (), parameters_of(estimator, precise, place, spread),
             gain, next_experiment("hysteresis_memory", ()),
             float(np.quantile(np.abs(apart), 0.998)),
             robust=trail.law_gain, effect=now,
@@ -99,7 +99,7 @@ def _law(
     before, after = values(given), values(now)
     change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
     as_a_whole = change >= max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after)))
-    lawless = _lawless_arcsec(workshop, fitted)
+    lawless = _lawless_arcsec(estimator, fitted)
     if (
         not as_a_whole
         and not lawless
@@ -113,28 +113,28 @@ def _law(
     )
     # A loop that obeys neither law may have memory in part of it, or in none.
     aliases = ("hysteresis_memory",) if lawless else ()
-    residual = fitted.residual / workshop.weight
+    residual = fitted.residual / estimator.weight
     apart = after - before - float(np.mean(after - before))
     taken = math.sqrt(max(float(np.mean((residual + apart) ** 2 - residual**2)), 0.0))
-    moved = values(fitted.theory.effects[place]) - before
+    moved = values(fitted.hypothesis.effects[place]) - before
     return Finding(
-        "hysteresis_parameters", 0.9, aliases, parameters_of(workshop, precise, place, spread),
-        held_out_change(workshop, fitted, fitted.places(place), moved),
+        "hysteresis_parameters", 0.9, aliases, parameters_of(estimator, precise, place, spread),
+        held_out_change(estimator, fitted, fitted.places(place), moved),
         next_experiment("hysteresis_parameters", aliases), max(peak, lawless), taken_arcsec=taken,
-        robust=float(np.sum((workshop.weight * (after - before - np.mean(after - before))) ** 2)),
+        robust=float(np.sum((estimator.weight * (after - before - np.mean(after - before))) ** 2)),
         effect=effect, note="the baseline's own loop takes over the new parameters",
     )  # fmt: skip
 
 
-def _lawless_arcsec(workshop: Workshop, fitted: Fitted) -> float:
+def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
-    searched = workshop.nuisance
+    searched = estimator.nuisance
     if not searched.shape[1]:
         return 0.0
-    workshop.nuisance = searched[:, :0]
-    plain = workshop.fit(fitted.theory)
-    workshop.nuisance = searched
-    apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / workshop.weight, 0.998))
+    estimator.nuisance = searched[:, :0]
+    plain = estimator.fit(fitted.hypothesis)
+    estimator.nuisance = searched
+    apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 0.998))
     gained = plain.chi_square - fitted.chi_square > LAW_GAIN + PENALTY * searched.shape[1]
     return apart if gained and apart > 2.0 * LAW_ARCSEC else 0.0
 
@@ -162,7 +162,7 @@ def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatA
 
 
 def _orders(
-    workshop: Workshop, fitted: Fitted, place: int, given: Synchronous, now: Effect, spread: FloatArray
+    estimator: Estimator, fitted: Fitted, place: int, given: Synchronous, now: Effect, spread: FloatArray
 ) -> Finding | None:
     assert isinstance(now, Synchronous)
     columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
@@ -172,7 +172,11 @@ def _orders(
     weight = 0.0
     # Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift.
     shift = next(
-        (math.radians(each.shift_deg) for each in fitted.theory.effects if isinstance(each, DirectionPhase)),
+        (
+            math.radians(each.shift_deg)
+            for each in fitted.hypothesis.effects
+            if isinstance(each, DirectionPhase)
+        ),
         0.0,
     )
     for number, (old, new) in enumerate(zip(given.orders, now.orders, strict=True)):
@@ -196,19 +200,19 @@ def _orders(
     if not changed:
         return None
     change = now.fitted(now.coefficients() - given.coefficients())
-    seen = 0.5 * float(np.ptp(workshop.does(change, fitted.theory.start)))
+    seen = 0.5 * float(np.ptp(estimator.does(change, fitted.hypothesis.start)))
     if max(each.amplitude_arcsec for each in changed) > EXTRAPOLATED * seen:
         return None  # on an arc of their turn orders take any size
     low = {each.order for each in changed} <= {1, 2}
     size = sum(each.amplitude_arcsec for each in changed)
     pairs = np.concatenate([columns[2 * number : 2 * number + 2] for number in which])
     difference = now.model_copy(update={"orders": tuple(changed)})
-    moved = workshop.columns(difference, fitted.theory.start) @ difference.coefficients()
+    moved = estimator.columns(difference, fitted.hypothesis.start) @ difference.coefficients()
     cause, aliases = ("motor_encoder_eccentricity", ("motor_order",)) if low else ("motor_order", ())
     return Finding(
-        cause, 0.9, aliases, parameters, held_out_change(workshop, fitted, pairs, moved),
+        cause, 0.9, aliases, parameters, held_out_change(estimator, fitted, pairs, moved),
         next_experiment(cause, aliases), size,
-        robust=float(np.sum(workshop.weight**2) * 0.5 * weight),
+        robust=float(np.sum(estimator.weight**2) * 0.5 * weight),
         effect=MotorEncoderEccentricity.model_construct(orders=tuple(changed)) if low else None,
         note="a change of orders that the model has: its synchronous part takes it over",
     )  # fmt: skip

@@ -8,21 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdbridge.diagnose import changes
-from hdbridge.diagnose.afterthought import reconsidered
-from hdbridge.diagnose.evidence import gather
+from hdbridge.diagnose.acceptance import Gate, gate
+from hdbridge.diagnose.backward import reconsidered
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
-from hdbridge.diagnose.gates import Gate, gate
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import ALWAYS, identifiability
+from hdbridge.diagnose.lookalikes import inertial, late, wound_up
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.probability import Beside, Signs, weighed
+from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.diagnose.reference import as_calibrated
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import ORDINARY_ARCSEC, PENALTY, Search, Trail
-from hdbridge.diagnose.theory import Fitted, Theory, Workshop
-from hdbridge.diagnose.twins import inertial, late, wound_up
 from hdbridge.diagnose.unexplained import (
     LEFT_ARCSEC,
     SHADOW,
@@ -40,6 +38,8 @@ from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
+from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.estimation.observed import gather
 from hdbridge.model import TransmissionModel
 from hdbridge.observations.cuts import observed
 from hdbridge.observations.foreign import check_once, check_records, zeros_apart_arcsec
@@ -96,19 +96,19 @@ def diagnose(
         if channels:
             raise missing_error(name, channels)
     progress("preparing the record")
-    evidence = gather(
+    data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    workshop = Workshop(evidence)
-    search = Search(workshop, model.effects)
-    first = unfitted(workshop, model.effects)
-    held = beyond_limit(model.effects, evidence.full.motion)
-    evidence = replace(evidence, remarks=(*((first,) if first else ()), *held, *evidence.remarks))
-    workshop.evidence = evidence
+    estimator = Estimator(data)
+    search = Search(estimator, model.effects)
+    first = unfitted(estimator, model.effects)
+    held = beyond_limit(model.effects, data.full.motion)
+    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
+    estimator.data = data
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    found = _Judge(workshop, search, trail, model, record, named_from, bool(first)).diagnosis()
+    found = _Judge(estimator, search, trail, model, record, named_from, bool(first)).diagnosis()
     return replace(found, remarks=(*remarks, *found.remarks))
 
 
@@ -135,7 +135,7 @@ class _Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judge:
-    workshop: Workshop
+    estimator: Estimator
     search: Search
     trail: Trail
     model: TransmissionModel
@@ -145,13 +145,13 @@ class _Judge:
     """Whether the model lacks most of what the axis has."""
 
     def diagnosis(self) -> Diagnosis:
-        workshop, trail, base = self.workshop, self.trail, self.trail.base
+        estimator, trail, base = self.estimator, self.trail, self.trail.base
         fitted, considered = self._named_only(trail.fitted)
         fitted, more = self._without_doubtful(fitted)
         considered += more
-        fitted = inertial(workshop, self.search, late(workshop, self.search, fitted))
-        fitted = wound_up(workshop, fitted, trail.base)
-        fitted = as_calibrated(workshop, fitted, self.model.effects)
+        fitted = inertial(estimator, self.search, late(estimator, self.search, fitted))
+        fitted = wound_up(estimator, fitted, trail.base)
+        fitted = as_calibrated(estimator, fitted, self.model.effects)
         judged = self._likely_only(fitted)
         fitted, left, spread = judged.fitted, judged.left, judged.spread
         usual = {each.cause for each in judged.findings if _ordinary(each)}
@@ -159,27 +159,30 @@ class _Judge:
         considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
         findings = self._with_unexplained(findings, left)
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-        given, refitted = self._as_given(), workshop.fit(Theory(self.model.effects, fitted.theory.start))
-        honest = as_named(workshop, fitted, self.model.effects, {each.cause for each in findings})
+        given, refitted = (
+            self._as_given(),
+            estimator.fit(Hypothesis(self.model.effects, fitted.hypothesis.start)),
+        )
+        honest = as_named(estimator, fitted, self.model.effects, {each.cause for each in findings})
         if honest is not fitted:
-            fitted, spread = honest, covariance(workshop, honest)
-        sound = supported(workshop, fitted, self.model.effects)
-        fitted = replace(fitted, theory=replace(fitted.theory, effects=sound))
+            fitted, spread = honest, covariance(estimator, honest)
+        sound = supported(estimator, fitted, self.model.effects)
+        fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
         named = {each.cause for each in findings if not each.within}
         chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
-        extended = extended_model(workshop, self.model, fitted, chosen, spread, reason, base)
-        after = self._about_zeros(workshop.told(extended.effects, fitted.theory.start))
-        fitted = replace(fitted, residual=after * workshop.weight)
-        points = workshop.evidence.points
+        extended = extended_model(estimator, self.model, fitted, chosen, spread, reason, base)
+        after = self._about_zeros(estimator.told(extended.effects, fitted.hypothesis.start))
+        fitted = replace(fitted, residual=after * estimator.weight)
+        points = estimator.data.points
         return Diagnosis(
             baseline=_figures(given),
-            refitted=_figures(refitted.residual / workshop.weight),
+            refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
-            noise_floor_arcsec=float(np.sqrt(np.mean(points.sigma_arcsec[workshop.index] ** 2))),
+            noise_floor_arcsec=float(np.sqrt(np.mean(points.sigma_arcsec[estimator.index] ** 2))),
             findings=tuple(findings),
-            identifiability=identifiability(workshop, fitted, self.model.effects),
+            identifiability=identifiability(estimator, fitted, self.model.effects),
             by_kind=self._by_kind(given, after),
-            remarks=workshop.evidence.remarks,
+            remarks=estimator.data.remarks,
             model=extended,
             traces=self._traces(fitted, given),
             considered=tuple(considered),
@@ -188,64 +191,64 @@ class _Judge:
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """The findings, without those that are not likely enough to be named; they leave the fit too."""
         considered: list[str] = []
-        nuisance = self.workshop.nuisance
+        nuisance = self.estimator.nuisance
         while True:
             judged = self._judged(fitted)
             doubted = [each for each in judged.findings if each.probability < self.named_from]
             considered += [f"{each.cause}: more likely something else" for each in doubted]
             effects = {id(each.effect) for each in doubted}
-            kept = fitted.theory
+            kept = fitted.hypothesis
             for place in range(len(kept.effects) - 1, self.trail.base - 1, -1):
                 if id(kept.effects[place]) in effects:
                     kept = kept.without(place)
-            if kept == fitted.theory:  # what is left of them are changes of the baseline, which it keeps
+            if kept == fitted.hypothesis:  # what is left of them are changes of the baseline, which it keeps
                 likely = [each for each in judged.findings if each not in doubted]
                 return replace(judged, findings=likely, considered=[*considered, *judged.considered])
-            self.workshop.nuisance = nuisance
-            fitted = self.workshop.fit(kept)
+            self.estimator.nuisance = nuisance
+            fitted = self.estimator.fit(kept)
 
     def _judged(self, fitted: Fitted) -> _Judged:
-        """What a theory finds, and how sure that is."""
-        workshop, base = self.workshop, self.trail.base
-        precise = precisely(workshop, fitted)
-        spread = covariance(workshop, precise)
+        """What a hypothesis finds, and how sure that is."""
+        estimator, base = self.estimator, self.trail.base
+        precise = precisely(estimator, fitted)
+        spread = covariance(estimator, precise)
         findings = [
-            replace(self._finding(fitted, place), parameters=parameters_of(workshop, precise, place, spread))
-            for place in range(base, len(fitted.theory.effects))
+            replace(self._finding(fitted, place), parameters=parameters_of(estimator, precise, place, spread))
+            for place in range(base, len(fitted.hypothesis.effects))
         ]
         findings += changes.findings(
-            workshop, self.model, replace(self.trail, fitted=fitted), precise, spread
+            estimator, self.model, replace(self.trail, fitted=fitted), precise, spread
         )
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        free_loop = bool(workshop.nuisance.shape[1])
+        free_loop = bool(estimator.nuisance.shape[1])
         if free_loop:  # a model cannot hold a free-form loop: figures are without it
-            workshop.nuisance = workshop.nuisance[:, :0]
-            fitted = workshop.fit(fitted.theory)
-        left = rest(workshop, fitted)
-        unknown = is_unexplained(workshop, left) or many_of_one(findings) is not None
+            estimator.nuisance = estimator.nuisance[:, :0]
+            fitted = estimator.fit(fitted.hypothesis)
+        left = rest(estimator, fitted)
+        unknown = is_unexplained(estimator, left) or many_of_one(findings) is not None
         considered: list[str] = []
         if unknown:
             findings, considered = without_doubtful_loops(findings, left)
-        findings = weighed(findings, Beside(left.arcsec, excess, free_loop, unknown))
-        if workshop.evidence.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+        findings = weighed(findings, Context(left.arcsec, excess, free_loop, unknown))
+        if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
-        return _Judged(fitted, findings, left, covariance(workshop, fitted), considered)
+        return _Judged(fitted, findings, left, covariance(estimator, fitted), considered)
 
     def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
         """Take out what a gate stops, weakest first, and fit again."""
         considered: list[str] = []
-        while len(fitted.theory.effects) > self.trail.base:
+        while len(fitted.hypothesis.effects) > self.trail.base:
             gates: dict[int, Gate] = {
-                place: gate(self.workshop, fitted, place)
-                for place in range(self.trail.base, len(fitted.theory.effects))
+                place: gate(self.estimator, fitted, place)
+                for place in range(self.trail.base, len(fitted.hypothesis.effects))
             }
             stopped = [place for place in gates if not gates[place].passed]
             if not stopped:
                 break
             place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed)
-            considered.append(f"{fitted.theory.effects[place].name}: {gates[place].reason}")
-            fitted = self.workshop.fit(fitted.theory.without(place))
+            considered.append(f"{fitted.hypothesis.effects[place].name}: {gates[place].reason}")
+            fitted = self.estimator.fit(fitted.hypothesis.without(place))
         return fitted, considered
 
     def _without_doubtful(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
@@ -253,38 +256,40 @@ class _Judge:
         shadow.
         """
         considered: list[str] = []
-        while len(fitted.theory.effects) > self.trail.base:
-            left = rest(self.workshop, fitted)
+        while len(fitted.hypothesis.effects) > self.trail.base:
+            left = rest(self.estimator, fitted)
             if not is_unexplained(
-                self.workshop, replace(left, fast_arcsec=0.0)
+                self.estimator, replace(left, fast_arcsec=0.0)
             ):  # what is fast casts no shadow
                 break
-            residual = fitted.residual / self.workshop.weight
-            apart = elsewhere(self.workshop, residual)
+            residual = fitted.residual / self.estimator.weight
+            apart = elsewhere(self.estimator, residual)
             share = {}
-            for place, effect in enumerate(fitted.theory.effects[self.trail.base :], self.trail.base):
+            for place, effect in enumerate(fitted.hypothesis.effects[self.trail.base :], self.trail.base):
                 if effect.name in LINES or effect.name in ORDINARY_ARCSEC:
                     continue  # what is left has no such line, and casts no shadow there; or any axis has it
-                rows = acts(self.workshop, fitted, place)
+                rows = acts(self.estimator, fitted, place)
                 if np.any(rows & apart):
                     rows &= apart
-                without = self.workshop.fit(fitted.theory.without(place))
-                lost = without.residual[rows] / self.workshop.weight[rows]
+                without = self.estimator.fit(fitted.hypothesis.without(place))
+                lost = without.residual[rows] / self.estimator.weight[rows]
                 does = float(np.mean(lost**2) - np.mean(residual[rows] ** 2))
-                left_arcsec = beyond_noise(self.workshop, residual, rows)
+                left_arcsec = beyond_noise(self.estimator, residual, rows)
                 share[place] = (does / max(left_arcsec**2, 1e-12), without)
             place = min(share, key=lambda each: share[each][0], default=-1)
             if place < 0 or share[place][0] > SHADOW:
                 break
-            considered.append(f"{fitted.theory.effects[place].name}: does less than what is left unexplained")
+            considered.append(
+                f"{fitted.hypothesis.effects[place].name}: does less than what is left unexplained"
+            )
             fitted = share[place][1]
         return fitted, considered
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
-        effect = fitted.theory.effects[place]
-        without = self.workshop.fit(fitted.theory.without(place))
-        judged = gate(self.workshop, fitted, place)
-        gain = held_out(self.workshop, fitted, without)
+        effect = fitted.hypothesis.effects[place]
+        without = self.estimator.fit(fitted.hypothesis.without(place))
+        judged = gate(self.estimator, fitted, place)
+        gain = held_out(self.estimator, fitted, without)
         aliases, margin = self._aliases(fitted, without, place)
         own = without.chi_square - fitted.chi_square
         return Finding(
@@ -306,7 +311,7 @@ class _Judge:
         """Other causes that do nearly as well in its place, and by how much the best of the others is
         worse.
         """
-        effect = fitted.theory.effects[place]
+        effect = fitted.hypothesis.effects[place]
         own = without.chi_square - fitted.chi_square
         aliases: list[str] = []
         margin = own
@@ -322,7 +327,7 @@ class _Judge:
         if effect.name == "motor_order" and _low(effect):
             aliases += [each for each in ALWAYS["motor_order"] if each not in aliases]
         aliases += [each for each in self._out_of_step(effect) if each not in aliases]
-        has_torque = Channel.LOAD_TORQUE in self.workshop.motion.available()
+        has_torque = Channel.LOAD_TORQUE in self.estimator.motion.available()
         orders = {each.order for each in getattr(effect, "orders", ())}
         if effect.name == "load_order" and 1 in orders and not has_torque and "compliance" not in aliases:
             aliases.append("compliance")
@@ -338,13 +343,13 @@ class _Judge:
             return ()
         orders = effect.orders  # type: ignore[attr-defined]
         largest = max(orders, key=lambda each: each.amplitude_arcsec).order
-        evidence = self.workshop.evidence
-        parted = largest * evidence.travel_deg / DEG_PER_TURN / evidence.ratio
+        data = self.estimator.data
+        parted = largest * data.travel_deg / DEG_PER_TURN / data.ratio
         return (twin,) if parted < PARTED else ()
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings)
-        if many is None and not is_unexplained(self.workshop, left):
+        if many is None and not is_unexplained(self.estimator, left):
             return findings
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
         lives = left.lives_in
@@ -391,7 +396,7 @@ class _Judge:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""
         best: FloatArray | None = None
         for start in Start:
-            error = self._about_zeros(self.workshop.told(self.model.effects, start))
+            error = self._about_zeros(self.estimator.told(self.model.effects, start))
             if best is None or float(error @ error) < float(best @ best):
                 best = error
         assert best is not None
@@ -399,19 +404,19 @@ class _Judge:
 
     def _about_zeros(self, told_arcsec: FloatArray) -> FloatArray:
         """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
-        workshop = self.workshop
-        error: FloatArray = workshop.observed - told_arcsec
-        for zero in range(workshop.evidence.zeros):
-            rows = workshop.zero == zero
+        estimator = self.estimator
+        error: FloatArray = estimator.observed - told_arcsec
+        for zero in range(estimator.data.zeros):
+            rows = estimator.zero == zero
             if np.any(rows):
-                error[rows] -= np.average(error[rows], weights=workshop.weight[rows] ** 2)
+                error[rows] -= np.average(error[rows], weights=estimator.weight[rows] ** 2)
         return error
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
-        workshop = self.workshop
-        kinds = workshop.evidence.points.kind[workshop.index]
-        direction = direction_of(workshop.motion)[workshop.index]
-        masks = {name: kinds == i for i, name in enumerate(workshop.evidence.kinds)}
+        estimator = self.estimator
+        kinds = estimator.data.points.kind[estimator.index]
+        direction = direction_of(estimator.motion)[estimator.index]
+        masks = {name: kinds == i for i, name in enumerate(estimator.data.kinds)}
         masks |= {"forward": direction > 0, "backward": direction < 0}
         return {
             name: (_figures(given[rows], about_zero=True), _figures(after[rows], about_zero=True))
@@ -420,26 +425,26 @@ class _Judge:
         }
 
     def _traces(self, fitted: Fitted, given: FloatArray) -> Traces:
-        workshop = self.workshop
-        points = workshop.evidence.points
+        estimator = self.estimator
+        points = estimator.data.points
         speed = points.motion.motor_speed_deg_s
         assert speed is not None
-        measured = workshop.observed - workshop.level - fitted.zeros[workshop.zero]
+        measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         return Traces(
-            time_s=workshop.time_s,
-            motor_deg=workshop.motion.motor_deg[workshop.index],
+            time_s=estimator.time_s,
+            motor_deg=estimator.motion.motor_deg[estimator.index],
             measured_arcsec=measured,
             model_arcsec=measured - given,
-            extended_arcsec=measured - fitted.residual / workshop.weight,
-            direction=direction_of(workshop.motion)[workshop.index],
-            speed_deg_s=speed[workshop.index],
-            kind=workshop.evidence.kinds,
-            kind_number=points.kind[workshop.index].astype(np.float64),
-            motion=workshop.motion,
-            rows=workshop.index,
-            samples=workshop.evidence.full.motion,
-            runs=workshop.evidence.runs,
-            start=fitted.theory.start,
+            extended_arcsec=measured - fitted.residual / estimator.weight,
+            direction=direction_of(estimator.motion)[estimator.index],
+            speed_deg_s=speed[estimator.index],
+            kind=estimator.data.kinds,
+            kind_number=points.kind[estimator.index].astype(np.float64),
+            motion=estimator.motion,
+            rows=estimator.index,
+            samples=estimator.data.full.motion,
+            runs=estimator.data.runs,
+            start=fitted.hypothesis.start,
         )
 
 

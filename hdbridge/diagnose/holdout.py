@@ -11,25 +11,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import FloatArray
-from hdbridge.identify.gain import Gain
+from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 FOLDS = 8
 STRETCHES = 64
 OVER = "stretches of time"
 
 
-def held_out(workshop: Workshop, fitted: Fitted, without: Fitted) -> Gain | None:
+def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | None:
     """Leave stretches out in turn; ``without`` is the fit that lacks the effect in question.
 
     None where the record is too short to leave anything out.
     """
-    return _gain(workshop, (without.tangent, without.residual), (fitted.tangent, fitted.residual))
+    return _gain(estimator, (without.tangent, without.residual), (fitted.tangent, fitted.residual))
 
 
 def held_out_change(
-    workshop: Workshop, fitted: Fitted, columns: NDArray[np.intp], change_arcsec: FloatArray
+    estimator: Estimator, fitted: Fitted, columns: NDArray[np.intp], change_arcsec: FloatArray
 ) -> Gain | None:
     """The same for a change within what the model has.
 
@@ -37,33 +37,33 @@ def held_out_change(
     ``change_arcsec`` (m,) is what they have changed by.
     """
     kept = np.setdiff1d(np.arange(fitted.count()), columns)
-    given = fitted.residual + workshop.weight * change_arcsec
-    return _gain(workshop, (fitted.tangent[:, kept], given), (fitted.tangent, fitted.residual))
+    given = fitted.residual + estimator.weight * change_arcsec
+    return _gain(estimator, (fitted.tangent[:, kept], given), (fitted.tangent, fitted.residual))
 
 
 def _gain(
-    workshop: Workshop, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]
+    estimator: Estimator, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]
 ) -> Gain | None:
     """From weighted tangents and residuals, each of a best fit or near it."""
-    stretch = stretches(workshop)
+    stretch = stretches(estimator)
     samples = np.bincount(stretch).astype(np.float64)
     largest = float(np.max(np.bincount(stretch % FOLDS)))
     if len(samples) < FOLDS or len(stretch) - largest < after[0].shape[1]:
         return None
-    squares = [_errors(workshop, tangent, residual, stretch) for tangent, residual in (before, after)]
+    squares = [_errors(estimator, tangent, residual, stretch) for tangent, residual in (before, after)]
     return Gain(OVER, FOLDS, samples, squares[0], squares[1])
 
 
-def stretches(workshop: Workshop) -> NDArray[np.intp]:
+def stretches(estimator: Estimator) -> NDArray[np.intp]:
     """Number of the stretch of time of each point."""
-    time = workshop.time_s
+    time = estimator.time_s
     span = max(float(time[-1] - time[0]), 1e-9)
     number = np.minimum((time - time[0]) / span * STRETCHES, STRETCHES - 1).astype(np.intp)
     return np.asarray(np.unique(number, return_inverse=True)[1])
 
 
 def _errors(
-    workshop: Workshop, tangent: FloatArray, residual: FloatArray, stretch: NDArray[np.intp]
+    estimator: Estimator, tangent: FloatArray, residual: FloatArray, stretch: NDArray[np.intp]
 ) -> FloatArray:
     """Sum of squares of each stretch, arcsec squared, with its fold left out of the fit."""
     fold = stretch % FOLDS
@@ -80,6 +80,6 @@ def _errors(
         inner = (total - grams[number]) / np.outer(scale, scale) + 1e-7 * np.eye(len(scale))
         step = np.linalg.solve(inner, (moment - moments[number]) / scale) / scale
         rows = fold == number
-        left = (residual[rows] - tangent[rows] @ step) / workshop.weight[rows]
+        left = (residual[rows] - tangent[rows] @ step) / estimator.weight[rows]
         result += np.bincount(stretch[rows], left**2, len(result))
     return result

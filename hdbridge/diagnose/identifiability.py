@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hdbridge.diagnose.candidates import Candidate, candidates
+from hdbridge.diagnose.candidates import candidates
 from hdbridge.diagnose.result import Identifiability
 from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, PENALTY
-from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import (
     CATALOGUE,
     CAUSES,
@@ -27,6 +26,8 @@ from hdbridge.effects import (
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import orders_from
+from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.screening import Candidate
 
 ENOUGH = 8_000
 """Points that are enough to distinguish shapes."""
@@ -41,15 +42,17 @@ shape."""
 ALWAYS = {"motor_order": ("motor_encoder_eccentricity",), "motor_encoder_eccentricity": ("motor_order",)}
 
 
-def identifiability(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) -> dict[str, Identifiability]:
+def identifiability(
+    estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
+) -> dict[str, Identifiability]:
     """For each cause of the catalogue."""
     left: dict[str, list[tuple[FloatArray, float, float, int]]] = {}
-    stride = -(-len(workshop.index) // ENOUGH)
+    stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
     basis = _orthonormal(fitted.basis[::stride])
-    weight = workshop.weight[::stride, np.newaxis]
-    for candidate in _specimens(workshop, fitted, base):
-        columns = workshop.columns(candidate.effect, fitted.theory.start)[::stride]
+    weight = estimator.weight[::stride, np.newaxis]
+    for candidate in _specimens(estimator, fitted, base):
+        columns = estimator.columns(candidate.effect, fitted.hypothesis.start)[::stride]
         span = np.quantile(columns, 0.998, axis=0) - np.quantile(columns, 0.002, axis=0)
         seen = span > 1e-12
         if not np.any(seen):
@@ -65,7 +68,7 @@ def identifiability(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) 
     result: dict[str, Identifiability] = {}
     for cause in CAUSES:
         if cause not in best:
-            result[cause] = Identifiability(False, None, (), 0.0, _missing(workshop, cause))
+            result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
             continue
         _, share, size, freedom = best[cause]
         if share < SHARE_LEFT or size <= 0.0:
@@ -77,7 +80,7 @@ def identifiability(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) 
         ]
         alike += [name for name in ALWAYS.get(cause, ()) if name not in alike]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
-    if not workshop.evidence.points.motion.available() & frozenset(Compliance.channels):
+    if not estimator.data.points.motion.available() & frozenset(Compliance.channels):
         each = result["load_order"]
         if "compliance" not in each.aliases:
             result["load_order"] = Identifiability(
@@ -90,17 +93,17 @@ def identifiability(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) 
     return result
 
 
-def _specimens(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) -> list[Candidate]:
-    evidence = workshop.evidence
-    time = workshop.time_s
-    ratio = evidence.ratio
-    load = float(np.median(workshop.motion.motor_deg)) / ratio
-    found = candidates(evidence, base)
+def _specimens(estimator: Estimator, fitted: Fitted, base: Sequence[Effect]) -> list[Candidate]:
+    data = estimator.data
+    time = estimator.time_s
+    ratio = data.ratio
+    load = float(np.median(estimator.motion.motor_deg)) / ratio
+    found = candidates(data, base)
     middle = float(np.quantile(time, 0.5))
     lines = round(
-        360.0 / max(float(np.median(np.abs(np.diff(workshop.motion.motor_deg)))) / ratio * 2.7, 0.02)
+        360.0 / max(float(np.median(np.abs(np.diff(estimator.motion.motor_deg)))) / ratio * 2.7, 0.02)
     )
-    fast = 0.137 / max(evidence.period_s, 1e-6)
+    fast = 0.137 / max(data.period_s, 1e-6)
     found += [
         Candidate(each.name, each)
         for each in (
@@ -111,7 +114,7 @@ def _specimens(workshop: Workshop, fitted: Fitted, base: Sequence[Effect]) -> li
             MotorEncoderEccentricity(orders=orders_from([1, 2])),
         )
     ]
-    for effect in fitted.theory.effects[: len(base)]:
+    for effect in fitted.hypothesis.effects[: len(base)]:
         if isinstance(effect, Hysteresis | HysteresisMemory):
             found += _loops(effect)
     return found
@@ -126,8 +129,8 @@ def _loops(law: Hysteresis | HysteresisMemory) -> list[Candidate]:
     ]
 
 
-def _missing(workshop: Workshop, cause: str) -> str:
-    lacking = CATALOGUE[cause].channels - workshop.evidence.points.motion.available()
+def _missing(estimator: Estimator, cause: str) -> str:
+    lacking = CATALOGUE[cause].channels - estimator.data.points.motion.available()
     if lacking:
         return "not recorded: " + ", ".join(sorted(each.value for each in lacking))
     return "nothing in this record or model to see it by"

@@ -9,13 +9,13 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import t as student
 
-from hdbridge.diagnose.evidence import IntArray
-from hdbridge.diagnose.gates import BLOCKS_S, blocks
+from hdbridge.diagnose.acceptance import BLOCKS_S, blocks
 from hdbridge.diagnose.result import Parameter
-from hdbridge.diagnose.theory import Fitted, Workshop, shape_value
 from hdbridge.effects import CountLoss, Creep, Effect, FloatArray, SubdivisionalError, Vibration
 from hdbridge.effects.base import Linear
 from hdbridge.effects.orders import OrderSeries
+from hdbridge.estimation.hypothesis import Estimator, Fitted, shape_value
+from hdbridge.estimation.observed import IntArray
 
 NORMAL_95: Final = 1.96
 PARTS: Final = (6, 12)
@@ -44,12 +44,12 @@ _UNITS: Final = {
 }
 
 
-def covariance(workshop: Workshop, fitted: Fitted) -> FloatArray:
+def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """Of all parameters, shape (p, p), so that `NORMAL_95` standard deviations are a 95 % interval.
 
     The sandwich over blocks of time, and of all lengths of blocks the most careful: seconds for noise that
-    wanders, and `PARTS` of the whole record for what the theory gets wrong from one part of a bench to the
-    next. Few parts tell a variance badly, so Student's quantile stands for the normal one, with as many
+    wanders, and `PARTS` of the whole record for what the hypothesis gets wrong from one part of a bench to
+    the next. Few parts tell a variance badly, so Student's quantile stands for the normal one, with as many
     degrees of freedom as parts carry the parameter, less one (Bester, Conley and Hansen 2011; effective
     number of clusters as Carter, Schnepel and Steigerwald 2017).
     """
@@ -77,7 +77,7 @@ def covariance(workshop: Workshop, fitted: Fitted) -> FloatArray:
         return np.asarray(best * np.outer(grow, grow))
 
     for length in (*BLOCKS_S, 20.0):
-        number = blocks(workshop.time_s, length)
+        number = blocks(estimator.time_s, length)
         if int(number[-1]) + 1 >= 20:
             best = at_least(number, normal=True)
     for parts in PARTS:
@@ -90,9 +90,11 @@ def _sums(rows: FloatArray, number: IntArray) -> FloatArray:
     return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
 
 
-def parameters_of(workshop: Workshop, fitted: Fitted, place: int, spread: FloatArray) -> dict[str, Parameter]:
+def parameters_of(
+    estimator: Estimator, fitted: Fitted, place: int, spread: FloatArray
+) -> dict[str, Parameter]:
     """Those of one effect, by the names of the model file where it has them."""
-    effect = fitted.theory.effects[place]
+    effect = fitted.hypothesis.effects[place]
     own = fitted.places(place)
     linear = [i for i in own if not fitted.parameters[i].shape]
     result = _linear(effect, spread[np.ix_(linear, linear)])
@@ -112,7 +114,7 @@ def parameters_of(workshop: Workshop, fitted: Fitted, place: int, spread: FloatA
             effect.frequency_hz, "Hz", effect.frequency_hz, effect.frequency_hz
         )
     if isinstance(effect, CountLoss):
-        result = _lost(workshop, fitted, effect, linear, spread)
+        result = _lost(estimator, fitted, effect, linear, spread)
     if isinstance(effect, SubdivisionalError):
         lines = float(effect.lines_per_turn)
         result["lines_per_turn"] = Parameter(lines, "1", lines, lines)
@@ -154,7 +156,7 @@ def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
 
 
 def _lost(
-    workshop: Workshop, fitted: Fitted, effect: CountLoss, columns: list[int], spread: FloatArray
+    estimator: Estimator, fitted: Fitted, effect: CountLoss, columns: list[int], spread: FloatArray
 ) -> dict[str, Parameter]:
     """Sizes and times of steps.
 
@@ -163,7 +165,7 @@ def _lost(
     `STEP_95` (sigma / size)^2 samples (Yao 1987).
     """
     result: dict[str, Parameter] = {}
-    time_s = workshop.time_s
+    time_s = estimator.time_s
     scatter = math.sqrt(float(np.mean(fitted.residual**2)))
     for i, (step, column) in enumerate(zip(effect.steps, columns, strict=True)):
         half = NORMAL_95 * math.sqrt(max(float(spread[column, column]), 0.0))
@@ -172,7 +174,7 @@ def _lost(
             size, "arcsec", size - half, size + half, is_size=True
         )
         first = min(int(np.searchsorted(time_s, step.time_s)), len(time_s) - 1)
-        sigmas = max(abs(size) * float(workshop.weight[first]), 1e-9) / max(scatter, 1.0)
+        sigmas = max(abs(size) * float(estimator.weight[first]), 1e-9) / max(scatter, 1.0)
         beyond = min(math.ceil(STEP_95 / sigmas**2 - 0.5), len(time_s))
         low, high = (
             float(time_s[max(first - 1 - beyond, 0)]),

@@ -6,10 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from hdbridge.diagnose.evidence import gather
 from hdbridge.diagnose.identifiability import identifiability
-from hdbridge.diagnose.theory import Theory, Workshop
 from hdbridge.effects import Motion, Start
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.observed import gather
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Procedure, Sample
 from hdbridge.procedures.plan import Plan
@@ -45,10 +45,10 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
     record = Record(
         {"time_s": time, "motor_position_deg": motor, "load_position_deg": load, "motor_target_deg": motor}
     )
-    evidence = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
-    workshop = Workshop(evidence)
-    fitted = workshop.fit(Theory(model.effects, start), iterations=2)
-    found = identifiability(workshop, fitted, model.effects)
+    data = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
+    estimator = Estimator(data)
+    fitted = estimator.fit(Hypothesis(model.effects, start), iterations=2)
+    found = identifiability(estimator, fitted, model.effects)
     return {
         "schema": "hdbridge.plan-diagnosis/1",
         "plan": plan.name,

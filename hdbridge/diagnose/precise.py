@@ -1,4 +1,4 @@
-"""The fit that parameters are taken from: what else moves the load in addition to the theory is allowed for.
+"""The fit that parameters are taken from: what else moves the load is allowed for.
 
 A tooth error shakes the load on its spring and the motor in its servo, and both answer the more the faster:
 well below the resonances in phase by the square of the frequency, and lagging by its cube. A search does
@@ -14,9 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose.theory import CONVERGED, Fitted, Workshop, moved, solve
 from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG, OrderSeries
+from hdbridge.estimation.hypothesis import CONVERGED, Estimator, Fitted, moved, solve
 
 SPEEDS_DIFFER: Final = 0.1
 """Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
@@ -27,48 +27,48 @@ _RATE: Final = 30.0
 """Radians per second, of size one in the columns."""
 
 
-def precisely(workshop: Workshop, fitted: Fitted) -> Fitted:
-    """The same theory fitted together with what its waves shake, with the tangents of all shapes.
+def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
+    """The same hypothesis fitted together with what its waves shake, with the tangents of all shapes.
 
     What its waves shake is left out where the record has one speed only: it is part of the orders there.
     """
-    shaken = _shaken(workshop, fitted) if _speeds_differ(workshop) else np.empty((len(workshop.index), 0))
-    searched = workshop.nuisance
+    shaken = _shaken(estimator, fitted) if _speeds_differ(estimator) else np.empty((len(estimator.index), 0))
+    searched = estimator.nuisance
     try:
-        workshop.nuisance = shaken
-        return _with_found(workshop, workshop.fit(fitted.theory))
+        estimator.nuisance = shaken
+        return _with_found(estimator, estimator.fit(fitted.hypothesis))
     finally:
-        workshop.nuisance = searched
+        estimator.nuisance = searched
 
 
-def _with_found(workshop: Workshop, fitted: Fitted) -> Fitted:
+def _with_found(estimator: Estimator, fitted: Fitted) -> Fitted:
     """With the shapes that a search found among all their values, moved to where they fit best."""
     for _ in range(STEPS):
-        full = workshop.with_shapes(fitted, FOUND)
+        full = estimator.with_shapes(fitted, FOUND)
         if len(full.parameters) == len(fitted.parameters):
             return fitted
         new = range(len(fitted.parameters), len(full.parameters))
         moves = solve(full.tangent, full.residual)
         effects = moved(
-            fitted.theory.effects, moves[new.start :], [full.parameters[each] for each in new], 1.0
+            fitted.hypothesis.effects, moves[new.start :], [full.parameters[each] for each in new], 1.0
         )
-        trial = workshop.fit(replace(fitted.theory, effects=effects))
+        trial = estimator.fit(replace(fitted.hypothesis, effects=effects))
         if any(each.violations() for each in effects) or trial.chi_square > fitted.chi_square - CONVERGED:
             return full
         fitted = trial
-    return workshop.with_shapes(fitted, FOUND)
+    return estimator.with_shapes(fitted, FOUND)
 
 
-def _shaken(workshop: Workshop, fitted: Fitted) -> FloatArray:
+def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """In phase by the square of frequency, lagging by its cube; shape (m, 2), or (m, 0) without orders.
 
     The second is odd in the direction, as a lag is.
     """
-    motion = workshop.evidence.full.motion
+    motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
-    waves = [each for each in fitted.theory.effects if isinstance(each, OrderSeries) and each.orders]
+    waves = [each for each in fitted.hypothesis.effects if isinstance(each, OrderSeries) and each.orders]
     if speed is None or not waves:
-        return np.empty((len(workshop.index), 0))
+        return np.empty((len(estimator.index), 0))
     rate = RAD_PER_DEG * speed / _RATE
     columns = np.zeros((len(motion), 2))
     for series in waves:
@@ -78,14 +78,14 @@ def _shaken(workshop: Workshop, fitted: Fitted) -> FloatArray:
             frequency = each.order * turns * rate
             columns[:, 0] += each.amplitude_arcsec * frequency**2 * np.cos(at)
             columns[:, 1] += each.amplitude_arcsec * frequency**3 * np.sin(at)
-    return workshop.at_points(columns)
+    return estimator.at_points(columns)
 
 
-def _speeds_differ(workshop: Workshop) -> bool:
-    speed = workshop.motion.motor_speed_deg_s
+def _speeds_differ(estimator: Estimator) -> bool:
+    speed = estimator.motion.motor_speed_deg_s
     if speed is None:
         return False
-    squared = speed[workshop.index] ** 2
+    squared = speed[estimator.index] ** 2
     squared = squared[squared > 0.0]
     if not len(squared):
         return False

@@ -23,7 +23,7 @@ PLAIN: Final = 25.0
 SMALL_ARCSEC: Final = 0.5
 CAP = 0.6
 STRONG = 2.5
-"""Evidence beyond twelve times the needed says that something is there, not what it is."""
+"""Observed beyond twelve times the needed says that something is there, not what it is."""
 MOST_EXCESS = 1.5
 """Beyond this, what counts is how much is left in addition to a finding and not how quiet the record is."""
 COEFFICIENTS: Final = {
@@ -58,7 +58,7 @@ class Signs:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class Context:
     """What speaks against all findings of a record."""
 
     left_arcsec: float
@@ -70,7 +70,7 @@ class Beside:
     unexplained: bool
 
 
-def features(finding: Finding, all_of_them: Sequence[Finding], beside: Beside) -> dict[str, float]:
+def features(finding: Finding, all_of_them: Sequence[Finding], context: Context) -> dict[str, float]:
     """The terms of the formula, by their names."""
     signs = finding.signs or Signs(finding.robust, PLAIN, 0.0, 1.0, within=True)
     largest = max(each.robust for each in all_of_them)
@@ -79,18 +79,18 @@ def features(finding: Finding, all_of_them: Sequence[Finding], beside: Beside) -
         "strength": min(math.log(max(signs.robust, 1e-9) / signs.needed), STRONG),
         "ahead": 0.0 if signs.within else min(max(signs.ahead, 0.0), CAP),
         "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
-        "size": math.log(max(finding.peak_arcsec, 1e-3) / max(SMALL_ARCSEC, beside.left_arcsec)),
-        "excess": min(math.log(max(beside.excess, 1.0)), MOST_EXCESS),
-        "free_loop": float(beside.free_loop),
-        "unexplained": float(beside.unexplained),
+        "size": math.log(max(finding.peak_arcsec, 1e-3) / max(SMALL_ARCSEC, context.left_arcsec)),
+        "excess": min(math.log(max(context.excess, 1.0)), MOST_EXCESS),
+        "free_loop": float(context.free_loop),
+        "unexplained": float(context.unexplained),
         "not_recovered": float(signs.recovered <= 0.0),
         "within": float(signs.within),
     }
 
 
-def weighed(findings: Sequence[Finding], beside: Beside) -> list[Finding]:
+def weighed(findings: Sequence[Finding], context: Context) -> list[Finding]:
     """The findings with the probability that each (or one of its aliases) is there."""
-    terms = [features(each, findings, beside) for each in findings]
+    terms = [features(each, findings, context) for each in findings]
     return [
         replace(each, probability=_logistic(own), terms=own)
         for each, own in zip(findings, terms, strict=True)

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import AmplitudeDrift, Channel, FloatArray, RateDependence, Synchronous
 from hdbridge.effects.base import Effect
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import coefficients_of
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 REACH_K = 30.0
 """A model was measured at a temperature that is at most so far away from those of the record."""
@@ -24,24 +24,24 @@ SAME = 10.0
 """Chi square that another temperature may cost: what a fit leaves that has not quite converged."""
 
 
-def as_calibrated(workshop: Workshop, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
+def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
     """The drift of amplitudes, counted from the temperature at which they are the ``given`` model's.
 
     As it was, where there is no such temperature near those of the record.
     """
-    temperature = workshop.motion.measured.get(Channel.TEMPERATURE)
+    temperature = estimator.motion.measured.get(Channel.TEMPERATURE)
     if temperature is None:
         return fitted
     coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K
-    for place, effect in enumerate(fitted.theory.effects[len(given) :], len(given)):
+    for place, effect in enumerate(fitted.hypothesis.effects[len(given) :], len(given)):
         if not isinstance(effect, AmplitudeDrift) or effect.driven_by != "temperature":
             continue
-        told = _nearest(effect, fitted.theory.effects[: len(given)], given)
+        told = _nearest(effect, fitted.hypothesis.effects[: len(given)], given)
         if told is None or not coldest <= told.reference_c <= hottest:
             continue
-        effects = tuple(told.beside(each) for each in fitted.theory.effects)
-        trial = workshop.fit(replace(fitted.theory, effects=effects))
-        if trial.chi_square < fitted.chi_square + SAME and not trial.theory.effects[place].violations():
+        effects = tuple(told.counted(each) for each in fitted.hypothesis.effects)
+        trial = estimator.fit(replace(fitted.hypothesis, effects=effects))
+        if trial.chi_square < fitted.chi_square + SAME and not trial.hypothesis.effects[place].violations():
             return trial
     return fitted
 
@@ -59,7 +59,7 @@ class _Told:
     per_loop: float
     """A share of the former ripple, or loop, as a share of this one."""
 
-    def beside(self, effect: Effect) -> Effect:
+    def counted(self, effect: Effect) -> Effect:
         """An effect of the model, or one that is told as a share of it."""
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)

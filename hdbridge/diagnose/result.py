@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.evidence import means
 from hdbridge.diagnose.probability import Signs
-from hdbridge.diagnose.seeing import seen_over
+from hdbridge.diagnose.residual_views import shares_by_coordinate
 from hdbridge.effects import Effect, FloatArray, Motion, Start
-from hdbridge.identify.gain import Gain
+from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.observed import means
 from hdbridge.model import TransmissionModel
 
 SCHEMA = "hdbridge.diagnosis/1"
@@ -222,7 +222,7 @@ class Diagnosis:
             },
             "remarks": list(self.remarks),
             "considered": list(self.considered),
-            "seen_over": seen_over(self),
+            "seen_over": shares_by_coordinate(self),
         }
 
     def verdict(self) -> str:

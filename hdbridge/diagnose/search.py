@@ -1,7 +1,7 @@
 """The search for causes: screen everything, fit the best few with everything, take the best, look again.
 
 Penalty per parameter and to enter as in `PENALTY`, `ENTER`; the elastic law is chosen again after each of
-the first picks. What was picked is looked at again in `afterthought.py`.
+the first picks. What was picked is looked at again in `backward.py`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from hdbridge.diagnose import seek
-from hdbridge.diagnose.candidates import Candidate, candidates
-from hdbridge.diagnose.gates import all_steps_seen, gate, standing_s
-from hdbridge.diagnose.screen import Score, Screen, score_of
-from hdbridge.diagnose.theory import LOOPS, Fitted, Theory, Workshop
+from hdbridge.diagnose import matched_filters
+from hdbridge.diagnose.acceptance import all_steps_seen, gate, standing_s
+from hdbridge.diagnose.candidates import candidates
 from hdbridge.effects import (
     AmplitudeDrift,
     Channel,
@@ -32,6 +30,8 @@ from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.local_defect import LocalDefect
 from hdbridge.effects.orders import OrderSeries
+from hdbridge.estimation.hypothesis import LOOPS, Estimator, Fitted, Hypothesis
+from hdbridge.estimation.screening import Candidate, Score, Screen, score_of
 
 PENALTY = 11.5
 """Chi square that each parameter has to earn."""
@@ -88,16 +88,16 @@ class Trail:
 
     fitted: Fitted
     base: int
-    """How many of the theory's effects are the baseline's."""
+    """How many of the hypothesis's effects are the baseline's."""
     law_gain: float
     """Chi square by which the chosen elastic law is better than the other; 0 without one."""
 
 
 class Search:
-    """One search on one workshop."""
+    """One search on one estimator."""
 
-    def __init__(self, workshop: Workshop, base: Sequence[Effect]) -> None:
-        self.workshop = workshop
+    def __init__(self, estimator: Estimator, base: Sequence[Effect]) -> None:
+        self.estimator = estimator
         self.base = len(base)
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
@@ -105,25 +105,25 @@ class Search:
         self._left_out: str | None = None
         law = next((each for each in self._base if isinstance(each, LOOPS)), None)
         if law is not None:
-            workshop.loop_sign = -1.0 if law.offset_arcsec < 0.0 else 1.0
+            estimator.loop_sign = -1.0 if law.offset_arcsec < 0.0 else 1.0
             self._choose_sign()
 
     def _choose_sign(self) -> None:
         """Let the load lag where the model has it lead, or the other way round, where that explains more than
         a loop of the model's sign with the best cause added to it (play lags, too).
         """
-        if self.workshop.evidence.reversals < 2:
+        if self.estimator.data.reversals < 2:
             return
         known = self._begin()
-        if any(isinstance(each, LOOPS) and each.offset_arcsec for each in known.theory.effects):
+        if any(isinstance(each, LOOPS) and each.offset_arcsec for each in known.hypothesis.effects):
             return  # not held at zero: it has the model's sign
-        self.workshop.loop_sign *= -1.0
+        self.estimator.loop_sign *= -1.0
         other = self._begin()
-        self.workshop.loop_sign *= -1.0
+        self.estimator.loop_sign *= -1.0
         rival = self.best_addition(known) or known
         self.forget()
         if cost(other) + ENTER < cost(rival):
-            self.workshop.loop_sign *= -1.0
+            self.estimator.loop_sign *= -1.0
 
     def run(self) -> Trail:
         """Find causes, best first; where much is left, again without the cause that was best at first.
@@ -131,11 +131,11 @@ class Search:
         The best of one cause may be one that does a little of the work of each of two.
         """
         trail = self._greedily()
-        names = [each.name for each in trail.fitted.theory.effects[self.base :]]
+        names = [each.name for each in trail.fitted.hypothesis.effects[self.base :]]
         if not names or trail.fitted.chi_square < AGAIN * len(trail.fitted.residual):
             return trail
-        nuisance = self.workshop.nuisance
-        self.workshop.nuisance = nuisance[:, :0]
+        nuisance = self.estimator.nuisance
+        self.estimator.nuisance = nuisance[:, :0]
         self._left_out = names[0]
         self.forget()
         other = self._greedily()
@@ -143,7 +143,7 @@ class Search:
         self.forget()
         if cost(other.fitted) + ENTER < cost(trail.fitted):
             return other
-        self.workshop.nuisance = nuisance
+        self.estimator.nuisance = nuisance
         return trail
 
     def _greedily(self) -> Trail:
@@ -155,7 +155,7 @@ class Search:
                 pair = self._best_pair(fitted)
                 if pair is not None and cost(pair) < PAIR_SHARE * cost(rival):
                     found = pair
-            if number < 3 and not self.workshop.nuisance.shape[1]:
+            if number < 3 and not self.estimator.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
                     fitted, law_gain = self.with_best_law(loose)
@@ -172,31 +172,31 @@ class Search:
         return Trail(fitted, self.base, law_gain)
 
     def _begin(self) -> Fitted:
-        fits = [self.workshop.fit(Theory(self._base, start)) for start in Start]
+        fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
     def with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
         """The article's law or the one with return-point memory, whichever fits better with all the rest."""
-        for place, effect in enumerate(fitted.theory.effects[: self.base]):
+        for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
             if isinstance(effect, Hysteresis | HysteresisMemory):
                 other = HysteresisMemory if isinstance(effect, Hysteresis) else Hysteresis
                 law = other(**effect.parameters())
-                rival = self.workshop.fit(fitted.theory.instead(place, law))
+                rival = self.estimator.fit(fitted.hypothesis.instead(place, law))
                 gain = rival.chi_square - fitted.chi_square
                 return (fitted, gain) if gain >= 0.0 else (rival, -gain)
         return fitted, 0.0
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
         """With a hysteresis of any shape added to the law, where that does more than the best cause."""
-        self.workshop.nuisance = self.workshop.free_loop(fitted.theory.start)
-        loose = self.workshop.fit(fitted.theory)
+        self.estimator.nuisance = self.estimator.free_loop(fitted.hypothesis.start)
+        loose = self.estimator.fit(fitted.hypothesis)
         added = loose.free() - fitted.free()
         gain = fitted.chi_square - loose.chi_square - PENALTY * added - ENTER
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
-        size = np.sqrt(max(gain, 0.0) / float(np.sum(self.workshop.weight**2)))
+        size = np.sqrt(max(gain, 0.0) / float(np.sum(self.estimator.weight**2)))
         if gain > rival and size > FREE_LOOP_ARCSEC:
             return loose
-        self.workshop.nuisance = self.workshop.nuisance[:, :0]
+        self.estimator.nuisance = self.estimator.nuisance[:, :0]
         return None
 
     # --- one more cause
@@ -209,7 +209,7 @@ class Search:
         """With the best cause more, refitted; None where none earns its keep."""
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
-            trial = self.workshop.fit(joined(fitted.theory, score.candidate.effect, self.base))
+            trial = self.estimator.fit(joined(fitted.hypothesis, score.candidate.effect, self.base))
             if isinstance(score.candidate.effect, AmplitudeDrift):
                 trial = self._at_home(trial)
             added = trial.free() - fitted.free()
@@ -226,7 +226,7 @@ class Search:
 
     def _best_pair(self, fitted: Fitted) -> Fitted | None:
         """With two causes more that grow with speed, each of which may hide the other."""
-        present = {each.name for each in fitted.theory.effects} | {self._left_out}
+        present = {each.name for each in fitted.hypothesis.effects} | {self._left_out}
         best: dict[str, Score] = {}
         for each in self._screen(fitted).scores(fitted):
             cause = each.candidate.cause
@@ -235,7 +235,7 @@ class Search:
         pairs = []
         for one, other in combinations(sorted(best), 2):
             two = (best[one].candidate, best[other].candidate)
-            trial = self.workshop.fit(fitted.theory.plus(two[0].effect).plus(two[1].effect))
+            trial = self.estimator.fit(fitted.hypothesis.plus(two[0].effect).plus(two[1].effect))
             if cost(fitted) - cost(trial) > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
                 pairs.append(trial)
         return min(pairs, key=cost, default=None)
@@ -245,29 +245,29 @@ class Search:
 
         At a reference that is far away the line may have no amplitude left of which to tell a share.
         """
-        place = next(i for i, each in enumerate(trial.theory.effects) if isinstance(each, AmplitudeDrift))
-        temperature = self.workshop.motion.measured.get(Channel.TEMPERATURE)
-        effect = trial.theory.effects[place]
+        place = next(i for i, each in enumerate(trial.hypothesis.effects) if isinstance(each, AmplitudeDrift))
+        temperature = self.estimator.motion.measured.get(Channel.TEMPERATURE)
+        effect = trial.hypothesis.effects[place]
         if not effect.violations() or temperature is None:
             return trial
         for reference in (float(np.max(temperature)), float(np.min(temperature))):
             other = effect.model_copy(update={"reference_c": round(reference, 1)})
-            again = self.workshop.fit(trial.theory.instead(place, other))
-            if not again.theory.effects[place].violations():
+            again = self.estimator.fit(trial.hypothesis.instead(place, other))
+            if not again.hypothesis.effects[place].violations():
                 return again
         return trial
 
     def _travel_turns(self) -> float:
         """Turns of the load that the record covers without a cut."""
-        return self.workshop.evidence.travel_deg / 360.0 / self.workshop.evidence.ratio
+        return self.estimator.data.travel_deg / 360.0 / self.estimator.data.ratio
 
     def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
         """Whether what was added is large enough, physical, and really seen."""
         place = next(
-            i for i in range(len(trial.theory.effects) - 1, -1, -1)
-            if trial.theory.effects[i].name == candidate.cause
+            i for i in range(len(trial.hypothesis.effects) - 1, -1, -1)
+            if trial.hypothesis.effects[i].name == candidate.cause
         )  # fmt: skip
-        effect = trial.theory.effects[place]
+        effect = trial.hypothesis.effects[place]
         if not self._makes_sense(effect):
             return False
         peak = self.peak(trial, place)
@@ -282,9 +282,9 @@ class Search:
             return True
         # What is over at once, or seen only where the axis reverses, is another cause's, which would not
         # be found with it in the fit.
-        if not gate(self.workshop, trial, place).passed:
+        if not gate(self.estimator, trial, place).passed:
             return False
-        return isinstance(effect, Creep) or all_steps_seen(self.workshop, trial, place)
+        return isinstance(effect, Creep) or all_steps_seen(self.estimator, trial, place)
 
     def _makes_sense(self, effect: Effect) -> bool:
         """Whether an effect is physical, and this record one in which it can be seen."""
@@ -295,24 +295,24 @@ class Search:
         if isinstance(effect, ChannelSkew):
             return _late(effect)
         if isinstance(effect, LocalDefect):
-            return seek.is_met(effect, self.workshop)
+            return matched_filters.is_met(effect, self.estimator)
         if isinstance(effect, CountLoss):
             # Nowhere twice: a step in time may as well be one at a place.
-            return self.workshop.evidence.reversals >= 2
+            return self.estimator.data.reversals >= 2
         if isinstance(effect, Creep):
-            rest_s = float(np.max(standing_s(self.workshop)))
+            rest_s = float(np.max(standing_s(self.estimator)))
             return min(each.tau_s for each in effect.parts) <= RESTS * rest_s
         return True
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
-        values = self.workshop.does(fitted.theory.effects[place], fitted.theory.start)
+        values = self.estimator.does(fitted.hypothesis.effects[place], fitted.hypothesis.start)
         low, high = np.quantile(values, [0.002, 0.998])
         return 0.5 * float(high - low)
 
     def _shortlist(self, fitted: Fitted, most: int = BEST) -> list[Score]:
         """The best candidate of each of the best causes."""
-        present = {each.name for each in fitted.theory.effects[self.base :]} - REPEATED
+        present = {each.name for each in fitted.hypothesis.effects[self.base :]} - REPEATED
         scores = [
             each
             for each in self._scores(fitted)
@@ -332,28 +332,33 @@ class Search:
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)
         scores = screen.scores(fitted)
-        residual, load_deg = seek.fast_residual(self.workshop, fitted)
-        seek.with_load_angle(self.workshop, load_deg)
+        residual, load_deg = matched_filters.fast_residual(self.estimator, fitted)
+        matched_filters.with_load_angle(self.estimator, load_deg)
         for candidate in self._sought(fitted, residual, load_deg):
-            columns = self.workshop.weighted(self.workshop.columns(candidate.effect, fitted.theory.start))
+            columns = self.estimator.weighted(
+                self.estimator.columns(candidate.effect, fitted.hypothesis.start)
+            )
             scores.append(score_of(candidate, columns, fitted))
         return scores
 
     def _sought(self, fitted: Fitted, residual: FloatArray, load_deg: FloatArray) -> list[Candidate]:
-        found = [seek.count_loss(self.workshop, fitted), seek.local_defect(self.workshop, fitted)]
+        found = [
+            matched_filters.count_loss(self.estimator, fitted),
+            matched_filters.local_defect(self.estimator, fitted),
+        ]
         return [
             *(each for each in found if each is not None),
-            *seek.vibrations(self.workshop, residual, fitted.theory.effects),
-            *seek.interpolation_errors(self.workshop, residual, load_deg),
+            *matched_filters.vibrations(self.estimator, residual, fitted.hypothesis.effects),
+            *matched_filters.interpolation_errors(self.estimator, residual, load_deg),
         ]
 
     def _screen(self, fitted: Fitted) -> Screen:
-        base = fitted.theory.effects[: self.base]
-        key = (fitted.theory.start, tuple(type(each) for each in base))
+        base = fitted.hypothesis.effects[: self.base]
+        key = (fitted.hypothesis.start, tuple(type(each) for each in base))
         if key not in self._screens:
-            offered = candidates(self.workshop.evidence, base)
+            offered = candidates(self.estimator.data, base)
             self._screens.clear()
-            self._screens[key] = Screen(self.workshop, offered, fitted.theory.start)
+            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start)
         return self._screens[key]
 
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
@@ -362,7 +367,7 @@ class Search:
         result = []
         for score in self._shortlist(without, BEST + 1):
             if score.candidate.cause != cause:
-                trial = self.workshop.fit(joined(without.theory, score.candidate.effect, self.base))
+                trial = self.estimator.fit(joined(without.hypothesis, score.candidate.effect, self.base))
                 if self._counts(trial, score.candidate):
                     result.append((score.candidate.cause, trial))
         return sorted(result, key=lambda each: each[1].chi_square)
@@ -373,10 +378,10 @@ def cost(fitted: Fitted) -> float:
     return fitted.chi_square + PENALTY * fitted.free()
 
 
-def joined(theory: Theory, effect: Effect, base: int) -> Theory:
-    """A theory with one more effect; orders and steps go into the finding of the same name."""
-    for place in range(base, len(theory.effects)):
-        present = theory.effects[place]
+def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
+    """A hypothesis with one more effect; orders and steps go into the finding of the same name."""
+    for place in range(base, len(hypothesis.effects)):
+        present = hypothesis.effects[place]
         if (
             isinstance(present, OrderSeries)
             and isinstance(effect, OrderSeries)
@@ -384,15 +389,15 @@ def joined(theory: Theory, effect: Effect, base: int) -> Theory:
         ):
             new = [each for each in effect.orders if each.order not in {o.order for o in present.orders}]
             orders = tuple(sorted((*present.orders, *new), key=lambda each: each.order))
-            return theory.instead(place, present.model_copy(update={"orders": orders}))
+            return hypothesis.instead(place, present.model_copy(update={"orders": orders}))
         if isinstance(present, CountLoss) and isinstance(effect, CountLoss):
             steps = tuple(sorted((*present.steps, *effect.steps), key=lambda each: each.time_s))
-            return theory.instead(place, present.model_copy(update={"steps": steps}))
+            return hypothesis.instead(place, present.model_copy(update={"steps": steps}))
         if isinstance(present, Creep) and isinstance(effect, Creep):
-            return theory.instead(
+            return hypothesis.instead(
                 place, present.model_copy(update={"parts": (*present.parts, *effect.parts)})
             )
-    return theory.plus(effect)
+    return hypothesis.plus(effect)
 
 
 def _stiffens(effect: Compliance) -> bool:

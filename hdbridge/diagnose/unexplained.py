@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.gates import since_reversal
+from hdbridge.diagnose.acceptance import since_reversal
 from hdbridge.diagnose.holdout import stretches
 from hdbridge.diagnose.result import Finding
 from hdbridge.diagnose.search import REPEATED
-from hdbridge.diagnose.theory import Fitted, Workshop
 from hdbridge.effects import FloatArray
 from hdbridge.effects.kinematics import direction_of
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.units import DEG_PER_TURN
 
 LEFT_ARCSEC = 0.5
@@ -64,24 +64,24 @@ class Rest:
     """Of each rival: held-out share of the rest's variance."""
 
 
-def rest(workshop: Workshop, fitted: Fitted) -> Rest:
+def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     """Look at a residual."""
-    residual = fitted.residual / workshop.weight
-    arcsec = beyond_noise(workshop, residual)
+    residual = fitted.residual / estimator.weight
+    arcsec = beyond_noise(estimator, residual)
     best = ("", 0.0, np.empty(0), np.empty(0))
     shares: dict[str, float] = {}
-    odd = stretches(workshop) % 2 == 1
-    smooth = _smoothed(workshop, residual)
+    odd = stretches(estimator) % 2 == 1
+    smooth = _smoothed(estimator, residual)
     variance = float(np.mean(smooth**2)) + 1e-12
-    for name, number, places in _coordinates(workshop):
+    for name, number, places in _coordinates(estimator):
         gain, curve = _gain(smooth, number, odd, len(places))
         shares[name] = max(gain / variance, 0.0)
         if gain > best[1]:
             best = (name, gain, places, curve)
     return Rest(
         arcsec,
-        float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / workshop.weight**2)), 0.0))),
-        _standing(workshop, residual),
+        float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
+        _standing(estimator, residual),
         best[0] or "time",
         float(np.sqrt(best[1])),
         best[2],
@@ -90,18 +90,18 @@ def rest(workshop: Workshop, fitted: Fitted) -> Rest:
     )
 
 
-def is_unexplained(workshop: Workshop, left: Rest) -> bool:
+def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     """Whether more is left than nobody need explain."""
-    evidence = workshop.evidence
+    data = estimator.data
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
     # that.
-    counts = evidence.motor_count_arcsec / np.sqrt(12.0)
-    limit = float(np.hypot(LEFT_ARCSEC, 0.0 if evidence.commanded else counts))
+    counts = data.motor_count_arcsec / np.sqrt(12.0)
+    limit = float(np.hypot(LEFT_ARCSEC, 0.0 if data.commanded else counts))
     if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
         return True
     # Where command and standstill distinguish noise and following error from the gear, fast things count.
-    if evidence.commanded and evidence.standstill:
-        floor = float(np.sqrt(np.mean(1.0 / workshop.weight**2)))
+    if data.commanded and data.standstill:
+        floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
         if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
             return True
     return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
@@ -142,32 +142,32 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
     return [each for each in findings if each not in doubtful], words
 
 
-def elsewhere(workshop: Workshop, residual: FloatArray) -> NDArray[np.bool_]:
+def elsewhere(estimator: Estimator, residual: FloatArray) -> NDArray[np.bool_]:
     """The points outside the tenth of the record's stretches in which most is left, shape (m,).
 
     What is left in one episode, say in small swings of a motor that sticks where it turns, casts no
     shadow on what is seen everywhere else. Without reversals an episode is a place, and all points count.
     """
-    if workshop.evidence.reversals < 2:
+    if estimator.data.reversals < 2:
         return np.ones(len(residual), dtype=np.bool_)
     number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
-    left = np.bincount(number, residual**2 * workshop.weight**2)
+    left = np.bincount(number, residual**2 * estimator.weight**2)
     return np.asarray(~np.isin(number, np.argsort(left)[-EPISODES // 10 :]))
 
 
-def acts(workshop: Workshop, fitted: Fitted, place: int) -> NDArray[np.bool_]:
+def acts(estimator: Estimator, fitted: Fitted, place: int) -> NDArray[np.bool_]:
     """The points at which an effect is a good part of what it can be, shape (m,)."""
-    effect = fitted.theory.effects[place]
-    values = workshop.columns(effect, fitted.theory.start) @ effect.coefficients()
+    effect = fitted.hypothesis.effects[place]
+    values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
     values = np.abs(values - np.median(values))
     return np.asarray(values > ACTS * float(np.quantile(values, 0.998)))
 
 
 def beyond_noise(
-    workshop: Workshop, residual: FloatArray, rows: NDArray[np.bool_] | slice = slice(None)
+    estimator: Estimator, residual: FloatArray, rows: NDArray[np.bool_] | slice = slice(None)
 ) -> float:
     """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
-    time_s, residual, weight = workshop.time_s[rows], residual[rows], workshop.weight[rows]
+    time_s, residual, weight = estimator.time_s[rows], residual[rows], estimator.weight[rows]
     number = np.floor((time_s - time_s[0]) / BLOCK_S).astype(np.intp)
     number = np.unique(number, return_inverse=True)[1]
     count = np.bincount(number)
@@ -176,25 +176,25 @@ def beyond_noise(
     return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
 
 
-def _standing(workshop: Workshop, residual: FloatArray) -> float:
+def _standing(estimator: Estimator, residual: FloatArray) -> float:
     """What moves from one short block to the next while the axis rests: no physics, but noise that
     wanders.
     """
-    speed = workshop.motion.motor_speed_deg_s
+    speed = estimator.motion.motor_speed_deg_s
     if speed is None:
         return 0.0
-    still = (speed == 0.0)[workshop.index]
+    still = (speed == 0.0)[estimator.index]
     if np.count_nonzero(still) < 50:
         return 0.0
-    number = np.floor((workshop.time_s[still] - workshop.time_s[0]) / BLOCK_S).astype(np.intp)
+    number = np.floor((estimator.time_s[still] - estimator.time_s[0]) / BLOCK_S).astype(np.intp)
     names, number = np.unique(number, return_inverse=True)
     mean = np.bincount(number, residual[still]) / np.bincount(number)
     step = np.diff(mean)[np.diff(names) == 1]
     return float(np.median(np.abs(step))) * 1.05 if len(step) else 0.0
 
 
-def _smoothed(workshop: Workshop, residual: FloatArray) -> FloatArray:
-    period = workshop.evidence.period_s * len(workshop.evidence.full) / len(workshop.evidence.points)
+def _smoothed(estimator: Estimator, residual: FloatArray) -> FloatArray:
+    period = estimator.data.period_s * len(estimator.data.full) / len(estimator.data.points)
     return np.asarray(uniform_filter1d(residual, max(1, round(0.1 / period))))
 
 
@@ -214,11 +214,11 @@ def _gain(
     return (before - after) / len(values), np.asarray(curve)
 
 
-def _coordinates(workshop: Workshop) -> Iterator[tuple[str, NDArray[np.intp], FloatArray]]:
+def _coordinates(estimator: Estimator) -> Iterator[tuple[str, NDArray[np.intp], FloatArray]]:
     """Name, bin of each point, and the middle of each bin."""
-    motion, index = workshop.motion, workshop.index
+    motion, index = estimator.motion, estimator.index
     motor = motion.motor_deg[index]
-    load = motor / workshop.evidence.ratio
+    load = motor / estimator.data.ratio
     direction = direction_of(motion)[index]
     back = (direction < 0).astype(np.intp)
     for name, angle, bins in (
@@ -231,7 +231,7 @@ def _coordinates(workshop: Workshop) -> Iterator[tuple[str, NDArray[np.intp], Fl
         yield f"{name} and direction", number + bins * back, np.tile(middle, 2)
     if float(np.ptp(load)) > 0.0:
         yield "position", *_ranged(load, 400)
-    yield "time", *_ranged(workshop.time_s, 200, alternate=True)
+    yield "time", *_ranged(estimator.time_s, 200, alternate=True)
     since = since_reversal(motion.motor_deg)[index]
     number, middle = _ranged(np.log10(since + 0.05), 40)
     angles = np.asarray(np.power(10.0, middle) - 0.05, dtype=np.float64)
@@ -239,7 +239,7 @@ def _coordinates(workshop: Workshop) -> Iterator[tuple[str, NDArray[np.intp], Fl
     speed = motion.motor_speed_deg_s
     if speed is not None:
         yield ("speed", *_quantiles(speed[index], 40))
-        yield "time since the last stop or start", *_ranged(np.log10(_since_change(workshop) + 0.02), 40)
+        yield "time since the last stop or start", *_ranged(np.log10(_since_change(estimator) + 0.02), 40)
     if motion.motor_acceleration_deg_s2 is not None:
         yield "acceleration", *_quantiles(motion.motor_acceleration_deg_s2[index], 40)
     for channel, values in motion.measured.items():
@@ -264,10 +264,10 @@ def _quantiles(values: FloatArray, bins: int) -> tuple[NDArray[np.intp], FloatAr
     return number.astype(np.intp), np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
 
-def _since_change(workshop: Workshop) -> FloatArray:
-    motion = workshop.motion
+def _since_change(estimator: Estimator) -> FloatArray:
+    motion = estimator.motion
     assert motion.motor_speed_deg_s is not None
     assert motion.time_s is not None
     change = np.flatnonzero(np.diff(np.sign(motion.motor_speed_deg_s), prepend=np.nan) != 0.0)
     last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
-    return np.asarray((motion.time_s - motion.time_s[last])[workshop.index])
+    return np.asarray((motion.time_s - motion.time_s[last])[estimator.index])

@@ -4,36 +4,36 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hdbridge.diagnose.theory import LOOPS, Theory, Workshop
 from hdbridge.effects import Effect, Start
 from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.estimation.hypothesis import LOOPS, Estimator, Hypothesis
 
 WIDTHS_DEG = (3.0, 20.0, 60.0)
 MOST = 0.5
 """Share of the squares that the model leaves; a loop that makes up more is most of what is wrong."""
 
 
-def unfitted(workshop: Workshop, effects: tuple[Effect, ...]) -> str:
+def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     """In words, where the model lacks a loop and one makes up most of what it leaves; else empty.
 
     What else is wrong shows only with the loop in the fit, so nothing that is named without it means much.
     """
-    if workshop.evidence.reversals < 2 or any(isinstance(each, LOOPS) for each in effects):
+    if estimator.data.reversals < 2 or any(isinstance(each, LOOPS) for each in effects):
         return ""
-    sign, workshop.loop_sign = workshop.loop_sign, 0.0  # it may lead or lag
-    plain = workshop.fit(Theory(effects))
+    sign, estimator.loop_sign = estimator.loop_sign, 0.0  # it may lead or lag
+    plain = estimator.fit(Hypothesis(effects))
     loops = [Hysteresis(offset_arcsec=1.0, width_deg=each, exponent=1.6) for each in WIDTHS_DEG]
     fits = [
-        workshop.fit(replace(plain.theory, start=start).plus(loop))
+        estimator.fit(replace(plain.hypothesis, start=start).plus(loop))
         for loop in loops
         for start in (Start.FORWARD, Start.BACKWARD)
     ]
-    workshop.loop_sign = sign
+    estimator.loop_sign = sign
     best = min(fits, key=lambda each: each.chi_square)
     share = 1.0 - best.chi_square / max(plain.chi_square, 1e-300)
     if share < MOST:
         return ""
-    offset = best.theory.effects[-1].bound_arcsec()
+    offset = best.hypothesis.effects[-1].bound_arcsec()
     return (
         f"the model has no elastic loop, and one of {offset:.3g} arcsec to either side makes up "
         f"{100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), then "

@@ -8,18 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Synchronous
-from hdbridge.identify.beside import DELAY, TEXTS, UNITS, delay_column
-from hdbridge.identify.design import Design
+from hdbridge.estimation.design import Design
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
+from hdbridge.estimation.samples import KINDS, Samples
+from hdbridge.estimation.separable import Solution, is_valid
 from hdbridge.identify.figures import laps_arcsec, standing
 from hdbridge.identify.holdout import held_out
 from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths
-from hdbridge.identify.joint import Solution, is_valid
-from hdbridge.identify.linear import solve_symmetric
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, threshold
 from hdbridge.identify.residuals import residual_tests
 from hdbridge.identify.result import ChosenOrder, FitResult, NoiseFigures, Nuisance, Outliers, Traces
-from hdbridge.identify.samples import KINDS, Samples
 from hdbridge.identify.spectrum import Curve, Spectrum, assemble, plain_spectrum
 from hdbridge.identify.state import State, System
 from hdbridge.model import TransmissionModel
@@ -48,7 +48,7 @@ def conclude(
     ]
     effects = tuple(each for each in solution.effects if is_valid(each))
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
-    inside = _inside_variance(design, solution, problem.beside.columns @ solution.beside)
+    inside = _inside_variance(design, solution, problem.nuisances.columns @ solution.nuisances)
     samples_used = float(np.sum(blocks.count))
     fitted_rms = math.sqrt(float(blocks.count @ solution.residual**2) / samples_used + inside)
     # Samples were put right by the delay, which no model holds.
@@ -117,10 +117,10 @@ def _traces(design: Design, solution: Solution, zeros: Sequence[float], left_arc
     )
 
 
-def _inside_variance(design: Design, solution: Solution, beside: FloatArray) -> float:
+def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) -> float:
     """Variance of the residual of samples about the mean of their block."""
     blocks = design.blocks
-    residual = design.residual(solution.effects, beside)[blocks.index]
+    residual = design.residual(solution.effects, nuisances)[blocks.index]
     sizes = np.diff(np.append(blocks.first, len(blocks.index)))
     mean = np.add.reduceat(blocks.weight * residual, blocks.first) / np.maximum(blocks.count, 1.0)
     off = residual - np.repeat(mean, sizes)
@@ -201,7 +201,7 @@ def _further(solution: Solution, cov: FloatArray) -> dict[str, tuple[float, floa
     places = [at for at, each in enumerate(solution.columns) if each.effect < 0]
     return {
         solution.columns[at].name: (value, NORMAL_95 * math.sqrt(max(float(cov[at, at]), 0.0)))
-        for at, value in zip(places, solution.beside.tolist(), strict=True)
+        for at, value in zip(places, solution.nuisances.tolist(), strict=True)
     }
 
 

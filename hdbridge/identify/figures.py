@@ -9,10 +9,10 @@ from scipy.ndimage import median_filter
 
 from hdbridge.effects import FloatArray
 from hdbridge.effects.hysteresis import branches
-from hdbridge.identify.blocks import REST_DEG_S
+from hdbridge.estimation.blocks import REST_DEG_S
+from hdbridge.estimation.samples import KINDS, SLOW, Samples
+from hdbridge.estimation.segment import Kind
 from hdbridge.identify.result import Outliers, Standing
-from hdbridge.identify.samples import KINDS, SLOW, Samples
-from hdbridge.identify.segment import Kind
 from hdbridge.units import ARCSEC_PER_DEG
 
 SHORTEST_REST_S = 1.0

@@ -9,7 +9,10 @@ import numpy as np
 
 from hdbridge.effects import Channel, Effect, FloatArray, Start
 from hdbridge.errors import InputError
-from hdbridge.identify.beside import (
+from hdbridge.estimation.blocks import make_blocks
+from hdbridge.estimation.design import Design, harmonics
+from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
+from hdbridge.estimation.nuisances import (
     DELAY,
     ROUNDING,
     SHARE,
@@ -21,18 +24,15 @@ from hdbridge.identify.beside import (
     speeds_differ,
     zeros,
 )
-from hdbridge.identify.blocks import make_blocks
+from hdbridge.estimation.samples import Samples, gather
+from hdbridge.estimation.segment import Segment
+from hdbridge.estimation.separable import Problem, Solution, is_valid, joint_fit, search
 from hdbridge.identify.conclude import conclude
-from hdbridge.identify.design import Design, harmonics
 from hdbridge.identify.figures import outlying
 from hdbridge.identify.intervals import covariance, effect_intervals
-from hdbridge.identify.joint import Problem, Solution, is_valid, joint_fit, search
-from hdbridge.identify.noise import NoiseModel, Precision, fit_noise
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Selection
 from hdbridge.identify.result import FitResult, Outliers
-from hdbridge.identify.samples import Samples, gather
-from hdbridge.identify.segment import Segment
 from hdbridge.identify.state import State, System, candidate_orders, turns_covered
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -137,7 +137,7 @@ def _search(state: State, warnings: list[str]) -> State:
     thin, picked = state.design.thinned(SEARCH_BLOCKS, NEAR_DEG)
     waves = [f"{each} {part}" for each in state.candidates for part in ("cosine", "sine")]
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
-    columns = simple.beside().and_waves(state.waves, waves)
+    columns = simple.nuisance_columns().and_waves(state.waves, waves)
 
     def found(design: Design, effects: tuple[Effect, ...]) -> tuple[float, tuple[Effect, ...]]:
         problem = Problem(design, effects, columns.rows(picked))
@@ -171,10 +171,10 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
     solution = joint_fit(problem, state.precision(), exact=False)
     samples = state.design.samples
     weight, outliers = outlying(
-        problem.design.residual(solution.effects, problem.beside.columns @ solution.beside),
+        problem.design.residual(solution.effects, problem.nuisances.columns @ solution.nuisances),
         samples.count_deg / samples.ratio * ARCSEC_PER_DEG,
     )
-    delay_ms = dict(zip(problem.beside.names, solution.beside.tolist(), strict=True)).get(DELAY, 0.0)
+    delay_ms = dict(zip(problem.nuisances.names, solution.nuisances.tolist(), strict=True)).get(DELAY, 0.0)
     if outliers.samples or delay_ms:
         state = state.after(solution).remade(samples.delayed(delay_ms / 1000.0), weight, delay_ms)
     for turn in range(ROUNDS):
@@ -189,14 +189,14 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
         selection = again
     problem = state.problem(selection)
     solution = joint_fit(problem, state.precision())
-    if dict(zip(problem.beside.names, solution.beside.tolist(), strict=True)).get(SWING, 0.0) < 0.0:
+    if dict(zip(problem.nuisances.names, solution.nuisances.tolist(), strict=True)).get(SWING, 0.0) < 0.0:
         # No load is held back below its natural frequency: something else differs from speed to speed.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = joint_fit(state.problem(selection), state.precision())
         system = state.information()
     state = state.after(solution)
     problem = state.problem(selection)
-    if len(problem.beside.names) != len(solution.beside):
+    if len(problem.nuisances.names) != len(solution.nuisances):
         # The first orders came in last, and what swings with them, or turns that now matter.
         solution = joint_fit(problem, state.precision())
         system = state.information()

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.identify.beside import is_rounding
-from hdbridge.identify.blocks import Blocks
-from hdbridge.identify.design import clusters
-from hdbridge.identify.gain import Gain
-from hdbridge.identify.joint import JointFit, Problem, Solution, is_valid
-from hdbridge.identify.noise import NoiseModel, Precision
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.design import clusters
+from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.noise import NoiseModel, Precision
+from hdbridge.estimation.nuisances import is_rounding
+from hdbridge.estimation.samples import KINDS, BoolArray, IntArray
+from hdbridge.estimation.segment import Kind
+from hdbridge.estimation.separable import JointFit, Problem, Solution, is_valid
 from hdbridge.identify.result import HeldOut
-from hdbridge.identify.samples import KINDS, BoolArray, IntArray
-from hdbridge.identify.segment import Kind
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
@@ -44,9 +44,9 @@ def held_out(
     blocks = problem.design.blocks
     fold, over = folds(problem)
     # Turns and rounding are noise of the fit, not something that a model could be given.
-    problem = replace(problem, beside=problem.beside.without(is_rounding))
-    shift = problem.beside.columns
-    beside, alone = (np.zeros((2, len(blocks))) for _ in range(2))
+    problem = replace(problem, nuisances=problem.nuisances.without(is_rounding))
+    shift = problem.nuisances.columns
+    added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
     used = np.zeros(len(blocks), dtype=bool)
     for number in np.unique(fold).tolist():
         out = fold == number
@@ -59,7 +59,7 @@ def held_out(
         either = (problem.observed - active_arcsec - shift @ rest, fit.residual)
         told = (active_arcsec, _told(problem, fit))
         for row in (0, 1):
-            beside[row, out] = _about_zeros(blocks, either[row], out, known=False)[out]
+            added[row, out] = _about_zeros(blocks, either[row], out, known=False)[out]
             alone[row, out] = _about_zeros(blocks, measured_arcsec - told[row], out, known=True)[out]
         used |= out
     weight = blocks.count * used
@@ -79,7 +79,7 @@ def held_out(
         return Gain(over, number, total(weight), before, after)
 
     fitted = math.sqrt(float(weight @ solution.residual**2) / float(np.sum(weight)) + inside_variance)
-    result = HeldOut(gain(alone), gain(beside), fitted, "")
+    result = HeldOut(gain(alone), gain(added), fitted, "")
     assert result.gain is not None
     words = "improves on" if result.improves else "does not improve on"
     figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Synchronous
-from hdbridge.identify.beside import is_turn
-from hdbridge.identify.blocks import Blocks
-from hdbridge.identify.design import clusters, moved
-from hdbridge.identify.joint import Column, Solution
-from hdbridge.identify.linear import inverse_symmetric
-from hdbridge.identify.noise import Precision
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.design import clusters, moved
+from hdbridge.estimation.linear import inverse_symmetric
+from hdbridge.estimation.noise import Precision
+from hdbridge.estimation.nuisances import is_turn
+from hdbridge.estimation.separable import Column, Solution
 
 NORMAL_95 = 1.959964
 STRETCHES = 100

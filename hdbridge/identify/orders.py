@@ -10,8 +10,8 @@ from enum import Enum
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.identify.linear import solve_symmetric
-from hdbridge.identify.samples import IntArray
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.samples import IntArray
 
 NOT_APART = 0.95
 """Correlation above which two orders cannot be distinguished in a record."""

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.identify.blocks import Blocks
-from hdbridge.identify.noise import NoiseModel, Precision
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.identify.orders import Family
 from hdbridge.identify.result import NoiseFigures, ResidualTest
 from hdbridge.identify.spectrum import Spectrum

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.identify.gain import Gain
+from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.noise import NoiseModel
 from hdbridge.identify.intervals import Interval
-from hdbridge.identify.noise import NoiseModel
 from hdbridge.identify.orders import Order
 from hdbridge.identify.spectrum import Spectrum
 from hdbridge.model import TransmissionModel
@@ -84,7 +84,7 @@ class HeldOut:
     """Of the model alone against the active one, or none, each about its zero; None where nothing was held
     out.
     """
-    beside: Gain | None
+    in_addition: Gain | None
     """The same with all that is fitted in addition to the model (delay, load orders) taken off of both."""
     fitted_arcsec: float
     """Rms that the fit leaves of the same data, with all that is fitted in addition to the model."""
@@ -97,7 +97,7 @@ class HeldOut:
         With the nuisances taken off, what it leaves falls by more than chance and by at least `WORTH` of its
         rms; alone it is not worse.
         """
-        gain = self.beside
+        gain = self.in_addition
         return (
             gain is not None
             and gain.sure

@@ -15,7 +15,7 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
-from hdbridge.identify.linear import inverse_symmetric
+from hdbridge.estimation.linear import inverse_symmetric
 from hdbridge.identify.orders import NOT_APART, Order, correlation, threshold
 from hdbridge.units import DEG_PER_TURN
 

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, MotorOrder, Synchronous
-from hdbridge.identify.beside import Beside, beside
-from hdbridge.identify.blocks import make_blocks
-from hdbridge.identify.design import Design, harmonics, tangents
-from hdbridge.identify.joint import Problem, Solution, is_valid
-from hdbridge.identify.noise import NoiseModel, Precision
+from hdbridge.estimation.blocks import make_blocks
+from hdbridge.estimation.design import Design, harmonics, tangents
+from hdbridge.estimation.noise import NoiseModel, Precision
+from hdbridge.estimation.nuisances import Nuisances, nuisances_of
+from hdbridge.estimation.samples import Samples
+from hdbridge.estimation.separable import Problem, Solution, is_valid
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, select
-from hdbridge.identify.samples import Samples
 from hdbridge.units import DEG_PER_TURN
 
 WHOLE_TURN = 0.95
@@ -42,9 +42,9 @@ class State(NamedTuple):
     synchronous: Synchronous | None = None
     """As last fitted."""
 
-    def beside(self) -> Beside:
+    def nuisance_columns(self) -> Nuisances:
         """Zeros and nuisances."""
-        return beside(self.design, self.nuisances, self.effects, self._shaking())
+        return nuisances_of(self.design, self.nuisances, self.effects, self._shaking())
 
     def _shaking(self) -> list[tuple[float, FloatArray, FloatArray]]:
         """Orders of the synchronous part, what each contributes to the blocks, and a quarter later."""
@@ -71,7 +71,7 @@ class State(NamedTuple):
 
         With the tangents in, shapes are refitted with every order that is tried.
         """
-        extra = self.beside()
+        extra = self.nuisance_columns()
         parts = [self.waves, extra.columns]
         for effect in self.effects:
             parts.append(self.design.columns(effect, exact=False))
@@ -104,7 +104,7 @@ class State(NamedTuple):
         picked = [2 * index + part for index in others for part in (0, 1)]
         names = [f"{self.candidates[index]} {part}" for index in others for part in ("cosine", "sine")]
         effects = ((Synchronous(orders=motor),) if motor else ()) + self.effects
-        return Problem(self.design, effects, self.beside().and_waves(self.waves[:, picked], names))
+        return Problem(self.design, effects, self.nuisance_columns().and_waves(self.waves[:, picked], names))
 
     def after(self, solution: Solution) -> State:
         """With a solution's effects, and the blur that they bring."""

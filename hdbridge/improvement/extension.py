@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.diagnose import Diagnosis, Finding
 from hdbridge.effects import CATALOGUE, Channel, Effect, Wear
-from hdbridge.identify.gain import Gain
+from hdbridge.estimation.gain import Gain
 from hdbridge.model import TransmissionModel
 from hdbridge.units import DEG_PER_TURN
 

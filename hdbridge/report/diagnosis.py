@@ -9,11 +9,11 @@ from hdbridge import __version__
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
 from hdbridge.diagnose import Diagnosis, Finding
-from hdbridge.diagnose.portrait import portrait
-from hdbridge.diagnose.seeing import Seen, see
+from hdbridge.diagnose.partial_residuals import partial_residual
+from hdbridge.diagnose.residual_views import ResidualViews, see
 from hdbridge.effects import CATALOGUE
 from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
-from hdbridge.report.residuals import beside_charts, portrait_chart, residual_charts
+from hdbridge.report.residuals import beside_charts, partial_residual_chart, residual_charts
 from hdbridge.report.validation import stepping_sections
 from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, sentence, with_interval
@@ -181,8 +181,8 @@ def _found(diagnosis: Diagnosis) -> Section:
 
 def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     title = _title(finding.cause)
-    drawn = portrait(finding, diagnosis)
-    blocks: list[Block] = [portrait_chart(drawn)]
+    drawn = partial_residual(finding, diagnosis)
+    blocks: list[Block] = [partial_residual_chart(drawn)]
     if finding.parameters:
         blocks.append(_parameters(finding))
     blocks.append(Facts([*_about(finding)]))
@@ -270,7 +270,7 @@ def _figures(diagnosis: Diagnosis) -> Section:
     )
 
 
-def _over(seen: Seen) -> Section:
+def _over(seen: ResidualViews) -> Section:
     shares = sorted(seen.shares().items(), key=lambda each: -each[1][0])
     rows: list[list[str | float]] = [
         [name, f"{100.0 * before:.1f} %", f"{100.0 * after:.1f} %"] for name, (before, after) in shares

@@ -1,4 +1,4 @@
-"""Charts of residuals: the portrait of a finding, and what is seen over every coordinate."""
+"""Charts of residuals: the partial_residual of a finding, and what is seen over every coordinate."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 
 from hdbridge.diagnose import Traces
-from hdbridge.diagnose.portrait import Portrait, Strength
-from hdbridge.diagnose.seeing import BoolArray, Coordinate, Seen, Spacing, binned
+from hdbridge.diagnose.partial_residuals import PartialResidual, Strength
+from hdbridge.diagnose.residual_views import BoolArray, Coordinate, ResidualViews, Spacing, binned
 from hdbridge.effects import FloatArray
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
 
 R_LABEL: Final = "residual, arcsec"
 E_LABEL: Final = "error, arcsec"
 CLOUD: Final = 2500
-"""Raw points of a portrait."""
+"""Raw points of a partial_residual."""
 SMALL_CLOUD: Final = 1200
 """... of a small chart."""
 LINE_POINTS: Final = 2000
@@ -34,14 +34,18 @@ GREEN: Final = 2
 FORWARD, BACKWARD = "forward", "backward"
 
 
-def portrait_chart(portrait: Portrait) -> Chart:
+def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
     """Raw points, means with their spread, and over them what the finding itself does."""
-    if portrait.strength is not None:
-        return _strength_chart(portrait.strength, portrait.coordinate)
-    home, residual, own = portrait.coordinate, portrait.residual_arcsec, portrait.own_arcsec
-    rows = portrait.rows
+    if partial_residual.strength is not None:
+        return _strength_chart(partial_residual.strength, partial_residual.coordinate)
+    home, residual, own = (
+        partial_residual.coordinate,
+        partial_residual.residual_arcsec,
+        partial_residual.own_arcsec,
+    )
+    rows = partial_residual.rows
     series = [_cloud("readings", home.values[rows], residual[rows], CLOUD)]
-    ways = _ways(portrait.forward, rows) if home.both_ways else [("", BLUE, rows)]
+    ways = _ways(partial_residual.forward, rows) if home.both_ways else [("", BLUE, rows)]
     for way, colour, chosen in ways:
         means = binned(home, residual, chosen)
         name = f"mean, {way}" if way else "mean"
@@ -79,7 +83,7 @@ def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
     return Chart(f"C{words}, over the {home.name}", home.label, f"c{words}, %", series, height_px=360)
 
 
-def residual_charts(seen: Seen) -> Iterator[Chart]:
+def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
     """Over each coordinate the model as it was given and the extended one, all to one scale."""
     reach = _reach(seen.given_arcsec)
     shares = seen.shares()

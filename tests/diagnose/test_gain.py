@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.diagnose.evidence import gather
 from hdbridge.diagnose.holdout import held_out_change
-from hdbridge.diagnose.theory import Theory, Workshop
 from hdbridge.effects import Start, Synchronous
 from hdbridge.effects.orders import orders_from
-from hdbridge.identify.gain import Gain
+from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.observed import gather
 from hdbridge.improvement import extension_of
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
@@ -37,12 +37,12 @@ def test_a_change_that_is_not_there_loses_on_what_is_held_out(
 ) -> None:
     """Orders of nothing but noise: a fit always gains by them in itself."""
     record = Record(columns(orders=(), offset=0.0))
-    workshop = Workshop(gather(record, 50.0))
+    estimator = Estimator(gather(record, 50.0))
     nothing = Synchronous(orders=orders_from(range(3, 24), 0.0))
-    fitted = workshop.fit(Theory((nothing,), Start.VIRGIN))
-    moved = workshop.columns(nothing, Start.VIRGIN) @ fitted.theory.effects[0].coefficients()
-    as_given = fitted.residual + workshop.weight * moved
-    gain = held_out_change(workshop, fitted, fitted.places(0), moved)
+    fitted = estimator.fit(Hypothesis((nothing,), Start.VIRGIN))
+    moved = estimator.columns(nothing, Start.VIRGIN) @ fitted.hypothesis.effects[0].coefficients()
+    as_given = fitted.residual + estimator.weight * moved
+    gain = held_out_change(estimator, fitted, fitted.places(0), moved)
     assert gain is not None
     assert float(as_given @ as_given) > fitted.chi_square
     assert gain.after_arcsec > gain.before_arcsec

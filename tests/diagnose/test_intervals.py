@@ -11,13 +11,13 @@ import numpy as np
 from scipy.stats import binom
 
 from hdbridge.diagnose import diagnose
-from hdbridge.diagnose.evidence import gather
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.result import Parameter
-from hdbridge.diagnose.theory import Theory, Workshop
 from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start
 from hdbridge.effects.orders import MotorOrder
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.observed import gather
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
@@ -33,7 +33,7 @@ def held(parameter: Parameter, name: str, truth: float) -> bool:
     return parameter.low <= truth <= parameter.high
 
 
-def hidden(seed: int) -> tuple[dict[str, Any], Theory, dict[str, float]]:
+def hidden(seed: int) -> tuple[dict[str, Any], Hypothesis, dict[str, float]]:
     """A wave of the flexspline, a ramp and a load order: for the plant, about right as effects, and as they
     should be told."""
     rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def hidden(seed: int) -> tuple[dict[str, Any], Theory, dict[str, float]]:
         "load_order order_1_amplitude_arcsec": run_out,
         "load_order order_1_phase_deg": angle,
     }
-    return effects, Theory(sought, Start.FORWARD), truth
+    return effects, Hypothesis(sought, Start.FORWARD), truth
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say(
@@ -74,12 +74,12 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     halves: list[float] = []
     for seed in SEEDS:
         effects, sought, truth = hidden(seed)
-        workshop = Workshop(gather(Record(columns(effects, seed)), 50.0))
-        theory = Theory((*model.effects, *sought.effects), sought.start)
-        precise = precisely(workshop, workshop.fit(theory))
-        spread = covariance(workshop, precise)
-        for place, effect in enumerate(theory.effects):
-            for name, parameter in parameters_of(workshop, precise, place, spread).items():
+        estimator = Estimator(gather(Record(columns(effects, seed)), 50.0))
+        hypothesis = Hypothesis((*model.effects, *sought.effects), sought.start)
+        precise = precisely(estimator, estimator.fit(hypothesis))
+        spread = covariance(estimator, precise)
+        for place, effect in enumerate(hypothesis.effects):
+            for name, parameter in parameters_of(estimator, precise, place, spread).items():
                 true = (truth | gear)[f"{effect.name} {name}"]
                 inside.append(held(parameter, name, true))
                 if not name.endswith("phase_deg"):

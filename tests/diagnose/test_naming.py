@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
-from hdbridge.diagnose.probability import Beside, Signs, weighed
+from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.effects import Hysteresis
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
@@ -189,18 +189,18 @@ def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
     return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, signs=signs)
 
 
-ALONE = Beside(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)
+ALONE = Context(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)
 
 
 @pytest.mark.parametrize(
     "beside",
     [
-        Beside(left_arcsec=2.0, excess=1.0, free_loop=False, unexplained=False),
+        Context(left_arcsec=2.0, excess=1.0, free_loop=False, unexplained=False),
         replace(ALONE, excess=4.0),
         replace(ALONE, unexplained=True),
     ],
 )
-def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Beside) -> None:
+def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Nuisances) -> None:
     (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE)
     (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside)
     assert doubtful.probability < alone.probability

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.identify.blocks import make_blocks
+from hdbridge.estimation.blocks import make_blocks
+from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
+from hdbridge.estimation.samples import gather
+from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.identify.figures import outlying, standing
-from hdbridge.identify.noise import NoiseModel, Precision, fit_noise
-from hdbridge.identify.samples import gather
-from hdbridge.identify.segment import Kind, Segment
 
 
 def blocks_of(count, rng, motor=None, error=None, kind=Kind.SWEEP):

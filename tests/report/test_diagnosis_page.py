@@ -28,8 +28,8 @@ from hdbridge.effects import (
     extended,
 )
 from hdbridge.effects.kinematics import direction_of
+from hdbridge.estimation.gain import Gain
 from hdbridge.evaluation.stepping import Scatter
-from hdbridge.identify.gain import Gain
 from hdbridge.model import TransmissionModel
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render

@@ -13,8 +13,8 @@ from hdbridge.daemon.adaptation.regressors import Regressors
 from hdbridge.daemon.adaptation.sink import reading_of
 from hdbridge.drive import Drive
 from hdbridge.effects import Start
+from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.identify import fit
-from hdbridge.identify.linear import solve_symmetric
 from hdbridge.identify.options import FitOptions
 from hdbridge.procedures.moves import Settle
 from hdbridge.procedures.stepping import Stepping

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.daemon.adaptation.estimator import Estimator
-from hdbridge.identify.linear import solve_symmetric
+from hdbridge.estimation.linear import solve_symmetric
 
 SIGMA = 0.9
 seeds = st.integers(0, 10_000)

@@ -1,4 +1,4 @@
-"""A theory of a measurement: effects and zeros, fitted together by Gauss-Newton on everything that is free.
+"""A hypothesis: effects and zeros, fitted together by Gauss-Newton on everything that is free.
 
 The baseline is refitted with every candidate, so what the baseline can take over is never called a finding.
 """
@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hdbridge.diagnose.evidence import Evidence, IntArray, Series
 from hdbridge.effects import (
     Channel,
     DirectionPhase,
@@ -27,6 +26,7 @@ from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.effects.play import stop
+from hdbridge.estimation.observed import IntArray, Observed, Series
 
 ITERATIONS = 8
 CONVERGED = 0.5
@@ -42,28 +42,28 @@ LOOPS = (Hysteresis, HysteresisMemory)
 ONE_SIDED = (VelocityWindup,)
 """Effects of which no coefficient is negative. One that is not there would come out on either side of zero
 by chance, and half of the time the effect would be refused for it: it is held at zero instead. A loop has the
-sign of `Workshop.loop_sign`, for the same reason."""
+sign of `Estimator.loop_sign`, for the same reason."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 _EPS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Theory:
+class Hypothesis:
     """Effects (the baseline's first) and the elastic state at the first sample."""
 
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
 
-    def plus(self, effect: Effect) -> Theory:
+    def plus(self, effect: Effect) -> Hypothesis:
         """With one more effect."""
         return replace(self, effects=(*self.effects, effect))
 
-    def without(self, place: int) -> Theory:
+    def without(self, place: int) -> Hypothesis:
         """With one effect less."""
         return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
 
-    def instead(self, place: int, effect: Effect) -> Theory:
+    def instead(self, place: int, effect: Effect) -> Hypothesis:
         """With one effect exchanged."""
         return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
 
@@ -73,7 +73,7 @@ class Parameter:
     """What a column of the tangent matrix stands for."""
 
     effect: int
-    """Place of the effect in the theory; -1 for a zero."""
+    """Place of the effect in the hypothesis; -1 for a zero."""
     name: str
     shape: bool = False
     logarithmic: bool = False
@@ -81,9 +81,9 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A theory with its best parameters."""
+    """A hypothesis with its best parameters."""
 
-    theory: Theory
+    hypothesis: Hypothesis
     zeros: FloatArray
     residual: FloatArray
     """Weighted residual of the usable points, shape (m,)."""
@@ -107,12 +107,12 @@ class Fitted:
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
 
-class Workshop:
+class Estimator:
     """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
 
-    def __init__(self, evidence: Evidence) -> None:
-        points = evidence.points
-        self.evidence = evidence
+    def __init__(self, data: Observed) -> None:
+        points = data.points
+        self.data = data
         self.index: IntArray = np.flatnonzero(points.usable)
         self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
         self.observed: FloatArray = points.error_arcsec[self.index]
@@ -133,7 +133,7 @@ class Workshop:
     @property
     def motion(self) -> Motion:
         """What drove the axis, point by point (all points, the elastic state passes through each)."""
-        return self.evidence.points.motion
+        return self.data.points.motion
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
@@ -150,7 +150,7 @@ class Workshop:
         if recent in self._recent:
             self._recent.move_to_end(recent)
             return self._recent[recent]
-        columns = self.at_points(effect.columns(self.evidence.full.motion, start))
+        columns = self.at_points(effect.columns(self.data.full.motion, start))
         self._recent[recent] = columns
         if len(self._recent) > KEPT_COLUMNS:
             self._recent.popitem(last=False)
@@ -161,17 +161,17 @@ class Workshop:
         key = (series.turns_per_motor_turn(), order.order)
         if key not in self._memo:
             alone = series.model_copy(update={"orders": (order,)})
-            self._memo[key] = self.at_points(alone.columns(self.evidence.full.motion))
+            self._memo[key] = self.at_points(alone.columns(self.data.full.motion))
         return self._memo[key]
 
     def at_points(self, values: FloatArray) -> FloatArray:
         """Of every sample to the usable points, as the observations are averaged."""
-        return np.asarray(self.evidence.mean(values)[self.index])
+        return np.asarray(self.data.mean(values)[self.index])
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
         """What an effect does in the usable samples, arcsec; in means a fast one would seem smaller."""
-        full = self.evidence.full
-        if len(full) == len(self.evidence.points):
+        full = self.data.full
+        if len(full) == len(self.data.points):
             return np.asarray(self.columns(effect, start) @ effect.coefficients())
         return effect.predict(full.motion, start)[full.usable]
 
@@ -181,38 +181,39 @@ class Workshop:
 
     def zero_columns(self) -> FloatArray:
         """One column per absolute zero, shape (m, zeros)."""
-        own: FloatArray = (self.zero[:, np.newaxis] == np.arange(self.evidence.zeros)).astype(np.float64)
+        own: FloatArray = (self.zero[:, np.newaxis] == np.arange(self.data.zeros)).astype(np.float64)
         return own
 
     def free_loop(self, start: Start) -> FloatArray:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
         memory.
         """
-        angle = self.evidence.full.motion.motor_deg
+        angle = self.data.full.motion.motor_deg
         return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
 
-    def fit(self, theory: Theory, iterations: int = ITERATIONS) -> Fitted:
-        """Gauss-Newton from where the theory stands; never worse than where it began."""
-        counted = any(Channel.LOAD_ANGLE in each.channels for each in theory.effects)
+    def fit(self, hypothesis: Hypothesis, iterations: int = ITERATIONS) -> Fitted:
+        """Gauss-Newton from where the hypothesis stands; never worse than where it began."""
+        counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
-            theory, iterations, self.nuisance.shape[1], self.load_angles if counted else 0, self.loop_sign,
+            hypothesis, iterations, self.nuisance.shape[1],
+            self.load_angles if counted else 0, self.loop_sign,
         )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
-        fitted = self._fit(theory, iterations)
+        fitted = self._fit(hypothesis, iterations)
         self._fits[key] = fitted
         if len(self._fits) > KEPT_FITS:
             self._fits.popitem(last=False)
         return fitted
 
-    def _fit(self, theory: Theory, iterations: int) -> Fitted:
-        effects = refreshed(theory.effects)
+    def _fit(self, hypothesis: Hypothesis, iterations: int) -> Fitted:
+        effects = refreshed(hypothesis.effects)
         best: Fitted | None = None
         step = 1.0
         moves = np.empty(0)
         for _ in range(iterations):
-            here = self._at(replace(theory, effects=effects))
+            here = self._at(replace(hypothesis, effects=effects))
             if best is None or here.chi_square < best.chi_square:
                 gain = math.inf if best is None else best.chi_square - here.chi_square
                 best = self.with_shapes(here)
@@ -224,17 +225,17 @@ class Workshop:
                 step *= 0.35
                 if step < 0.02:
                     break
-            effects = moved(best.theory.effects, moves, best.parameters, step)
+            effects = moved(best.hypothesis.effects, moves, best.parameters, step)
         assert best is not None
         return replace(best, basis=orthonormal(best.tangent))
 
-    def _at(self, theory: Theory) -> Fitted:
+    def _at(self, hypothesis: Hypothesis) -> Fitted:
         """Residual at these shapes, with everything linear solved for; shapes have no tangents yet."""
         blocks = [self.zero_columns(), self.nuisance]
-        parameters = [Parameter(-1, f"zero{i}") for i in range(self.evidence.zeros)]
+        parameters = [Parameter(-1, f"zero{i}") for i in range(self.data.zeros)]
         parameters += [Parameter(-1, f"nuisance{i}") for i in range(self.nuisance.shape[1])]
-        for place, effect in enumerate(theory.effects):
-            columns = self.columns(effect, theory.start)
+        for place, effect in enumerate(hypothesis.effects):
+            columns = self.columns(effect, hypothesis.start)
             blocks.append(columns)
             parameters += [Parameter(place, str(i)) for i in range(columns.shape[1])]
         linear = self.weighted(np.hstack(blocks))
@@ -242,22 +243,22 @@ class Workshop:
         # Linear in the coefficients: solve for them outright; what is carried elsewhere follows in
         # `refreshed`.
         sign = np.array(
-            [0.0 if each.effect < 0 else self._sign(theory.effects[each.effect]) for each in parameters]
+            [0.0 if each.effect < 0 else self._sign(hypothesis.effects[each.effect]) for each in parameters]
         )
         solution = solve(linear, observed)
         while np.any(below := sign * solution < 0.0):
             linear[:, below] = 0.0
             solution = solve(linear, observed)
         effects: list[Effect] = []
-        at = self.evidence.zeros + self.nuisance.shape[1]
-        for effect in theory.effects:
+        at = self.data.zeros + self.nuisance.shape[1]
+        for effect in hypothesis.effects:
             size = len(effect.coefficients())
             effects.append(effect.fitted(solution[at : at + size]))
             at += size
         residual = observed - linear @ solution
         return Fitted(
-            replace(theory, effects=tuple(effects)),
-            solution[: self.evidence.zeros],
+            replace(hypothesis, effects=tuple(effects)),
+            solution[: self.data.zeros],
             residual,
             linear,
             tuple(parameters),
@@ -272,9 +273,9 @@ class Workshop:
 
     def with_shapes(self, fitted: Fitted, names: Container[str] | None = None) -> Fitted:
         """With the tangents of these shapes, or of all but `FIXED_SHAPES`; the same where there are none."""
-        theory, parameters = fitted.theory, list(fitted.parameters)
+        hypothesis, parameters = fitted.hypothesis, list(fitted.parameters)
         shapes: list[FloatArray] = []
-        for place, effect in enumerate(theory.effects):
+        for place, effect in enumerate(hypothesis.effects):
             for each in effect.shape:
                 if each.name in FIXED_SHAPES if names is None else each.name not in names:
                     continue
@@ -288,7 +289,8 @@ class Workshop:
                 span = math.log(high / low) if each.logarithmic else high - low
                 coefficients = effect.coefficients()
                 either = [
-                    self.columns(effect.fitted(coefficients, {each.name: value}), theory.start) @ coefficients
+                    self.columns(effect.fitted(coefficients, {each.name: value}), hypothesis.start)
+                    @ coefficients
                     for value in (low, high)
                 ]
                 shapes.append(self.weight * (either[1] - either[0]) / span)
@@ -299,16 +301,16 @@ class Workshop:
         return replace(fitted, tangent=tangent, parameters=tuple(parameters))
 
     def predicted(self, fitted: Fitted) -> FloatArray:
-        """What the theory says for each sample, zeros included, arcsec, shape (n,)."""
-        full = self.evidence.full
+        """What the hypothesis says for each sample, zeros included, arcsec, shape (n,)."""
+        full = self.data.full
         total = fitted.zeros[full.zero] + self.level
-        for effect in fitted.theory.effects:
-            total = total + effect.predict(full.motion, fitted.theory.start)
+        for effect in fitted.hypothesis.effects:
+            total = total + effect.predict(full.motion, fitted.hypothesis.start)
         return np.asarray(total)
 
     def told(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """What effects say together at the usable points, arcsec, shape (m,)."""
-        full = self.evidence.full.motion
+        full = self.data.full.motion
         total = sum((each.predict(full, start) for each in effects), start=np.zeros(len(full)))
         return self.at_points(total)
 

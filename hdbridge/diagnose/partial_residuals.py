@@ -1,4 +1,4 @@
-"""The portrait of a finding: the residual without it, over the coordinate that its cause depends on.
+"""The partial_residual of a finding: the residual without it, over the coordinate that its cause depends on.
 
 Everything else that was found stays in the model, so what is seen is this finding alone, with the noise.
 A cause that scales what the model has (ripple that grows with torque, a loop that grows with speed) is seen
@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
+from hdbridge.diagnose.residual_views import BoolArray, Coordinate, Spacing, coordinates
 from hdbridge.diagnose.result import Diagnosis, Finding, Traces
-from hdbridge.diagnose.seeing import BoolArray, Coordinate, Spacing, coordinates
 from hdbridge.effects import (
     AmplitudeDrift,
     Channel,
@@ -76,7 +76,7 @@ class Strength:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Portrait:
+class PartialResidual:
     """A finding over its coordinate; arrays of shape (m,), like those of `Traces`."""
 
     coordinate: Coordinate
@@ -91,7 +91,7 @@ class Portrait:
     strength: Strength | None = None
 
 
-def portrait(finding: Finding, diagnosis: Diagnosis) -> Portrait:
+def partial_residual(finding: Finding, diagnosis: Diagnosis) -> PartialResidual:
     """Draw one finding of a diagnosis."""
     traces = diagnosis.traces
     effect = _in_model(finding, diagnosis.model)
@@ -105,7 +105,7 @@ def portrait(finding: Finding, diagnosis: Diagnosis) -> Portrait:
     residual = left if own is None else left + own
     forward = traces.direction > 0.0
     strength = _strength(effect, traces, home, residual, own)
-    return Portrait(home, residual, own, rows, forward, strength)
+    return PartialResidual(home, residual, own, rows, forward, strength)
 
 
 def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:

@@ -1,6 +1,6 @@
 """Gates that a finding has to pass before it is named: block-robust evidence, and no false backlash.
 
-Evidence in chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a
+Observed in chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a
 finding's
 score is summed over blocks of time, and its variance is taken from those sums: whatever is correlated
 within a block no longer counts as many.
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.theory import Fitted, Workshop, orthonormal
 from hdbridge.effects import (
     Backlash,
     CountLoss,
@@ -26,6 +25,7 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.hysteresis import branches
 from hdbridge.effects.orders import OrderSeries
+from hdbridge.estimation.hypothesis import Estimator, Fitted, orthonormal
 
 BLOCKS_S = (1.0, 5.0)
 LEAST_BLOCKS = 30
@@ -58,27 +58,27 @@ class Gate:
 
 
 def robust_chi_square(
-    workshop: Workshop,
+    estimator: Estimator,
     fitted: Fitted,
     place: int,
-    beside: FloatArray | None = None,
+    nuisances: FloatArray | None = None,
     rows: NDArray[np.bool_] | None = None,
     only: int | None = None,
 ) -> float:
-    """Of one effect of a theory: its coefficients against zero, by the sums of their scores over blocks of
-    time.
+    """Of one effect of a hypothesis: its coefficients against zero, by the sums of their scores over
+    blocks of time.
 
-    Everything else is projected out, and the columns ``beside`` (weighted) too; only ``rows`` count, where
+    Everything else is projected out, and the columns ``nuisances`` (weighted) too; only ``rows`` count, where
     given, and of the coefficients the one with the number ``only``.
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
-    coefficients = fitted.theory.effects[place].coefficients()
+    coefficients = fitted.hypothesis.effects[place].coefficients()
     if only is not None:
         own, coefficients = [own[only]], coefficients[[only]]
     others = np.setdiff1d(np.arange(fitted.count()), own)
-    tangent, residual, time = fitted.tangent, fitted.residual, workshop.time_s
+    tangent, residual, time = fitted.tangent, fitted.residual, estimator.time_s
     target = residual + tangent[:, own] @ coefficients
-    rest = tangent[:, others] if beside is None else np.hstack([tangent[:, others], beside])
+    rest = tangent[:, others] if nuisances is None else np.hstack([tangent[:, others], nuisances])
     columns = tangent[:, own]
     if rows is not None:
         rest, columns, target, time = rest[rows], columns[rows], target[rows], time[rows]
@@ -97,9 +97,7 @@ def robust_chi_square(
     result = np.inf
     scores = left * residual[:, np.newaxis]
     for longest in BLOCKS_S:
-        number = blocks(
-            time, min(longest, workshop.evidence.period_s * len(workshop.evidence.full) / LEAST_BLOCKS)
-        )
+        number = blocks(time, min(longest, estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS))
         sums = np.stack([np.bincount(number, each) for each in scores.T], axis=1)
         # The noise itself is a floor: a residual may be quieter than it by luck.
         variance = sums.T @ sums + 0.25 * gram
@@ -107,55 +105,55 @@ def robust_chi_square(
     return result
 
 
-def gate(workshop: Workshop, fitted: Fitted, place: int) -> Gate:
+def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
-    effect = fitted.theory.effects[place]
-    robust = robust_chi_square(workshop, fitted, place)
+    effect = fitted.hypothesis.effects[place]
+    robust = robust_chi_square(estimator, fitted, place)
     needed = ROBUST + 6.0 * (len(effect.coefficients()) - 1)
     if robust < needed:
         return Gate(robust, needed, passed=False, reason="not seen in enough independent stretches")
     if isinstance(effect, Backlash | Wear):
-        free = workshop.weighted(workshop.free_loop(fitted.theory.start))
-        robust = min(robust, robust_chi_square(workshop, fitted, place, free))
+        free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start))
+        robust = min(robust, robust_chi_square(estimator, fitted, place, free))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="an elastic loop of another shape does as well")
     if isinstance(effect, LocalDefect | CountLoss | OrderSeries | SubdivisionalError):
         # Where it turns, a loop of another shape leaves bumps that lie at one load angle too, and steps.
-        far = since_reversal(workshop.motion.motor_deg)[workshop.index] > TURN_DEG
-        robust = min(robust, robust_chi_square(workshop, fitted, place, rows=far))
+        far = since_reversal(estimator.motion.motor_deg)[estimator.index] > TURN_DEG
+        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=far))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="seen only where the axis reverses")
     if isinstance(effect, Creep):
-        late = standing_s(workshop)[workshop.index] > SETTLED_S
-        robust = min(robust, robust_chi_square(workshop, fitted, place, rows=late))
-        if robust < needed or _span(workshop, fitted, place, late) < LEAST_CREEP_ARCSEC:
+        late = standing_s(estimator)[estimator.index] > SETTLED_S
+        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=late))
+        if robust < needed or _span(estimator, fitted, place, late) < LEAST_CREEP_ARCSEC:
             return Gate(robust, needed, passed=False, reason="over as soon as the axis has come to rest")
-    if isinstance(effect, RatioError) and _bends(workshop, fitted, place):
+    if isinstance(effect, RatioError) and _bends(estimator, fitted, place):
         return Gate(robust, needed, passed=False, reason="not the same slope everywhere")
-    if isinstance(effect, Backlash) and workshop.evidence.reversals < 2:
+    if isinstance(effect, Backlash) and estimator.data.reversals < 2:
         return Gate(robust, needed, passed=False, reason="no reversal in which play would show")
     if isinstance(effect, Backlash) and effect.gap_arcsec < LEAST_GAP_ARCSEC:
         return Gate(robust, needed, passed=False, reason="too small to distinguish from the loop's shape")
     return Gate(robust, needed, passed=True)
 
 
-def all_steps_seen(workshop: Workshop, fitted: Fitted, place: int) -> bool:
+def all_steps_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     """Whether each step of a `count_loss` is seen, and none is what another cause leaves in its place."""
-    steps = range(len(fitted.theory.effects[place].coefficients()))
-    robust = [robust_chi_square(workshop, fitted, place, only=each) for each in steps]
+    steps = range(len(fitted.hypothesis.effects[place].coefficients()))
+    robust = [robust_chi_square(estimator, fitted, place, only=each) for each in steps]
     return min(robust) > max(ROBUST, STEP_SHARE * max(robust))
 
 
-def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:
+def _bends(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     """Whether a ramp has another slope in some third of the travel: a wrong ratio has the same everywhere."""
-    angle = workshop.motion.motor_deg[workshop.index]
+    angle = estimator.motion.motor_deg[estimator.index]
     low, span = float(np.min(angle)), float(np.ptp(angle))
     hinges = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
     own = fitted.places(place)
-    slope = float(fitted.theory.effects[place].coefficients()[0])
+    slope = float(fitted.hypothesis.effects[place].coefficients()[0])
     column = fitted.tangent[:, own[:1]]
-    scale = float(np.ptp(column[:, 0] / workshop.weight)) / max(span, 1e-9)
-    columns = workshop.weighted(np.column_stack(hinges)) * scale
+    scale = float(np.ptp(column[:, 0] / estimator.weight)) / max(span, 1e-9)
+    columns = estimator.weighted(np.column_stack(hinges)) * scale
     basis = orthonormal(np.hstack([np.delete(fitted.tangent, own, axis=1), column]))
     left = columns - basis @ (basis.T @ columns)
     moment = left.T @ fitted.residual
@@ -167,19 +165,19 @@ def _bends(workshop: Workshop, fitted: Fitted, place: int) -> bool:
     return bool(np.ptp(slopes) > BEND * np.max(np.abs(slopes)) and float(moment @ bend) > ROBUST)
 
 
-def _span(workshop: Workshop, fitted: Fitted, place: int, rows: NDArray[np.bool_]) -> float:
+def _span(estimator: Estimator, fitted: Fitted, place: int, rows: NDArray[np.bool_]) -> float:
     """Half the span of an effect over some of the usable points, arcsec."""
-    effect = fitted.theory.effects[place]
+    effect = fitted.hypothesis.effects[place]
     if not np.any(rows):
         return 0.0
-    values = (workshop.columns(effect, fitted.theory.start) @ effect.coefficients())[rows]
+    values = (estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients())[rows]
     low, high = np.quantile(values, [0.002, 0.998])
     return 0.5 * float(high - low)
 
 
-def standing_s(workshop: Workshop) -> FloatArray:
+def standing_s(estimator: Estimator) -> FloatArray:
     """Time since the axis came to rest, seconds, shape (n,); 0 in motion."""
-    motion = workshop.motion
+    motion = estimator.motion
     if motion.motor_speed_deg_s is None or motion.time_s is None:
         return np.zeros(len(motion))
     moving = motion.motor_speed_deg_s != 0.0

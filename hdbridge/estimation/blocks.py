@@ -15,7 +15,7 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.effects.hysteresis import branches
-from hdbridge.identify.samples import BoolArray, IntArray, Samples
+from hdbridge.estimation.samples import BoolArray, IntArray, Samples
 from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000

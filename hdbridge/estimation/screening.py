@@ -1,10 +1,9 @@
-"""Screening: every candidate's score on the residual, with the whole present theory projected out.
+"""Screening: every candidate's score on the residual, with the whole present hypothesis projected out.
 
-One matrix product for all columns: with Q an orthonormal basis of the theory's tangent and C a candidate's
-columns,
-C'C - (Q'C)'(Q'C) is what is left of it, and its score is the chi square that it would gain. So a grid of
-hundreds
-of shapes costs no more than one fit. A column of which less than `SHARE_LEFT` is left is not in the record.
+One matrix product for all columns: with Q an orthonormal basis of the hypothesis's tangent and C a
+candidate's columns, C'C - (Q'C)'(Q'C) is what is left of it, and its score is the chi square that it would
+gain. So a grid of hundreds of shapes costs no more than one fit. A column of which less than `SHARE_LEFT` is
+left is not in the record.
 """
 
 from __future__ import annotations
@@ -14,11 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.diagnose.candidates import Candidate
-from hdbridge.diagnose.theory import Fitted, Workshop
-from hdbridge.effects import FloatArray, Start
+from hdbridge.effects import Effect, FloatArray, Start
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 SHARE_LEFT = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One effect that might be there."""
+
+    cause: str
+    effect: Effect
+    """With the shape of this point of the grid; its coefficients are of no account."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,23 +36,23 @@ class Score:
     gain: float
     """Chi square that it would take away, linearised."""
     freedom: int
-    """Directions of it that the theory leaves."""
+    """Directions of it that the hypothesis leaves."""
     share: float
-    """Largest share of a column's square that the theory leaves."""
+    """Largest share of a column's square that the hypothesis leaves."""
 
 
 class Screen:
     """The weighted columns of all candidates, made once."""
 
-    def __init__(self, workshop: Workshop, candidates: Sequence[Candidate], start: Start) -> None:
+    def __init__(self, estimator: Estimator, candidates: Sequence[Candidate], start: Start) -> None:
         self._candidates = tuple(candidates)
-        blocks = [workshop.weighted(workshop.columns(each.effect, start)) for each in candidates]
+        blocks = [estimator.weighted(estimator.columns(each.effect, start)) for each in candidates]
         self._slices: list[slice] = []
         at = 0
         for block in blocks:
             self._slices.append(slice(at, at + block.shape[1]))
             at += block.shape[1]
-        self._matrix = np.hstack(blocks) if blocks else np.empty((len(workshop.index), 0))
+        self._matrix = np.hstack(blocks) if blocks else np.empty((len(estimator.index), 0))
         self._grams = [block.T @ block for block in blocks]
 
     def scores(self, fitted: Fitted) -> list[Score]:

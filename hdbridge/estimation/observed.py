@@ -4,7 +4,7 @@ The angle that drives the effects is the command's where the record has one, plu
 against it as a smooth line in speed and acceleration: neither encoder counts nor a following error are
 findings.
 Longer records are averaged over runs of consecutive samples. What is fitted to them is averaged alike
-(`Evidence.mean`), so that a law is as large there as in the samples. The full rate stays at hand for that,
+(`Observed.mean`), so that a law is as large there as in the samples. The full rate stays at hand for that,
 and for what is fast (vibration, interpolation errors of an encoder).
 """
 
@@ -18,9 +18,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.diagnose.noise import noise_arcsec
 from hdbridge.effects import FloatArray, Motion
 from hdbridge.errors import InputError
+from hdbridge.estimation.white_noise import noise_arcsec
 from hdbridge.observations.cuts import observed
 from hdbridge.observations.driving import reversals
 from hdbridge.observations.kinematics import kinematics
@@ -80,7 +80,7 @@ class Series:
     leg: IntArray
     """Number of the leg; a new one wherever the kind of motion changes."""
     kind: IntArray
-    """Index into `Evidence.kinds`."""
+    """Index into `Observed.kinds`."""
 
     def __len__(self) -> int:
         """Number of points."""
@@ -88,7 +88,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class Observed:
     """A measurement, prepared."""
 
     ratio: float
@@ -126,7 +126,7 @@ def gather(
     legs: Sequence[Leg] = (),
     independent_zeros: bool = False,
     expected: Callable[[Motion], FloatArray] | None = None,
-) -> Evidence:
+) -> Observed:
     """Prepare a record; ``expected`` is what a model predicts, taken off before the noise is looked at.
     InputError where there is too little of it, or the ratio is not this gear's.
     """
@@ -159,7 +159,7 @@ def gather(
     )
     full = replace(full, sigma_arcsec=sigma)
     runs = _runs(count, record.starts)
-    return Evidence(
+    return Observed(
         ratio=ratio,
         points=_averaged(full, runs),
         full=full,

@@ -120,7 +120,7 @@ def binned(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class ResidualViews:
     """Two residuals and what they are looked at over; arrays of shape (m,)."""
 
     given_arcsec: FloatArray
@@ -147,10 +147,10 @@ class Seen:
         }
 
 
-def see(diagnosis: Diagnosis) -> Seen:
+def see(diagnosis: Diagnosis) -> ResidualViews:
     """Look at a diagnosis's residuals."""
     traces = diagnosis.traces
-    return Seen(
+    return ResidualViews(
         traces.measured_arcsec - traces.model_arcsec,
         traces.measured_arcsec - traces.extended_arcsec,
         traces.direction,
@@ -159,8 +159,8 @@ def see(diagnosis: Diagnosis) -> Seen:
     )
 
 
-def seen_over(diagnosis: Diagnosis) -> dict[str, Any]:
-    """`Seen.shares` for machines."""
+def shares_by_coordinate(diagnosis: Diagnosis) -> dict[str, Any]:
+    """`ResidualViews.shares` for machines."""
     seen = see(diagnosis)
     return {
         name: {"share_of_baseline": round(before, 4), "share_of_extended": round(after, 4)}

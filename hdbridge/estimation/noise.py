@@ -16,8 +16,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
 from hdbridge.effects import FloatArray
-from hdbridge.identify.blocks import Blocks
-from hdbridge.identify.samples import BoolArray, IntArray
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.samples import BoolArray, IntArray
 
 PIECES = 16
 PIECE_BLOCKS = 250
@@ -93,9 +93,9 @@ class Precision:
         """Cholesky factor of the bracket, wanders interleaved."""
         width, count = len(chains), len(self.weight)
         band = np.zeros((width + 1, width * count))
-        for number, (diagonal, beside) in enumerate(chains):
+        for number, (diagonal, off_diagonal) in enumerate(chains):
             band[0, number::width] = diagonal + self.weight * self._loads[number] ** 2
-            band[width, number : width * (count - 1) : width] = beside
+            band[width, number : width * (count - 1) : width] = off_diagonal
         for apart in range(1, width):
             for number in range(width - apart):
                 band[apart, number::width] = self.weight * self._loads[number] * self._loads[number + apart]

@@ -10,8 +10,8 @@ import numpy as np
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.effects.base import Memoryless, measured_by_all
 from hdbridge.effects.hysteresis import branches
-from hdbridge.identify.blocks import Blocks
-from hdbridge.identify.samples import IntArray, Samples
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.samples import IntArray, Samples
 
 PART_SAMPLES = 50_000
 

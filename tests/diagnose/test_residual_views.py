@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.seeing import Coordinate, Seen, Spacing, binned, since_change_s, since_reversal
+from hdbridge.diagnose.residual_views import (
+    Coordinate,
+    ResidualViews,
+    Spacing,
+    binned,
+    since_change_s,
+    since_reversal,
+)
 from hdbridge.effects import Motion
 
 COUNT = 8000
@@ -25,7 +32,7 @@ def seen(given_arcsec):
         Coordinate("time", "s", TIME_S, bins=100),
     )
     noise = RNG.normal(size=COUNT)
-    return Seen(given_arcsec, noise, DIRECTION, TIME_S, {each.name: each for each in found})
+    return ResidualViews(given_arcsec, noise, DIRECTION, TIME_S, {each.name: each for each in found})
 
 
 def test_noise_goes_with_nothing():

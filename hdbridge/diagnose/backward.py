@@ -22,10 +22,10 @@ from hdbridge.diagnose.search import (
     Trail,
     cost,
 )
-from hdbridge.diagnose.theory import Fitted
 from hdbridge.effects import AmplitudeDrift, Wear
+from hdbridge.estimation.hypothesis import Fitted
 
-TWO_WAYS = frozenset(
+DIRECTIONAL = frozenset(
     {
         "backlash",
         "wear",
@@ -39,9 +39,9 @@ TWO_WAYS = frozenset(
 )
 """Causes that lie between the two directions of motion, or where one goes over to the other: what the form of
 one gets wrong lies there too, and looks like another of them."""
-TWO_WAYS_SHARE = 0.05
-"""... so that the second needs this share of the first one's evidence."""
-KIN = (
+DIRECTIONAL_SHARE = 0.05
+"""... so that the second needs this share of the first one's data."""
+OVERLAPPING = (
     {"velocity_windup", "channel_skew", "rate_dependence"},
     {"channel_skew", "inertial_windup"},
     {"zero_drift", "count_loss"},
@@ -50,7 +50,7 @@ KIN = (
     {"wear", "amplitude_drift"},
 )
 """Causes that are nearer to each other than that."""
-KIN_SHARE = 0.15
+OVERLAP_SHARE = 0.15
 EXACTLY = 1.1
 """Chi square per point that is more than noise. Where kin together leave noise and without the smaller one
 there is more, both are there."""
@@ -66,7 +66,7 @@ LEFTOVER = 2e-5
 def reconsidered(search: Search, trail: Trail) -> Trail:
     """What is left of a trail, and what stands in for the rest."""
     fitted = trail.fitted
-    if len(fitted.theory.effects) - search.base <= FEW:
+    if len(fitted.hypothesis.effects) - search.base <= FEW:
         fitted = _swapped(search, fitted)
     fitted = _pruned(search, _with_wear_anew(search, fitted))
     fitted = _merged(search, fitted)
@@ -76,22 +76,22 @@ def reconsidered(search: Search, trail: Trail) -> Trail:
     return replace(trail, fitted=fitted, law_gain=law_gain)
 
 
-def kinship(one: str, other: str) -> float:
+def overlap(one: str, other: str) -> float:
     """Share of the other's evidence that a finding needs, because it may look like what that leaves."""
     if one == other:
-        return {"vibration": SIDELINE_SHARE, "local_defect": KIN_SHARE}.get(one, 0.0)
-    if any({one, other} <= each for each in KIN):
-        return KIN_SHARE
-    return TWO_WAYS_SHARE if {one, other} <= TWO_WAYS else 0.0
+        return {"vibration": SIDELINE_SHARE, "local_defect": OVERLAP_SHARE}.get(one, 0.0)
+    if any({one, other} <= each for each in OVERLAPPING):
+        return OVERLAP_SHARE
+    return DIRECTIONAL_SHARE if {one, other} <= DIRECTIONAL else 0.0
 
 
 def _swapped(search: Search, fitted: Fitted) -> Fitted:
     """Each finding taken out, the law chosen anew, the best one put in its place."""
     for _ in range(2):
         changed = False
-        for place in range(search.base, len(fitted.theory.effects)):
+        for place in range(search.base, len(fitted.hypothesis.effects)):
             search.forget()
-            without, _ = search.with_best_law(search.workshop.fit(fitted.theory.without(place)))
+            without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
             other = search.best_addition(without)
             if other is not None and cost(other) < cost(fitted) - 5.0:
                 fitted, changed = other, True
@@ -104,11 +104,11 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
 
 def _with_wear_anew(search: Search, fitted: Fitted) -> Fitted:
     """With wear fitted anew from each width that is offered: from a wide one it ends as part of the loop."""
-    for place, effect in enumerate(fitted.theory.effects[search.base :], search.base):
+    for place, effect in enumerate(fitted.hypothesis.effects[search.base :], search.base):
         if isinstance(effect, Wear):
             trials = [
-                search.workshop.fit(fitted.theory.instead(place, each.effect))
-                for each in candidates(search.workshop.evidence, fitted.theory.effects[: search.base])
+                search.estimator.fit(fitted.hypothesis.instead(place, each.effect))
+                for each in candidates(search.estimator.data, fitted.hypothesis.effects[: search.base])
                 if isinstance(each.effect, Wear)
             ]
             fitted = min((fitted, *trials), key=cost)
@@ -117,13 +117,13 @@ def _with_wear_anew(search: Search, fitted: Fitted) -> Fitted:
 
 def _merged(search: Search, fitted: Fitted) -> Fitted:
     """Two kin taken out together, and the best one cause put in the place of both."""
-    places = range(search.base, len(fitted.theory.effects))
+    places = range(search.base, len(fitted.hypothesis.effects))
     for one, other in combinations(places, 2):
         kinds = (_kind(search, fitted, one), _kind(search, fitted, other))
-        if kinds[0] == kinds[1] or not kinship(*kinds):
+        if kinds[0] == kinds[1] or not overlap(*kinds):
             continue
         search.forget()
-        without = search.workshop.fit(fitted.theory.without(other).without(one))
+        without = search.estimator.fit(fitted.hypothesis.without(other).without(one))
         trial = search.best_addition(without)
         if trial is None:
             continue
@@ -137,10 +137,10 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
 
 def _pruned(search: Search, fitted: Fitted) -> Fitted:
     """Without what no longer earns its keep among the others."""
-    while len(fitted.theory.effects) > search.base:
+    while len(fitted.hypothesis.effects) > search.base:
         gains = {}
-        for place in range(search.base, len(fitted.theory.effects)):
-            without = search.workshop.fit(fitted.theory.without(place))
+        for place in range(search.base, len(fitted.hypothesis.effects)):
+            without = search.estimator.fit(fitted.hypothesis.without(place))
             gains[place] = (without.chi_square - fitted.chi_square, without)
         largest = max(gain for gain, _ in gains.values())
         place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
@@ -149,7 +149,7 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         small = search.peak(fitted, place) < FLOOR_ARCSEC
         count = len(fitted.residual)
         share = max(
-            (kinship(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
+            (overlap(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
             default=0.0,
         )
         if fitted.chi_square < count and without.chi_square > EXACTLY * count:
@@ -162,9 +162,9 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
 
 def _kind(search: Search, fitted: Fitted, place: int) -> str:
     """The cause, for its kin; a drift of amplitudes that is one of ripple lies in both directions alike."""
-    effect = fitted.theory.effects[place]
+    effect = fitted.hypothesis.effects[place]
     if isinstance(effect, AmplitudeDrift):
-        parts = search.workshop.columns(effect, fitted.theory.start) * effect.coefficients()
+        parts = search.estimator.columns(effect, fitted.hypothesis.start) * effect.coefficients()
         ripple, friction = np.std(parts, axis=0)
         if ripple > friction:
             return "ripple"

@@ -18,10 +18,10 @@ from itertools import pairwise
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
-from hdbridge.identify.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, locked_counts
-from hdbridge.identify.design import Design
-from hdbridge.identify.linear import solve_symmetric
-from hdbridge.identify.samples import IntArray
+from hdbridge.estimation.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, locked_counts
+from hdbridge.estimation.design import Design
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.samples import IntArray
 from hdbridge.units import ARCSEC_PER_DEG
 
 DELAY = "delay_ms"
@@ -52,7 +52,7 @@ SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beside:
+class Nuisances:
     """Columns that are no effect's."""
 
     columns: FloatArray
@@ -61,23 +61,23 @@ class Beside:
     prior: FloatArray
     """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
 
-    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Beside:
+    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Nuisances:
         """With further columns of which nothing is known."""
-        return Beside(
+        return Nuisances(
             np.concatenate([self.columns, columns], axis=1),
             (*self.names, *names),
             np.concatenate([self.prior, np.zeros(columns.shape[1])]),
         )
 
-    def without(self, left_out: Callable[[str], bool]) -> Beside:
+    def without(self, left_out: Callable[[str], bool]) -> Nuisances:
         """Without the columns whose names answer."""
         keep = np.array([not left_out(each) for each in self.names])
         names = tuple(each for each in self.names if not left_out(each))
-        return Beside(self.columns[:, keep], names, self.prior[keep])
+        return Nuisances(self.columns[:, keep], names, self.prior[keep])
 
-    def rows(self, index: IntArray) -> Beside:
+    def rows(self, index: IntArray) -> Nuisances:
         """For some of the blocks."""
-        return Beside(self.columns[index], self.names, self.prior)
+        return Nuisances(self.columns[index], self.names, self.prior)
 
 
 def zeros(design: Design) -> FloatArray:
@@ -158,12 +158,12 @@ def speeds_differ(design: Design) -> float:
     return 1.0 - float(count @ squared) ** 2 / (float(np.sum(count)) * fourth) if fourth > 0.0 else 0.0
 
 
-def beside(
+def nuisances_of(
     design: Design,
     nuisances: Sequence[str],
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
-) -> Beside:
+) -> Nuisances:
     """Zeros and the nuisances named; ``waves`` as for `swing_columns`."""
     count = design.samples.zeros
     columns = [zeros(design)]
@@ -187,7 +187,7 @@ def beside(
         columns.append(swing_columns(design, waves))
         names += [SWING, SWING_LAG]
         prior += [SWING_MS2**-2, SWING_MS3**-2]
-    return Beside(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
+    return Nuisances(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:

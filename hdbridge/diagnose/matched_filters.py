@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.candidates import HIGHEST_MOTOR_ORDER, Candidate
-from hdbridge.diagnose.theory import Fitted, Workshop
+from hdbridge.diagnose.candidates import HIGHEST_MOTOR_ORDER
 from hdbridge.effects import CountLoss, Effect, FloatArray, LocalDefect, Step, SubdivisionalError, Vibration
 from hdbridge.effects.orders import orders_from
+from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.screening import Candidate
 from hdbridge.units import DEG_PER_TURN
 
 BINS = 1 << 17
@@ -30,9 +31,9 @@ LINE_OVER_MEAN = 12.0
 """A line is looked at when its power is so many times the mean: noise alone reaches 11 in 65,000 lines."""
 
 
-def count_loss(workshop: Workshop, fitted: Fitted) -> Candidate | None:
-    """The best single step, at any sample; exact, with the theory projected out."""
-    weight, basis = workshop.weight, fitted.basis
+def count_loss(estimator: Estimator, fitted: Fitted) -> Candidate | None:
+    """The best single step, at any sample; exact, with the hypothesis projected out."""
+    weight, basis = estimator.weight, fitted.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
     left = square.copy()
@@ -45,19 +46,19 @@ def count_loss(workshop: Workshop, fitted: Fitted) -> Candidate | None:
         return None
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
-    evidence = workshop.evidence
-    assert evidence.full.motion.time_s is not None
-    first = evidence.runs[workshop.index[place]]  # of the samples of the point at which it is seen
-    step = Step(time_s=float(evidence.full.motion.time_s[first]), size_arcsec=1.0)
+    data = estimator.data
+    assert data.full.motion.time_s is not None
+    first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
+    step = Step(time_s=float(data.full.motion.time_s[first]), size_arcsec=1.0)
     return Candidate("count_loss", CountLoss(steps=(step,)))
 
 
-def local_defect(workshop: Workshop, fitted: Fitted) -> Candidate | None:
+def local_defect(estimator: Estimator, fitted: Fitted) -> Candidate | None:
     """The best bump; it must lie on several passes, and not cover most of the travel."""
-    ratio = workshop.evidence.ratio
-    load = workshop.motion.motor_deg[workshop.index] / ratio
+    ratio = estimator.data.ratio
+    load = estimator.motion.motor_deg[estimator.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
-    weight = workshop.weight
+    weight = estimator.weight
 
     def binned(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(place, values, DEFECT_BINS), dtype=np.float64)
@@ -86,12 +87,12 @@ def local_defect(workshop: Workshop, fitted: Fitted) -> Candidate | None:
     return Candidate("local_defect", effect)
 
 
-def is_met(effect: LocalDefect, workshop: Workshop) -> bool:
+def is_met(effect: LocalDefect, estimator: Estimator) -> bool:
     """Whether the axis went over the place several times, in both directions or at different speeds.
 
     Passes that are all alike cannot distinguish a place from a moment of the move.
     """
-    motion = workshop.motion
+    motion = estimator.motion
     if motion.motor_speed_deg_s is None or motion.time_s is None:
         return False
     turns = (motion.motor_deg / effect.ratio - effect.centre_deg) / DEG_PER_TURN
@@ -102,7 +103,7 @@ def is_met(effect: LocalDefect, workshop: Workshop) -> bool:
     fast = np.abs(speed[speed != 0.0])
     if len(fast) < 3:
         return False
-    both = bool(np.any(speed > 0.0) and np.any(speed < 0.0)) and workshop.evidence.reversals >= 2
+    both = bool(np.any(speed > 0.0) and np.any(speed < 0.0)) and estimator.data.reversals >= 2
     return both or float(np.max(fast)) > 1.5 * float(np.min(fast))
 
 
@@ -112,43 +113,43 @@ def _bump(half_deg: float) -> FloatArray:
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.minimum(away / half_deg, 1.0)))
 
 
-def fast_residual(workshop: Workshop, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
+def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
     """Residual of every sample, and the predicted load angle there; zero where it is not usable."""
-    full = workshop.evidence.full
-    predicted = workshop.predicted(fitted)
+    full = estimator.data.full
+    predicted = estimator.predicted(fitted)
     residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
     # What is slow is none of the business of those who ask for this, and would leak into their peaks.
     window = 9
     smooth = np.convolve(residual, np.ones(window) / window, mode="same")
     spread = 6.0 * float(np.median(np.abs(residual - smooth))) * 1.4826 + 1e-9
-    load = full.motion.motor_deg / workshop.evidence.ratio + predicted / 3600.0
+    load = full.motion.motor_deg / estimator.data.ratio + predicted / 3600.0
     return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
 
 
 def vibrations(
-    workshop: Workshop, residual: FloatArray, present: Sequence[Effect] = ()
+    estimator: Estimator, residual: FloatArray, present: Sequence[Effect] = ()
 ) -> Iterator[Candidate]:
     """The highest lines over absolute time, apart from the feet of those ``present``.
 
     A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
     """
-    evidence = workshop.evidence
-    time_s = evidence.full.motion.time_s
+    data = estimator.data
+    time_s = data.full.motion.time_s
     assert time_s is not None
-    slot = np.round((time_s - time_s[0]) / evidence.period_s).astype(np.int64)
+    slot = np.round((time_s - time_s[0]) / data.period_s).astype(np.int64)
     length = int(slot[-1]) + 1
     if length > 4 * len(time_s) + 1000 or length < 64:
         return
     size = 1 << int(np.ceil(np.log2(length)) + 2)
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
-    frequency = np.arange(len(power)) / (size * evidence.period_s)
+    frequency = np.arange(len(power)) / (size * data.period_s)
     # Less than two periods of it are a bend, not a frequency.
-    power[frequency < max(LOWEST_HZ, 2.0 / (length * evidence.period_s))] = 0.0
+    power[frequency < max(LOWEST_HZ, 2.0 / (length * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
     for each in present:
         if isinstance(each, Vibration):
-            power[np.abs(frequency - each.frequency_hz) < FOOT_LINES / (length * evidence.period_s)] = 0.0
+            power[np.abs(frequency - each.frequency_hz) < FOOT_LINES / (length * data.period_s)] = 0.0
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= 0.0:
@@ -170,12 +171,12 @@ def _off_centre(height: FloatArray, at: int) -> float:
 
 
 def interpolation_errors(
-    workshop: Workshop, residual: FloatArray, load_deg: FloatArray
+    estimator: Estimator, residual: FloatArray, load_deg: FloatArray
 ) -> Iterator[Candidate]:
     """The highest lines over one load turn, beyond the orders of the mesh."""
     place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
-    ratio = workshop.evidence.ratio
+    ratio = estimator.data.ratio
     power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
     least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
     for _ in range(PEAKS):
@@ -197,13 +198,13 @@ def interpolation_errors(
         power[max(at - 3, 0) : at + 4] = 0.0
 
 
-def with_load_angle(workshop: Workshop, load_deg: FloatArray) -> None:
+def with_load_angle(estimator: Estimator, load_deg: FloatArray) -> None:
     """Make the predicted load angle what effects of the load encoder's lines count on."""
-    evidence = workshop.evidence
-    full = replace(evidence.full, motion=replace(evidence.full.motion, load_deg=load_deg))
+    data = estimator.data
+    full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
     points = full
-    if len(evidence.points) < len(full):
-        mean = evidence.mean(load_deg)
-        points = replace(evidence.points, motion=replace(evidence.points.motion, load_deg=mean))
-    workshop.evidence = replace(evidence, full=full, points=points)
-    workshop.load_angles += 1
+    if len(data.points) < len(full):
+        mean = data.mean(load_deg)
+        points = replace(data.points, motion=replace(data.points.motion, load_deg=mean))
+    estimator.data = replace(data, full=full, points=points)
+    estimator.load_angles += 1

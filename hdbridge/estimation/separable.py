@@ -16,11 +16,11 @@ import numpy as np
 from pydantic import ValidationError
 
 from hdbridge.effects import Effect, FloatArray
-from hdbridge.identify.beside import Beside
-from hdbridge.identify.design import Design, moved, tangents
-from hdbridge.identify.linear import solve_symmetric
-from hdbridge.identify.noise import Precision
-from hdbridge.identify.samples import BoolArray
+from hdbridge.estimation.design import Design, moved, tangents
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.noise import Precision
+from hdbridge.estimation.nuisances import Nuisances
+from hdbridge.estimation.samples import BoolArray
 
 GRID_LOGARITHMIC = 12
 GRID_LINEAR = 7
@@ -47,7 +47,7 @@ class Problem:
 
     design: Design
     effects: tuple[Effect, ...]
-    beside: Beside
+    nuisances: Nuisances
 
     @property
     def observed(self) -> FloatArray:
@@ -60,7 +60,7 @@ class Solution:
     """The minimum, and what intervals and tests need of it."""
 
     effects: tuple[Effect, ...]
-    beside: FloatArray
+    nuisances: FloatArray
     """Coefficients of the columns that are no effect's, shape (q,)."""
     chi_square: float
     columns: tuple[Column, ...]
@@ -94,10 +94,10 @@ class JointFit:
         self._shaped = [index for index, each in enumerate(problem.effects) if each.shape]
         self._straight = [index for index, each in enumerate(problem.effects) if not each.shape]
         parts = [problem.design.columns(problem.effects[index], True) for index in self._straight]
-        self._static = np.concatenate([*parts, problem.beside.columns], axis=1)
+        self._static = np.concatenate([*parts, problem.nuisances.columns], axis=1)
         self._weighted_static = precision.apply(self._static)
         self._prior = np.concatenate(
-            [np.zeros(self._static.shape[1] - problem.beside.columns.shape[1]), problem.beside.prior]
+            [np.zeros(self._static.shape[1] - problem.nuisances.columns.shape[1]), problem.nuisances.prior]
         )
         self._gram = self._static.T @ self._weighted_static + np.diag(self._prior)
         self._weighted_observed = precision.apply(problem.observed)
@@ -210,7 +210,7 @@ class JointFit:
             size = len(effects[index].coefficients())
             result[index] = effects[index].fitted(coefficients[at : at + size])
             at += size
-        rest = coefficients[at : at + self.problem.beside.columns.shape[1]]
+        rest = coefficients[at : at + self.problem.nuisances.columns.shape[1]]
         at += len(rest)
         for index in self._shaped:
             size = len(effects[index].coefficients())
@@ -264,7 +264,7 @@ class JointFit:
         """Put the columns in the order: effects, further columns, shapes."""
         where, shapes = self._tangents(effects)
         straight = sum(len(effects[index].coefficients()) for index in self._straight)
-        extra = self.problem.beside.columns.shape[1]
+        extra = self.problem.nuisances.columns.shape[1]
         offsets: dict[int, int] = {}
         at = 0
         for index in [*self._straight, -1, *self._shaped]:
@@ -277,7 +277,7 @@ class JointFit:
                 order.append(offsets[index] + number)
                 columns.append(Column(index, str(number)))
         order += range(straight, straight + extra)
-        columns += [Column(-1, name) for name in self.problem.beside.names]
+        columns += [Column(-1, name) for name in self.problem.nuisances.names]
         columns += [Column(index, name, shape=True) for index, name in where]
         linear_columns = np.concatenate([self._static, linear.dynamic], axis=1)[:, order]
         jacobian = np.concatenate([linear_columns, shapes], axis=1)

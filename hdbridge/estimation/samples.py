@@ -13,7 +13,7 @@ from hdbridge.effects import FloatArray, Motion, Start
 from hdbridge.effects.base import measured_by_all
 from hdbridge.effects.hysteresis import branches
 from hdbridge.errors import InputError
-from hdbridge.identify.segment import MINIMUM_SAMPLES, Kind, Segment
+from hdbridge.estimation.segment import MINIMUM_SAMPLES, Kind, Segment
 from hdbridge.observations.cuts import jumps
 from hdbridge.observations.driving import driving_angle
 from hdbridge.observations.reading import quantum_deg
