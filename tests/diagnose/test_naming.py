@@ -200,7 +200,7 @@ ALONE = Context(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)
         replace(ALONE, unexplained=True),
     ],
 )
-def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Nuisances) -> None:
+def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Context) -> None:
     (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE)
     (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside)
     assert doubtful.probability < alone.probability
