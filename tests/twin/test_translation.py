@@ -1,0 +1,377 @@
+"""Models as truth files: the simulated drive then errs as the model says."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import (
+    CATALOGUE,
+    AmplitudeDrift,
+    Backlash,
+    ChannelSkew,
+    Compliance,
+    CountLoss,
+    Creep,
+    DirectionPhase,
+    Effect,
+    FlexsplineOrders,
+    Hysteresis,
+    HysteresisMemory,
+    HysteresisParameters,
+    InertialWindup,
+    LoadOrders,
+    LocalDefect,
+    Loop,
+    MotorEncoderEccentricity,
+    MotorOrder,
+    MotorOrders,
+    RateDependence,
+    RatioError,
+    Relaxation,
+    Step,
+    SubdivisionalError,
+    Synchronous,
+    TorqueModulation,
+    VelocityWindup,
+    Vibration,
+    Wear,
+    ZeroDrift,
+)
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.records.record import Record
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.defaults import default_truth
+from hdbridge.twin.translation import TABLE, translate
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "demo"
+N = 50.0
+
+
+def fine_axis() -> AxisConfig:
+    """The demo's axis with encoders whose counts do not show, one of them counting down."""
+    axis = AxisConfig.load(PROFILE)
+    motor = axis.motor_encoder.model_copy(update={"counts_per_turn": 800_000, "direction": -1})
+    load = axis.load_encoder.model_copy(update={"counts_per_turn": 28_800_000})
+    return axis.model_copy(update={"motor_encoder": motor, "load_encoder": load})
+
+
+AXIS = fine_axis()
+ORDERS = tuple(
+    MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in [(1, 6.4, 38.0), (2, 13.7, 161.5)]
+)
+FURTHER = tuple(
+    MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in [(1, 9.0, -70.0), (2, 5.0, 25.0)]
+)
+LOOP = {"offset_arcsec": 30.0, "width_deg": 25.0, "exponent": 1.7}
+BASIC: tuple[Effect, ...] = (Synchronous(orders=ORDERS), Hysteresis(**LOOP))
+
+
+def to_and_fro(bench: Exercise) -> None:
+    """Slow moves both ways, with reversals inside the loop."""
+    for distance in (150.0, -200.0, 100.0, -10.0, 12.0, -20.0, 150.0):
+        bench.move(distance, 60.0, 200.0)
+        bench.hold(0.5)
+
+
+def far(bench: Exercise) -> None:
+    """A load turn each way."""
+    for distance in (360.0 * N, -360.0 * N):
+        bench.move(distance, 900.0, 400.0)
+
+
+def several_speeds(bench: Exercise) -> None:
+    """Back and forth at several speeds."""
+    for speed in (60.0, 200.0, 900.0):
+        for distance in (1.0, -1.0):
+            bench.move(distance * (200.0 + speed), speed, 1500.0)
+            bench.hold(0.4)
+
+
+def brisk(bench: Exercise) -> None:
+    """Sines: much acceleration, no step of it that would make the load ring."""
+    bench.sine(200.0, 0.5, 3.0)
+    bench.sine(100.0, 1.0, 3.0)
+
+
+def nested(bench: Exercise) -> None:
+    """Small back-steps within the loop, each undone."""
+    bench.move(60.0, 30.0, 200.0)
+    for back in (2.0, 4.0, 8.0, 12.0):
+        for distance in (-60.0, 60.0 - back, -back, back, back):
+            bench.move(distance, 30.0, 200.0)
+
+
+def rests(bench: Exercise) -> None:
+    """Moves of seconds, and long rests."""
+    for distance in (800.0, -800.0):
+        bench.move(distance, 200.0, 800.0)
+        bench.hold(8.0)
+
+
+def within_lines(bench: Exercise) -> None:
+    """Slowly over some lines of the load encoder."""
+    bench.move(60.0, 20.0, 100.0)
+
+
+def stand(bench: Exercise) -> None:
+    bench.hold(4.0)
+
+
+def warming(truth: Truth) -> Truth:
+    """Surroundings that warm up by a kelvin a second, and an axis that began warmer."""
+    heat = {"ambient_k_per_hour": 3600.0, "time_constant_s": 0.5, "start_c": 25.0}
+    return truth.model_copy(update={"temperature": truth.temperature.model_copy(update=heat)})
+
+
+def hanging(truth: Truth) -> Truth:
+    """A mass of 5.9 Nm on the axis."""
+    data = truth.model_dump(by_alias=True)
+    data["load"]["gravity"] = {"mass_kg": 3.0, "arm_m": 0.2, "down_deg": -60.0}
+    return Truth.model_validate(data)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """An effect in its place in a model, a motion that shows it, and how much of it may be left."""
+
+    effects: tuple[Effect, ...]
+    lead: Callable[[Exercise], None] = to_and_fro
+    left: float = 0.03
+    """Of the effect's own part, rms: what a translation of another shape may leave."""
+    floor_arcsec: float = 0.5
+    """... and what the plant's dynamics add at these speeds."""
+    plant: Callable[[Truth], Truth] = lambda truth: truth
+
+
+SPRING = Compliance(
+    c1_arcsec_per_nm=14.0, c2_arcsec_per_nm=10.0, c3_arcsec_per_nm=8.0, torque1_nm=2.0, torque2_nm=4.0
+)
+BY_TEMPERATURE = {"tau_s": 3.0, "reference_c": 24.0}
+CASES = {
+    "synchronous": Case((Synchronous(orders=ORDERS),)),
+    "hysteresis": Case((Hysteresis(**LOOP),)),
+    "motor_order": Case((*BASIC, MotorOrders(orders=FURTHER))),
+    "motor_encoder_eccentricity": Case((*BASIC, MotorEncoderEccentricity(orders=FURTHER))),
+    "load_order": Case((*BASIC, LoadOrders(ratio=N, orders=FURTHER, origin="load_encoder")), far),
+    "flexspline_order": Case((*BASIC, FlexsplineOrders(ratio=N, orders=FURTHER)), far),
+    "direction_phase": Case((*BASIC, DirectionPhase(orders=ORDERS, shift_deg=4.0))),
+    "torque_modulation": Case(
+        (*BASIC, SPRING, TorqueModulation(orders=ORDERS, growth_percent_per_nm=8.0)), far, plant=hanging
+    ),
+    "compliance": Case((*BASIC, SPRING), far, plant=hanging),
+    "inertial_windup": Case((BASIC[0], InertialWindup(ratio=N, inertia_over_stiffness_s2=4e-5)), brisk),
+    "velocity_windup": Case(
+        (
+            *BASIC,
+            VelocityWindup(coulomb_arcsec=8.0, viscous_arcsec_s_per_deg=0.1, shear_deg_s=300.0),
+            InertialWindup(ratio=N, inertia_over_stiffness_s2=2e-5),
+        ),
+        several_speeds,
+        left=0.05,
+    ),
+    "channel_skew": Case((*BASIC, ChannelSkew.of_delay(2.0, N)), several_speeds, floor_arcsec=2.0),
+    "backlash": Case((*BASIC, Backlash.of_gap(40.0, N, softness=1.0)), left=0.15),
+    "hysteresis_memory": Case((BASIC[0], HysteresisMemory(**LOOP)), nested),
+    "hysteresis_parameters": Case(
+        (
+            *BASIC,
+            HysteresisParameters(base=Loop(**LOOP), **{**LOOP, "offset_arcsec": 50.0, "width_deg": 12.0}),
+        )
+    ),
+    "rate_dependence": Case(
+        (*BASIC, RateDependence(loop=Loop(**LOOP), growth_percent=40.0, reference_deg_s=30.0)),
+        several_speeds,
+        left=0.15,
+        floor_arcsec=1.5,
+    ),
+    "subdivisional_error": Case(
+        (
+            *BASIC,
+            SubdivisionalError(
+                lines_per_turn=9000,
+                orders=tuple(
+                    MotorOrder(order=k, amplitude_arcsec=1.5, phase_deg=p)
+                    for k, p in [(1, 50.0), (2, -110.0), (4, 90.0)]
+                ),
+            ),
+        ),
+        within_lines,
+        left=0.15,
+    ),
+    "zero_drift": Case((*BASIC, ZeroDrift(drift_arcsec_per_k=3.0, **BY_TEMPERATURE)), rests, plant=warming),
+    "amplitude_drift": Case(
+        (
+            *BASIC,
+            AmplitudeDrift(
+                orders=ORDERS,
+                loop=Loop(**LOOP),
+                ripple_percent_per_k=5.0,
+                friction_percent_per_k=-3.0,
+                tau_s=0.02,
+                reference_c=24.0,
+            ),
+        ),
+        plant=warming,
+    ),
+    "wear": Case(
+        (*BASIC, Wear(growth_arcsec_per_kiloturn=-1000.0, width_deg=0.3, exponent=0.9)),
+        several_speeds,
+        left=0.1,
+    ),
+    "creep": Case((*BASIC, Creep(parts=(Relaxation(amplitude_arcsec=-12.0, tau_s=1.5),))), rests),
+    "ratio_error": Case((*BASIC, RatioError(ramp_arcsec_per_turn=20.0))),
+    "count_loss": Case((*BASIC, CountLoss(steps=(Step(time_s=8.0, size_arcsec=-25.0),)))),
+    "vibration": Case(
+        (*BASIC, Vibration(frequency_hz=7.0, amplitude_arcsec=9.0, phase_deg=40.0)), stand, left=0.1
+    ),
+    "local_defect": Case(
+        (*BASIC, LocalDefect(ratio=N, height_arcsec=-30.0, centre_deg=80.0, half_width_deg=6.0)), far
+    ),
+}
+
+
+BEFORE_DEG = 60.0
+"""A first move that says how the loop stands; before it model and plant begin differently."""
+
+
+def quiet(truth: Truth) -> Truth:
+    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
+    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+
+
+def record_of(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
+    bench = Exercise(Machine(truth, 0))
+    bench.move(BEFORE_DEG, 100.0, 300.0)
+    bench.hold(0.5)
+    lead(bench)
+    readings = bench.readings()
+    return Record(
+        {
+            "time_s": readings.time_s,
+            "motor_position_deg": readings.motor_deg,
+            "load_position_deg": readings.load_deg,
+            "motor_target_deg": readings.target_deg,
+            "load_torque_nm": readings.load_torque_nm,
+            "motor_torque_nm": readings.motor_torque_nm,
+            "temperature_c": readings.temperature_c,
+        }
+    )
+
+
+def predicted(effects: tuple[Effect, ...], record: Record) -> np.ndarray:
+    target, time_s = record.columns["motor_target_deg"], record.time_s
+    speed = np.round(np.gradient(target, time_s), 6)  # a target that rests is not quite the same float
+    motion = dataclasses.replace(
+        record.motion(),
+        motor_deg=record.motor_position_deg,
+        motor_speed_deg_s=speed,
+        motor_acceleration_deg_s2=np.gradient(speed, time_s),
+        load_deg=record.load_position_deg,
+    )
+    return after(record, TransmissionModel(N, effects).predict(motion))
+
+
+def after(record: Record, error: np.ndarray) -> np.ndarray:
+    """What comes after the first move, without its mean."""
+    begun = int(np.argmax(record.columns["motor_target_deg"] >= BEFORE_DEG))
+    return error[begun:] - error[begun:].mean()
+
+
+def test_every_effect_of_the_catalogue_has_its_row() -> None:
+    assert set(TABLE) == set(CATALOGUE)
+    assert set(CASES) == set(CATALOGUE), "a new effect needs a case here that shows its translation"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_simulated_drive_errs_as_the_model_says(name: str) -> None:
+    case = CASES[name]
+    base = case.plant(default_truth(AXIS))
+    # A spring that nothing asks for would wind up without the model's knowledge.
+    translation = translate(
+        AXIS, TransmissionModel(N, case.effects), base if base != default_truth(AXIS) else None
+    )
+    record = record_of(quiet(translation.truth), case.lead)
+    error = after(record, record.transmission_error_arcsec(N))
+    told = predicted(case.effects, record)
+    own = told - predicted(tuple(each for each in case.effects if each.name != name), record)
+    size = float(np.sqrt(np.mean(own**2)))
+    left = float(np.sqrt(np.mean((error - told) ** 2)))
+    allowed = case.left * size + case.floor_arcsec
+    assert left < allowed, f"{left:.2f} arcsec of {size:.2f} are left"
+    assert allowed < 0.5 * size, "a drive that had nothing of it would pass"
+    assert [row.effect for row in translation.rows if row.counterpart is None] == []
+
+
+LAG = {"offset_arcsec": -25.0, "width_deg": 25.0, "exponent": 2.5}
+
+
+@pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
+def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[Effect]) -> None:
+    effects = (law(**LAG),)
+    translation = translate(AXIS, TransmissionModel(N, effects))
+    record = record_of(quiet(translation.truth), to_and_fro)
+    error, told = after(record, record.transmission_error_arcsec(N)), predicted(effects, record)
+    assert np.std(error - told) < 0.08 * np.std(told)
+    assert translation.truth.gear.hysteresis is None
+    assert translation.truth.load_.presliding
+
+
+def test_what_the_plant_cannot_do_is_said() -> None:
+    effects = (
+        Synchronous(orders=(*ORDERS, MotorOrder(order=600, amplitude_arcsec=1.0, phase_deg=0.0))),
+        TorqueModulation(orders=ORDERS, growth_percent_per_nm=1.0, signed=True),
+        Wear(growth_arcsec_per_kiloturn=10.0, width_deg=2.0),
+        CountLoss(steps=(Step(time_s=-5.0, size_arcsec=3.0),)),
+        Vibration(frequency_hz=900.0, amplitude_arcsec=1.0, phase_deg=0.0),
+    )
+    rows = {row.effect: row for row in translate(AXIS, TransmissionModel(N, effects)).rows}
+    assert "600" in rows["synchronous"].note
+    for name in ("torque_modulation", "wear", "count_loss", "vibration"):
+        assert rows[name].counterpart is None
+        assert rows[name].note
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_an_effect_of_typical_size_makes_a_plant(name: str) -> None:
+    model = TransmissionModel(N, BASIC)
+    effect = CATALOGUE[name].candidate(N, BASIC)
+    others = tuple(each for each in model.effects if each.name not in {name, effect.replaces})
+    translation = translate(AXIS, TransmissionModel(N, (*others, effect)))
+    row = next(row for row in translation.rows if row.effect == name)
+    assert row.counterpart or name == "wear", "its typical loop widens, which the plant's teeth do not"
+    Machine(translation.truth, 0).coast(4, braked=False)
+
+
+def test_what_the_model_does_not_speak_of_stays_as_it_was_given() -> None:
+    given = Truth.load(PROFILE)
+    translation = translate(AXIS, TransmissionModel(N, BASIC), given)
+    truth = translation.truth
+    assert truth.servo == given.servo
+    assert truth.load_.inertia_kg_m2 == given.load_.inertia_kg_m2
+    assert truth.gear.stiffness_nm_per_rad == given.gear.stiffness_nm_per_rad
+    assert [each.order for each in truth.gear.motor_orders] == [1, 2]
+    assert (truth.motor.encoder.counts_per_turn, truth.motor.encoder.direction) == (800_000, -1)
+    assert translate(AXIS, None, given).truth.gear == given.gear
+
+
+def test_a_plant_of_usual_values_follows_its_axis_file() -> None:
+    truth = translate(AxisConfig.load(PROFILE)).truth
+    record = record_of(truth, to_and_fro)
+    behind = record.columns["motor_target_deg"] - record.motor_position_deg
+    assert np.max(np.abs(behind)) < 1.0, "motor degrees"
+    assert np.max(np.abs(record.columns["motor_torque_nm"])) < truth.motor.rated_torque_nm
+    assert 30.0 < truth.load_frequency_hz < 50.0
+
+
+def test_a_model_of_another_gear_is_refused() -> None:
+    with pytest.raises(InputError, match="ratio"):
+        translate(AXIS, TransmissionModel(80.0, BASIC))
