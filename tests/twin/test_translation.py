@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import (
@@ -248,23 +249,15 @@ def quiet(truth: Truth) -> Truth:
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
 
-def record_of(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
-    bench = Exercise(Machine(truth, 0))
-    bench.move(BEFORE_DEG, 100.0, 300.0)
-    bench.hold(0.5)
-    lead(bench)
-    readings = bench.readings()
-    return Record(
-        {
-            "time_s": readings.time_s,
-            "motor_position_deg": readings.motor_deg,
-            "load_position_deg": readings.load_deg,
-            "motor_target_deg": readings.target_deg,
-            "load_torque_nm": readings.load_torque_nm,
-            "motor_torque_nm": readings.motor_torque_nm,
-            "temperature_c": readings.temperature_c,
-        }
-    )
+def exercised(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
+    """The record of a first move, and of what comes after it."""
+
+    def both(bench: Exercise) -> None:
+        bench.move(BEFORE_DEG, 100.0, 300.0)
+        bench.hold(0.5)
+        lead(bench)
+
+    return record_of(truth, both)
 
 
 def predicted(effects: tuple[Effect, ...], record: Record) -> np.ndarray:
@@ -299,7 +292,7 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str) -> None:
     translation = translate(
         AXIS, TransmissionModel(N, case.effects), base if base != default_truth(AXIS) else None
     )
-    record = record_of(quiet(translation.truth), case.lead)
+    record = exercised(quiet(translation.truth), case.lead)
     error = after(record, record.transmission_error_arcsec(N))
     told = predicted(case.effects, record)
     own = told - predicted(tuple(each for each in case.effects if each.name != name), record)
@@ -318,7 +311,7 @@ LAG = {"offset_arcsec": -25.0, "width_deg": 25.0, "exponent": 2.5}
 def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[Effect]) -> None:
     effects = (law(**LAG),)
     translation = translate(AXIS, TransmissionModel(N, effects))
-    record = record_of(quiet(translation.truth), to_and_fro)
+    record = exercised(quiet(translation.truth), to_and_fro)
     error, told = after(record, record.transmission_error_arcsec(N)), predicted(effects, record)
     assert np.std(error - told) < 0.08 * np.std(told)
     assert translation.truth.gear.hysteresis is None
@@ -365,7 +358,7 @@ def test_what_the_model_does_not_speak_of_stays_as_it_was_given() -> None:
 
 def test_a_plant_of_usual_values_follows_its_axis_file() -> None:
     truth = translate(AxisConfig.load(PROFILE)).truth
-    record = record_of(truth, to_and_fro)
+    record = exercised(truth, to_and_fro)
     behind = record.columns["motor_target_deg"] - record.motor_position_deg
     assert np.max(np.abs(behind)) < 1.0, "motor degrees"
     assert np.max(np.abs(record.columns["motor_torque_nm"])) < truth.motor.rated_torque_nm

@@ -1,0 +1,28 @@
+"""Records of the simulated axis without a bus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hdbridge.records.record import Record
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+
+def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> Record:
+    """What the encoders of a simulated axis say while it is led through moves; every channel is there."""
+    bench = Exercise(Machine(truth, seed))
+    lead(bench)
+    readings = bench.readings()
+    return Record(
+        {
+            "time_s": readings.time_s,
+            "motor_position_deg": readings.motor_deg,
+            "load_position_deg": readings.load_deg,
+            "motor_target_deg": readings.target_deg,
+            "load_torque_nm": readings.load_torque_nm,
+            "motor_torque_nm": readings.motor_torque_nm,
+            "temperature_c": readings.temperature_c,
+        }
+    )

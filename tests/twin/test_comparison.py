@@ -1,0 +1,120 @@
+"""Two records of the same commands, compared channel by channel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.exercised import record_of
+
+from hdbridge.errors import InputError
+from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Segment
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import ALL, Comparison, compare
+
+TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
+N = 50.0
+
+
+def steps_and_a_sweep(bench: Exercise) -> None:
+    for distance in (400.0, -250.0, 300.0, -450.0):
+        bench.move(distance, 800.0, 40_000.0)
+        bench.hold(0.6)
+    bench.move(360.0, 120.0, 1000.0)
+    bench.hold(0.5)
+
+
+def changed(**parts: dict[str, Any]) -> Truth:
+    data = TRUTH.model_dump(by_alias=True)
+    for name, values in parts.items():
+        data[name] |= values
+    return Truth.model_validate(data)
+
+
+def legs_of(record: Record) -> tuple[Segment, ...]:
+    end = float(record.time_s[-1])
+    return (
+        Segment(kind="step", start_s=0.0, end_s=end - 4.1),
+        Segment(kind="sweep", start_s=end - 4.0, end_s=end),
+    )
+
+
+@pytest.fixture(scope="module")
+def measured() -> Record:
+    return record_of(TRUTH, steps_and_a_sweep)
+
+
+def against(measured: Record, truth: Truth) -> Comparison:
+    return compare(measured, record_of(truth, steps_and_a_sweep, seed=1), legs_of(measured), N)
+
+
+def test_the_same_axis_differs_by_its_noise(measured: Record) -> None:
+    comparison = against(measured, TRUTH)
+    for channel in ("load_error", "following_error", "motor_torque"):
+        for kind in (ALL, "step", "sweep"):
+            row = comparison.row(channel, kind)
+            assert row is not None
+            assert row.difference <= 2.0 * row.noise
+    settling = comparison.row("settling_time")
+    assert settling is not None
+    assert settling.count == 5
+    assert settling.difference <= 2.0 * settling.noise
+    at_rest = comparison.row("noise_at_rest:load_error")
+    assert at_rest is not None
+    # Noise of the load encoder (0.3 arcsec) and its count (0.45 arcsec).
+    assert at_rest.measured == pytest.approx(np.hypot(0.3, 0.45 / np.sqrt(12.0)), rel=0.2)
+
+
+def test_more_friction_shows_in_the_torque(measured: Record) -> None:
+    comparison = against(measured, changed(motor={"coulomb_nm": 0.068}))
+    row = comparison.row("motor_torque")
+    assert row is not None
+    # 0.034 Nm while it moves, and what the integral holds at rest.
+    assert 0.015 < row.difference < 0.045
+    assert row.in_noise > 10.0
+    load = comparison.row("load_error", "sweep")
+    assert load is not None
+    assert load.difference < 1.5
+
+
+def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
+    comparison = against(
+        measured, changed(gear={"stiffness_nm_per_rad": 7000.0, "damping_nm_s_per_rad": 6.0})
+    )
+    settling, overshoot = comparison.row("settling_time"), comparison.row("overshoot")
+    assert settling is not None
+    assert overshoot is not None
+    assert settling.simulated > 1.5 * settling.measured
+    assert overshoot.simulated > 1.5 * overshoot.measured
+    spectrum = comparison.spectra["load_error"]
+    peak_hz = spectrum.frequency_hz[np.argmax(spectrum.difference * (spectrum.frequency_hz > 10.0))]
+    assert peak_hz == pytest.approx(np.sqrt(7000.0 / 0.25) / (2.0 * np.pi), rel=0.15)
+
+
+def test_zeros_that_differ_between_parts_are_no_difference(measured: Record) -> None:
+    twice = concatenate([measured, measured])
+    load = twice.load_position_deg.copy()
+    load[twice.starts[1] :] += 0.5
+    shifted = Record({**twice.columns, "load_position_deg": load}, starts=twice.starts)
+    comparison = compare(shifted, twice, (), N)
+    row = comparison.row("load_error")
+    assert row is not None
+    assert row.difference < 1e-6
+
+
+def test_figures_are_told_for_machines(measured: Record) -> None:
+    told = against(measured, TRUTH).as_dict()["figures"]
+    assert {each["kind"] for each in told} == {ALL, "step", "sweep"}
+    assert all(np.isfinite(each["difference"]) for each in told)
+
+
+def test_records_of_other_rows_are_refused(measured: Record) -> None:
+    with pytest.raises(InputError, match="one for one"):
+        compare(measured, measured.rows(0, 100), (), N)
+    bare = Record({name: column for name, column in measured.columns.items() if name != "motor_target_deg"})
+    with pytest.raises(InputError, match="motor_target_deg"):
+        compare(bare, bare, (), N)
