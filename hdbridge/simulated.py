@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) -> Iterator[Drive]:
     """The drive of an axis, simulated in this process and faster than real time; not booted yet.
 
-    ``truth`` says what the axis is like (docs/truth-file.md): without it the ``truth.yaml`` that lies next to
-    the axis file. The same truth and seed give the same frames, bit for bit. InputError where there is no
-    truth, or it is wrong.
+    ``truth`` says what the axis is like (docs/truth-file.md): without it the ``twin.yaml`` that lies next to
+    the axis file, or else the ``truth.yaml``. The same truth and seed give the same frames, bit for bit.
+    InputError where there is no truth, or it is wrong.
     """
     # Loaded here: who masters a real drive needs no simulated one.
     from hdbridge.drive import Drive  # noqa: PLC0415
+    from hdbridge.files.profile import Profile  # noqa: PLC0415
     from hdbridge.sim.lockstep import simulated_bench  # noqa: PLC0415
 
-    known = Path(truth) if truth is not None else axis.path.parent / "truth.yaml"
+    known = Path(truth) if truth is not None else Profile.find(str(axis.path)).simulated
     with (
         simulated_bench(known, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
         Drive(bus, axis, clock) as drive,

@@ -1,4 +1,4 @@
-"""``hdbridge model``: the history of an axis's model: look, compare, commit, go back."""
+"""``hdbridge model``: the history of an axis's model, or its twin: look, compare, commit, go back."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from rich.table import Table
 from hdbridge.cli.options import JsonOption, ProfileArgument, console, print_table, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
-from hdbridge.model import store
+from hdbridge.model import TransmissionModel
 from hdbridge.model.difference import Difference, diff
-from hdbridge.model.store import ACTIVE, PENDING, Version
+from hdbridge.model.store import ACTIVE, MODELS, PENDING, Store, Version
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
+TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis instead of its models.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -34,12 +35,16 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="model")
 
 
-def log(profile: ProfileArgument, json_file: JsonOption = None) -> None:
+def log(profile: ProfileArgument, twin: TwinOption = False, json_file: JsonOption = None) -> None:
     """List every model of the profile, newest first, with dates and reasons."""
+    store = _store(twin)
     versions = store.log(_folder(profile))
-    write_json(json_file, {"schema": "hdbridge.model-log/1", "models": [_version(each) for each in versions]})
+    write_json(
+        json_file,
+        {"schema": f"hdbridge.{store.noun}-log/1", f"{store.noun}s": [_version(each) for each in versions]},
+    )
     if not versions:
-        console.print("no model yet: calibrate first")
+        console.print(f"no {store.noun} yet: {store.first}")
     for each in versions:
         mark = "active" if each.active else "pending" if each.number is None else ""
         name = f"{each.number:4d}" if each.number else "   -"
@@ -59,26 +64,27 @@ def compare(
     after: Annotated[
         str | None, typer.Argument(metavar="AFTER", help="The same; else the pending one.")
     ] = None,
+    twin: TwinOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Show what changed between two models, parameter by parameter."""
-    folder = _folder(profile)
+    folder, store = _folder(profile), _store(twin)
     names = {name for each in store.log(folder) for name in _names(each)}
     if after is None and before is None and PENDING not in names:
         others = f", or name two of: {', '.join(sorted(names))}" if len(names) > 1 else ""
-        raise InputError(f"{folder}: there is no pending model to compare with; calibrate first{others}")
+        raise InputError(f"{folder}: there is no pending {store.noun} to compare with; {store.first}{others}")
     if before is None and ACTIVE not in names:
         later = store.find(folder, after or PENDING)
-        earlier_name, model = "no model", later.model.only(())
+        earlier_name, old = f"no {store.noun}", None
     else:
         earlier = store.find(folder, before or ACTIVE)
-        earlier_name, model = earlier.name, earlier.model
+        earlier_name, old = earlier.name, earlier.content
         later = store.find(folder, after or (PENDING if before is None or PENDING in names else ACTIVE))
-    rows = diff(model, later.model)
+    rows = _rows(old, later.content)
     write_json(
         json_file,
         {
-            "schema": "hdbridge.model-diff/1",
+            "schema": f"hdbridge.{store.noun}-diff/1",
             "before": earlier_name,
             "after": later.name,
             "parameters": [{**row._asdict(), "changed": row.changed} for row in rows],
@@ -87,32 +93,54 @@ def compare(
     _print_diff(f"{earlier_name} → {later.name}", rows)
 
 
-def commit(profile: ProfileArgument) -> None:
+def commit(profile: ProfileArgument, twin: TwinOption = False) -> None:
     """Make the pending model the active one; the one before stays in the history."""
+    store = _store(twin)
     number = store.commit(_folder(profile), _now())
-    console.print(f"model {number} is active")
+    console.print(f"{store.noun} {number} is active")
 
 
 def activate(
     profile: ProfileArgument,
     version: Annotated[int, typer.Argument(min=1, help="Its number in the log.")],
     reason: ReasonOption = "",
+    twin: TwinOption = False,
 ) -> None:
     """Make a model of the history the active one."""
+    store = _store(twin)
     number = store.activate(_folder(profile), version, reason, _now())
-    console.print(f"model {number} is active")
+    console.print(f"{store.noun} {number} is active")
 
 
-def rollback(profile: ProfileArgument, reason: ReasonOption = "") -> None:
+def rollback(profile: ProfileArgument, reason: ReasonOption = "", twin: TwinOption = False) -> None:
     """Undo the last activation: the model before it is active again."""
+    store = _store(twin)
     number = store.rollback(_folder(profile), reason, _now())
-    console.print(f"model {number} is active again")
+    console.print(f"{store.noun} {number} is active again")
 
 
-def discard(profile: ProfileArgument) -> None:
+def discard(profile: ProfileArgument, twin: TwinOption = False) -> None:
     """Throw the pending model away; the recording that it came from stays."""
+    store = _store(twin)
     store.discard(_folder(profile))
-    console.print("the pending model is gone; its recording is kept")
+    console.print(f"the pending {store.noun} is gone; its recording is kept")
+
+
+def _store(twin: bool) -> Store[Any]:
+    if not twin:
+        return MODELS
+    from hdbridge.twin.kept import TWINS
+
+    return TWINS
+
+
+def _rows(before: Any, after: Any) -> list[Difference]:
+    """The differences of two models, or of two twins; ``before`` may be None."""
+    if isinstance(after, TransmissionModel):
+        return diff(before or after.only(()), after)
+    from hdbridge.twin import difference
+
+    return difference.diff(before.truth if before else None, after.truth)
 
 
 def _folder(profile: str) -> Path:
@@ -149,7 +177,7 @@ def _print_diff(title: str, rows: Sequence[Difference]) -> None:
     print_table(table)
 
 
-def _names(version: Version) -> set[str]:
+def _names(version: Version[Any]) -> set[str]:
     return {version.name, ACTIVE} if version.active else {version.name}
 
 
@@ -159,7 +187,7 @@ def _cell(value: Any) -> str:
     return f"{value:.3f}" if isinstance(value, float) else escape(str(value))
 
 
-def _version(each: Version) -> dict[str, Any]:
+def _version(each: Version[Any]) -> dict[str, Any]:
     return {
         "name": each.name,
         "number": each.number,

@@ -66,7 +66,9 @@ SimulateOption = Annotated[
 TruthOption = Annotated[
     Path | None,
     typer.Option(
-        "--truth", metavar="TRUTH.yaml", help="What the simulated axis is like; else the profile's."
+        "--truth",
+        metavar="TRUTH.yaml",
+        help="What the simulated axis is like; else the profile's twin, or its truth file.",
     ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")]
@@ -139,8 +141,17 @@ def connected(
             notes.print(f"this process: {conditions}")
             yield bus, MonotonicClock()
         return
-    with simulated_bench(truth or profile.truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
+    plant = simulated_by(profile, truth)
+    with simulated_bench(plant, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
         yield bus, clock
+
+
+def simulated_by(profile: Profile, truth: Path | None) -> Path:
+    """The file that says what the simulated axis is; where that is its twin, it is said."""
+    plant = truth or profile.simulated
+    if plant == profile.twin:
+        notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
+    return plant
 
 
 class _TimeColumn(ProgressColumn):

@@ -16,6 +16,7 @@ from hdbridge.cli.options import (
     MachineArgument,
     SeedOption,
     check_bus_options,
+    simulated_by,
 )
 from hdbridge.errors import InputError
 
@@ -91,7 +92,9 @@ def _simulation(machine: Machine, truths: list[Path], seed: int, speed: float) -
     if truths and len(truths) != len(machine.axes):
         names = ", ".join(axis.name for axis in machine.axes)
         raise InputError(f"--truth stands {len(truths)} times; expected once for each of the axes {names}")
-    paths = tuple(path.absolute() for path in truths) or tuple(axis.profile.truth for axis in machine.axes)
+    paths = tuple(path.absolute() for path in truths) or tuple(
+        simulated_by(axis.profile, None) for axis in machine.axes
+    )
     for path in paths:
         Truth.load(path)
     return Simulation(paths, seed, speed)

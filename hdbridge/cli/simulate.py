@@ -15,6 +15,7 @@ from hdbridge.cli.options import (
     TruthOption,
     load_axis,
     notes,
+    simulated_by,
 )
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import InputError
@@ -59,7 +60,7 @@ def simulate(
             "give --interface udp_multicast --channel 239.0.0.1, or socketcan, "
             "or use 'hdbridge step --simulate'"
         )
-    known = Truth.load(truth or files.truth)
+    known = Truth.load(simulated_by(files, truth))
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
         node = SimulatedDrive(

@@ -54,7 +54,10 @@ class Output:
     kind: Kind
 
 
-_PROFILE: Final = frozenset({"axis.yaml", "model.yaml", "pending.yaml", "truth.yaml"})
+_PROFILE: Final = frozenset(
+    {"axis.yaml", "model.yaml", "pending.yaml", "truth.yaml", "twin.yaml", "pending-twin.yaml"}
+)
+_HISTORIES: Final = frozenset({"history", "twin-history"})
 _RECORDING: Final = frozenset(
     {"recording.yaml", "model.yaml", "active.yaml", "calibration.json", "improvement.json"}
 )
@@ -118,7 +121,7 @@ def _check_belongs_to_no_folder(output: Output) -> None:
     """Of a profile or a recording only a pending model may be written, or a first one."""
     path = _resolved(output.path)
     folder, name = path.parent, path.name.casefold()
-    profile = folder.parent if folder.name.casefold() == "history" else folder
+    profile = folder.parent if folder.name.casefold() in _HISTORIES else folder
     if (profile / "axis.yaml").exists() and (profile != folder or name in _PROFILE):
         if output.kind is Kind.MODEL and profile == folder:
             if name == "pending.yaml" or (name == "model.yaml" and not path.exists()):

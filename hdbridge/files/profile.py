@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from hdbridge.files.bundled import bundled_profile
+
+TWIN_NAME: Final = "twin.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +23,16 @@ class Profile:
     def folder(self) -> Path:
         """Where the axis file lies, and with it the history of its models."""
         return self.axis.parent
+
+    @property
+    def twin(self) -> Path:
+        """The twin's file, which may not be there."""
+        return self.folder / TWIN_NAME
+
+    @property
+    def simulated(self) -> Path:
+        """What the simulated drive of this axis is: its twin where there is one, else the truth file."""
+        return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Profile:

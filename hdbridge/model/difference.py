@@ -40,28 +40,28 @@ def diff(before: TransmissionModel, after: TransmissionModel) -> list[Difference
 def _parameters(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], Any]]:
     yield ("", "ratio"), model.ratio
     for effect in model.effects:
-        for name, value in _flat(effect.parameters()):
+        for name, value in flat(effect.parameters()):
             yield (effect.name, name), value
 
 
 def _half_widths(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], float]]:
     for effect, widths in model.uncertainty.items():
-        for name, value in _flat(widths):
+        for name, value in flat(widths):
             if isinstance(value, int | float):
                 yield (effect, name), float(value)
 
 
-def _flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Leaves of nested parameters; the items of a list go by their ``order``, where they have one."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from _flat(inner, f"{name}.{key}" if name else key)
+            yield from flat(inner, f"{name}.{key}" if name else key)
     elif isinstance(value, list | tuple):
         for number, inner in enumerate(value):
             if isinstance(inner, dict) and "order" in inner:
                 rest = {key: each for key, each in inner.items() if key != "order"}
-                yield from _flat(rest, f"{name}[{inner['order']}]")
+                yield from flat(rest, f"{name}[{inner['order']}]")
             else:
-                yield from _flat(inner, f"{name}[{number}]")
+                yield from flat(inner, f"{name}[{number}]")
     else:
         yield name, value

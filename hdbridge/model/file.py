@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hdbridge.axis import AxisConfig, Identity, Teeth
+from hdbridge.axis import Identity, Teeth
 from hdbridge.effects import CATALOGUE, Effect, conflicts
 from hdbridge.files.expectation import nearest
 from hdbridge.files.yamlfile import Document, Hex, dump_yaml
@@ -100,15 +100,6 @@ def text_of(
     if provenance:
         data["provenance"] = _hexadecimal(provenance)
     return _HEADER + dump_yaml(data)
-
-
-def binding(axis: AxisConfig, identity: Identity | None = None) -> dict[str, Any]:
-    """What binds a model to an axis: entries of its provenance."""
-    return {
-        "axis": axis.name,
-        "drive": (identity or axis.drive.identity).model_dump(exclude_none=True),
-        "gear": axis.gear.model_dump(include={"ratio", "teeth"}, exclude_none=True),
-    }
 
 
 def _effect(document: Document, number: int, entry: EffectEntry, before: list[str]) -> Effect:

@@ -6,6 +6,9 @@
                   history/0001.yaml   each version that was ever active, byte for byte
                   history/log.yaml    what was activated when, and why
 
+Twins are kept alike, in files of their own names (`hdbridge.twin.kept`): what is said of models here holds
+for whatever a `Store` keeps.
+
 Each file is replaced atomically, in such an order that a kill at any moment leaves a usable profile: a
 version is in the history before it becomes active, and the log is written last. Which version is active is
 not noted anywhere, so it cannot be noted wrongly: it is the one whose bytes model.yaml has.
@@ -17,12 +20,12 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Generic, Literal, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -33,7 +36,7 @@ from hdbridge.model import TransmissionModel
 
 PENDING = "pending"
 ACTIVE = "active"
-_HEADER = "# What was activated when, by hdbridge; read it with `hdbridge model log`.\n"
+_HEADER = "# What was activated when, by hdbridge; read it with `{}`.\n"
 
 Action = Literal["found", "commit", "activate", "rollback"]
 
@@ -60,9 +63,27 @@ class LogFile(BaseModel):
     activations: tuple[Activation, ...] = Field(description="what was activated, oldest first")
 
 
+class Kept(Protocol):
+    """What a store keeps: something with a provenance that binds it to an axis and its drive."""
+
+    @property
+    def provenance(self) -> Mapping[str, Any]: ...
+    def told(self, **provenance: Any) -> Self:
+        """The same, with this in its provenance."""
+        ...
+
+    def save(self, path: Path | str) -> None: ...
+    def check_ratio(self, axis: AxisConfig) -> None: ...
+    def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self: ...
+    def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None: ...
+
+
+K = TypeVar("K", bound=Kept)
+
+
 @dataclass(frozen=True, slots=True)
-class Version:
-    """A model of the profile."""
+class Version(Generic[K]):
+    """A version of what is kept."""
 
     number: int | None
     """None for the pending model, and for an active one that was put there or edited by hand."""
@@ -71,7 +92,7 @@ class Version:
     date: str
     """When it was made, as its file says."""
     reason: str
-    model: TransmissionModel
+    content: K
     activations: tuple[Activation, ...] = ()
 
     @property
@@ -80,103 +101,198 @@ class Version:
         return str(self.number) if self.number else ACTIVE if self.active else PENDING
 
 
-def log(profile: Path) -> list[Version]:
-    """Every model of the profile: the pending one, an active one that is not in the history, newest first."""
-    activations = _activations(profile)
-    active = _bytes(profile / "model.yaml")
-    versions = []
-    known = False
-    for number, path in sorted(_history(profile).items(), reverse=True):
-        is_active = path.read_bytes() == active
-        known = known or is_active
-        own = tuple(each for each in activations if each.version == number)
-        versions.append(_version(number, path, is_active, own))
-    if active is not None and not known:
-        versions.insert(0, _version(None, profile / "model.yaml", True))
-    if (profile / "pending.yaml").exists():
-        versions.insert(0, _version(None, profile / "pending.yaml", False))
-    return versions
+@dataclass(frozen=True, slots=True)
+class Store(Generic[K]):
+    """What is kept of one kind in a profile's folder."""
 
+    noun: str
+    """What complaints call one."""
+    active: str
+    """Name of the active one's file."""
+    pending: str
+    """Name of the pending one's file."""
+    history: str
+    """Name of the folder with all versions."""
+    first: str
+    """What to do where there is none, for complaints."""
+    command: str
+    """The command that prints the log."""
+    load: Callable[[Path], K]
 
-def find(profile: Path, name: str) -> Version:
-    """A model by name: ``active``, ``pending`` or a version's number; InputError says which there are."""
-    versions = log(profile)
-    for version in versions:
-        if name in {version.name, f"{version.number:04d}" if version.number else ""} or (
-            name == ACTIVE and version.active
-        ):
-            return version
-    names = ", ".join(dict.fromkeys(each for version in versions for each in _names(version)))
-    raise InputError(
-        f"{profile}: there is no model '{name}'; expected one of: {names or 'none yet, calibrate first'}"
-    )
+    def log(self, profile: Path) -> list[Version[K]]:
+        """Every version: the pending one, an active one that is not in the history, newest first."""
+        activations = self._activations(profile)
+        active = _bytes(profile / self.active)
+        versions = []
+        known = False
+        for number, path in sorted(self._history(profile).items(), reverse=True):
+            is_active = path.read_bytes() == active
+            known = known or is_active
+            own = tuple(each for each in activations if each.version == number)
+            versions.append(self._version(number, path, is_active, own))
+        if active is not None and not known:
+            versions.insert(0, self._version(None, profile / self.active, True))
+        if (profile / self.pending).exists():
+            versions.insert(0, self._version(None, profile / self.pending, False))
+        return versions
 
+    def find(self, profile: Path, name: str) -> Version[K]:
+        """One by name: ``active``, ``pending`` or a version's number; InputError says which there are."""
+        versions = self.log(profile)
+        for version in versions:
+            if name in {version.name, f"{version.number:04d}" if version.number else ""} or (
+                name == ACTIVE and version.active
+            ):
+                return version
+        names = ", ".join(dict.fromkeys(each for version in versions for each in _names(version)))
+        raise InputError(
+            f"{profile}: there is no {self.noun} '{name}'; "
+            f"expected one of: {names or f'none yet, {self.first}'}"
+        )
 
-def propose(
-    profile: Path, model: TransmissionModel, reason: str, date: datetime, identity: Identity | None = None
-) -> Path:
-    """Keep a model as pending, bound to the profile's axis and the drive that answered.
+    def propose(
+        self,
+        profile: Path,
+        content: K,
+        reason: str,
+        date: datetime,
+        identity: Identity | None = None,
+    ) -> Path:
+        """Keep one as pending, bound to the profile's axis and the drive that answered.
 
-    It takes the place of another pending one. Returns the file. InputError where it is of another gear ratio.
-    """
-    axis = AxisConfig.load(profile)
-    model.check_ratio(axis)
-    provenance = {**model.provenance, "date": _iso(date), "reason": reason}
-    with _locked(profile):
-        replace(model, provenance=provenance).bound_to(axis, identity).save(profile / "pending.yaml")
-    return profile / "pending.yaml"
+        It takes the place of another pending one. Returns the file. InputError where it is of another gear
+        ratio.
+        """
+        axis = AxisConfig.load(profile)
+        content.check_ratio(axis)
+        with _locked(profile):
+            told = content.told(date=_iso(date), reason=reason)
+            told.bound_to(axis, identity).save(profile / self.pending)
+        return profile / self.pending
 
+    def commit(self, profile: Path, date: datetime, identity: Identity | None = None) -> int:
+        """Make the pending one the active one; returns its number.
 
-def commit(profile: Path, date: datetime, identity: Identity | None = None) -> int:
-    """Make the pending model the active one; returns its number.
+        ``identity`` is what the drive answers now; InputError where it, the axis or the gear is another.
+        """
+        pending = profile / self.pending
+        with _locked(profile):
+            content = _bytes(pending)
+            if content is None:
+                raise InputError(f"{profile}: there is no pending {self.noun}; {self.first}")
+            reason = self._check(profile, pending, identity).provenance.get("reason", "")
+            number = self._activate(profile, content, "commit", str(reason), date)
+            pending.unlink()
+        return number
 
-    ``identity`` is what the drive answers now; InputError where it, the axis or the gear is not the model's.
-    """
-    pending = profile / "pending.yaml"
-    with _locked(profile):
-        content = _bytes(pending)
-        if content is None:
-            raise InputError(f"{profile}: there is no pending model; calibrate first")
-        reason = _check(profile, pending, identity).provenance.get("reason", "")
-        number = _activate(profile, content, "commit", str(reason), date)
-        pending.unlink()
-    return number
+    def discard(self, profile: Path) -> None:
+        """Throw the pending one away; InputError when there is none."""
+        with _locked(profile):
+            try:
+                (profile / self.pending).unlink()
+            except FileNotFoundError:
+                raise InputError(f"{profile}: there is no pending {self.noun}") from None
 
-
-def discard(profile: Path) -> None:
-    """Throw the pending model away; InputError when there is none."""
-    with _locked(profile):
-        try:
-            (profile / "pending.yaml").unlink()
-        except FileNotFoundError:
-            raise InputError(f"{profile}: there is no pending model") from None
-
-
-def activate(
-    profile: Path, version: int, reason: str, date: datetime, identity: Identity | None = None
-) -> int:
-    """Make a version of the history the active model; the one before stays in the history."""
-    path = _history(profile).get(version)
-    if path is None:
-        numbers = ", ".join(map(str, sorted(_history(profile)))) or "none yet, calibrate first"
-        raise InputError(f"{profile}: there is no version {version}; expected one of: {numbers}")
-    with _locked(profile):
-        _check(profile, path, identity)
-        return _activate(profile, path.read_bytes(), "activate", reason, date)
-
-
-def rollback(profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
-    """Undo the last activation that is not undone yet; returns the number that is active now."""
-    with _locked(profile):
-        active = _bytes(profile / "model.yaml")
-        earlier = undone(_activations(profile), _number(profile, active) if active is not None else None)
-        path = _history(profile).get(earlier) if earlier else None
+    def activate(
+        self, profile: Path, version: int, reason: str, date: datetime, identity: Identity | None = None
+    ) -> int:
+        """Make a version of the history the active one; the one before stays in the history."""
+        path = self._history(profile).get(version)
         if path is None:
-            raise InputError(
-                f"{profile}: no model was active before this one; there is nothing to roll back to"
+            numbers = ", ".join(map(str, sorted(self._history(profile)))) or f"none yet, {self.first}"
+            raise InputError(f"{profile}: there is no version {version}; expected one of: {numbers}")
+        with _locked(profile):
+            self._check(profile, path, identity)
+            return self._activate(profile, path.read_bytes(), "activate", reason, date)
+
+    def rollback(self, profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
+        """Undo the last activation that is not undone yet; returns the number that is active now."""
+        with _locked(profile):
+            active = _bytes(profile / self.active)
+            earlier = undone(
+                self._activations(profile), self._number(profile, active) if active is not None else None
             )
-        _check(profile, path, identity)
-        return _activate(profile, path.read_bytes(), "rollback", reason, date)
+            path = self._history(profile).get(earlier) if earlier else None
+            if path is None:
+                raise InputError(
+                    f"{profile}: no {self.noun} was active before this one; there is nothing to roll back to"
+                )
+            self._check(profile, path, identity)
+            return self._activate(profile, path.read_bytes(), "rollback", reason, date)
+
+    def _activate(self, profile: Path, content: bytes, action: Action, reason: str, date: datetime) -> int:
+        """History first, then the active one, the log last."""
+        activations = self._activations(profile)
+        before = _bytes(profile / self.active)
+        if before is not None and before != content and self._number(profile, before) is None:
+            try:
+                self.load(profile / self.active)
+            except (InputError, UnicodeDecodeError):  # edited by hand and broken: kept, but it is no version
+                write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
+            else:
+                reason_found = "was there, but not in the history"
+                activations.append(
+                    Activation(
+                        date=_iso(date),
+                        action="found",
+                        version=self._keep(profile, before),
+                        reason=reason_found,
+                    )
+                )
+                self._write_log(profile, activations)
+        number = self._keep(profile, content)
+        write_atomically(profile / self.active, content)
+        activations.append(Activation(date=_iso(date), action=action, version=number, reason=reason))
+        self._write_log(profile, activations)
+        return number
+
+    def _keep(self, profile: Path, content: bytes) -> int:
+        """The number of the version with this content, put into the history if it is not there."""
+        number = self._number(profile, content)
+        if number is None:
+            number = max(self._history(profile), default=0) + 1
+            write_atomically(self._history_folder(profile) / f"{number:04d}.yaml", content)
+        return number
+
+    def _history_folder(self, profile: Path) -> Path:
+        folder = profile / self.history
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as problem:
+            raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
+        return folder
+
+    def _check(self, profile: Path, path: Path, identity: Identity | None) -> K:
+        content = self.load(path)
+        content.check_bound_to(AxisConfig.load(profile), identity)
+        return content
+
+    def _number(self, profile: Path, content: bytes) -> int | None:
+        history = sorted(self._history(profile).items(), reverse=True)
+        return next((number for number, path in history if path.read_bytes() == content), None)
+
+    def _history(self, profile: Path) -> dict[int, Path]:
+        return {
+            int(path.stem): path for path in (profile / self.history).glob("*.yaml") if path.stem.isdecimal()
+        }
+
+    def _activations(self, profile: Path) -> list[Activation]:
+        path = profile / self.history / "log.yaml"
+        return list(read_yaml(path).validate(LogFile).activations) if path.exists() else []
+
+    def _write_log(self, profile: Path, activations: Sequence[Activation]) -> None:
+        data = {
+            "schema": "hdbridge.history/1",
+            "activations": [each.model_dump(exclude_defaults=True) for each in activations],
+        }
+        write_atomically(profile / self.history / "log.yaml", _HEADER.format(self.command) + dump_yaml(data))
+
+    def _version(
+        self, number: int | None, path: Path, active: bool, own: tuple[Activation, ...] = ()
+    ) -> Version[K]:
+        content = self.load(path)
+        date, reason = (str(content.provenance.get(key, "")) for key in ("date", "reason"))
+        return Version(number, path, active, date, reason, content, own)
 
 
 def undone(activations: Sequence[Activation], active: int | None) -> int | None:
@@ -206,83 +322,7 @@ def _unwind(stack: list[int], version: int) -> None:
         stack.pop()
 
 
-def _activate(profile: Path, content: bytes, action: Action, reason: str, date: datetime) -> int:
-    """History first, then the active model, the log last."""
-    activations = _activations(profile)
-    before = _bytes(profile / "model.yaml")
-    if before is not None and before != content and _number(profile, before) is None:
-        try:
-            TransmissionModel.from_text(before.decode())
-        except (InputError, UnicodeDecodeError):  # edited by hand and broken: kept, but it is no version
-            write_atomically(_history_folder(profile) / "unreadable.yaml", before)
-        else:
-            reason_found = "was there, but not in the history"
-            activations.append(
-                Activation(
-                    date=_iso(date), action="found", version=_keep(profile, before), reason=reason_found
-                )
-            )
-            _write_log(profile, activations)
-    number = _keep(profile, content)
-    write_atomically(profile / "model.yaml", content)
-    activations.append(Activation(date=_iso(date), action=action, version=number, reason=reason))
-    _write_log(profile, activations)
-    return number
-
-
-def _keep(profile: Path, content: bytes) -> int:
-    """The number of the version with this content, put into the history if it is not there."""
-    number = _number(profile, content)
-    if number is None:
-        number = max(_history(profile), default=0) + 1
-        write_atomically(_history_folder(profile) / f"{number:04d}.yaml", content)
-    return number
-
-
-def _history_folder(profile: Path) -> Path:
-    folder = profile / "history"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as problem:
-        raise InputError(f"{folder}: cannot be made: {problem.strerror}") from None
-    return folder
-
-
-def _check(profile: Path, path: Path, identity: Identity | None) -> TransmissionModel:
-    model = TransmissionModel.load(path)
-    model.check_bound_to(AxisConfig.load(profile), identity)
-    return model
-
-
-def _number(profile: Path, content: bytes) -> int | None:
-    history = sorted(_history(profile).items(), reverse=True)
-    return next((number for number, path in history if path.read_bytes() == content), None)
-
-
-def _history(profile: Path) -> dict[int, Path]:
-    return {int(path.stem): path for path in (profile / "history").glob("*.yaml") if path.stem.isdecimal()}
-
-
-def _activations(profile: Path) -> list[Activation]:
-    path = profile / "history" / "log.yaml"
-    return list(read_yaml(path).validate(LogFile).activations) if path.exists() else []
-
-
-def _write_log(profile: Path, activations: Sequence[Activation]) -> None:
-    data = {
-        "schema": "hdbridge.history/1",
-        "activations": [each.model_dump(exclude_defaults=True) for each in activations],
-    }
-    write_atomically(profile / "history" / "log.yaml", _HEADER + dump_yaml(data))
-
-
-def _version(number: int | None, path: Path, active: bool, own: tuple[Activation, ...] = ()) -> Version:
-    model = TransmissionModel.load(path)
-    date, reason = (str(model.provenance.get(key, "")) for key in ("date", "reason"))
-    return Version(number, path, active, date, reason, model, own)
-
-
-def _names(version: Version) -> list[str]:
+def _names(version: Version[K]) -> list[str]:
     return [version.name, ACTIVE] if version.active else [version.name]
 
 
@@ -331,3 +371,17 @@ def _locked(profile: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
+
+
+MODELS: Final = Store(
+    "model",
+    "model.yaml",
+    "pending.yaml",
+    "history",
+    "calibrate first",
+    "hdbridge model log",
+    TransmissionModel.load,
+)
+"""The models of a profile."""
+log, find, propose, commit = MODELS.log, MODELS.find, MODELS.propose, MODELS.commit
+discard, activate, rollback = MODELS.discard, MODELS.activate, MODELS.rollback

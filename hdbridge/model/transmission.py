@@ -10,11 +10,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from hdbridge.axis import AxisConfig, Identity, Teeth
+from hdbridge.axis import AxisConfig, Identity
 from hdbridge.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
-from hdbridge.model.file import Provenance, binding, content_of, text_of
+from hdbridge.model.binding import binding, check_binding
+from hdbridge.model.file import content_of, text_of
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,10 @@ class TransmissionModel:
         """Write the model file atomically."""
         write_atomically(path, self.dump())
 
+    def told(self, **provenance: Any) -> Self:
+        """The same model, with this in its provenance."""
+        return replace(self, provenance={**self.provenance, **provenance})
+
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
         """The same model, bound to an axis and the drive that answered there (else the axis file's)."""
         return replace(self, provenance={**self.provenance, **binding(axis, identity)})
@@ -97,31 +102,10 @@ class TransmissionModel:
         drive leaves open is not compared, and neither is the revision: new firmware does not change a gear.
         """
         self.check_ratio(axis)
-        bound = Provenance.model_validate(self.provenance)
-        if bound.axis is not None and bound.axis != axis.name:
-            raise self._of_another("axis", f"'{bound.axis}'", f"'{axis.name}'", axis)
-        teeth = bound.gear.teeth if bound.gear else None
-        if teeth and axis.gear.teeth and teeth != axis.gear.teeth:
-            raise self._of_another("gear", _teeth_words(teeth), _teeth_words(axis.gear.teeth), axis)
-        present = identity or axis.drive.identity
-        for name in ("vendor_id", "product_code", "serial"):
-            theirs, ours = getattr(bound.drive, name, None), getattr(present, name)
-            if theirs is not None and ours is not None and theirs != ours:
-                raise self._of_another("drive", f"{name} {theirs:#x}", f"{ours:#x}", axis)
-
-    def _of_another(self, what: str, theirs: str, ours: str, axis: AxisConfig) -> InputError:
-        return InputError(
-            f"{self._name()}: provenance.{what}: this model was made for {theirs}, but the {what} here is "
-            f"{ours} ({axis.path}); use the model of this {what}, or calibrate it (if it is the same gear, "
-            f"correct provenance.{what} in the model's file)"
-        )
+        check_binding(self.provenance, axis, identity, self._name(), "model", "calibrate it")
 
     def _name(self) -> str:
         return str(self.path) if self.path else "this model"
-
-
-def _teeth_words(teeth: Teeth) -> str:
-    return f"{teeth.flexspline}/{teeth.circular_spline} teeth, {teeth.output} output"
 
 
 class ModelTracker(Tracker):

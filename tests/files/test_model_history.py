@@ -91,7 +91,7 @@ def test_every_version_stays_in_the_history_byte_for_byte(profile):
     ]  # fmt: skip
     assert (profile / "history" / "0003.yaml").read_bytes() == (profile / "model.yaml").read_bytes()
     assert offset(profile) == 42
-    assert store.find(profile, "0002").model == store.find(profile, "2").model
+    assert store.find(profile, "0002").content == store.find(profile, "2").content
     assert store.find(profile, "active").number == 3
 
 

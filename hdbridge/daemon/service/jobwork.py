@@ -224,7 +224,7 @@ def _improve(work: Work, options: ImproveOptions, rig: Rig, told: Told) -> dict[
 
 def _model(work: Work, version: int | None) -> TransmissionModel:
     if version is not None:
-        return store.find(work.profile.folder, str(version)).model
+        return store.find(work.profile.folder, str(version)).content
     if not work.profile.model.exists():
         raise InputError(f"{work.profile.model}: there is no active model; calibrate and commit one first")
     return TransmissionModel.load(work.profile.model)

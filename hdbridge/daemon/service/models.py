@@ -96,8 +96,8 @@ class AxisModels:
         InputError where there is no such model, or it is of another axis, drive or gear.
         """
         found = store.find(self._axis.profile.folder, str(version))
-        found.model.check_bound_to(self._axis.config, identity)
-        return self.made(InUse(found.model, self.in_use.scheme, found.number, found.path))
+        found.content.check_bound_to(self._axis.config, identity)
+        return self.made(InUse(found.content, self.in_use.scheme, found.number, found.path))
 
     def activate(
         self, version: int | Literal["pending", "active"], identity: Identity, date: datetime
@@ -128,7 +128,7 @@ class AxisModels:
         in_use = self.in_use
         if version is not None and version != in_use.version:
             found = store.find(self._axis.profile.folder, str(version))
-            self.in_use = InUse(found.model, scheme, version, found.path)
+            self.in_use = InUse(found.content, scheme, version, found.path)
         else:
             self.in_use = InUse(in_use.model, scheme, in_use.version, in_use.file)
 

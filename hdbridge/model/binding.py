@@ -1,0 +1,57 @@
+"""What a model, or a twin, is bound to: the axis, the gear and the drive that it was made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hdbridge.axis import AxisConfig, Identity, Teeth
+from hdbridge.errors import InputError
+from hdbridge.model.file import Provenance
+
+
+def binding(axis: AxisConfig, identity: Identity | None = None) -> dict[str, Any]:
+    """What binds a model to an axis: entries of its provenance."""
+    return {
+        "axis": axis.name,
+        "drive": (identity or axis.drive.identity).model_dump(exclude_none=True),
+        "gear": axis.gear.model_dump(include={"ratio", "teeth"}, exclude_none=True),
+    }
+
+
+def check_binding(
+    provenance: Mapping[str, Any],
+    axis: AxisConfig,
+    identity: Identity | None,
+    name: str,
+    noun: str,
+    instead: str,
+) -> None:
+    """Refuse (InputError) what is of another drive, axis or gear; ``noun`` is what complaints call it.
+
+    ``identity`` is what the drive answered; without it the axis file's is taken. What the provenance or the
+    drive leaves open is not compared, and neither is the revision: new firmware does not change a gear.
+    """
+    bound = Provenance.model_validate(provenance)
+
+    def of_another(what: str, theirs: str, ours: str) -> InputError:
+        return InputError(
+            f"{name}: provenance.{what}: this {noun} was made for {theirs}, but the {what} here is "
+            f"{ours} ({axis.path}); use the {noun} of this {what}, or {instead} (if it is the same gear, "
+            f"correct provenance.{what} in the {noun}'s file)"
+        )
+
+    if bound.axis is not None and bound.axis != axis.name:
+        raise of_another("axis", f"'{bound.axis}'", f"'{axis.name}'")
+    teeth = bound.gear.teeth if bound.gear else None
+    if teeth and axis.gear.teeth and teeth != axis.gear.teeth:
+        raise of_another("gear", _teeth_words(teeth), _teeth_words(axis.gear.teeth))
+    present = identity or axis.drive.identity
+    for key in ("vendor_id", "product_code", "serial"):
+        theirs, ours = getattr(bound.drive, key, None), getattr(present, key)
+        if theirs is not None and ours is not None and theirs != ours:
+            raise of_another("drive", f"{key} {theirs:#x}", f"{ours:#x}")
+
+
+def _teeth_words(teeth: Teeth) -> str:
+    return f"{teeth.flexspline}/{teeth.circular_spline} teeth, {teeth.output} output"

@@ -1,0 +1,103 @@
+"""The twin of an axis as a file: a truth file that says where its values come from, kept as models are.
+
+profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
+              pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
+              twin-history/       each version that was ever active, and the log
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.errors import InputError
+from hdbridge.files.profile import TWIN_NAME
+from hdbridge.files.yamlfile import Hex, dump_yaml, write_atomically
+from hdbridge.model.binding import binding, check_binding
+from hdbridge.model.file import Provenance
+from hdbridge.model.store import Store
+from hdbridge.records.record import WRONG_RATIO
+from hdbridge.sim.truth import Truth
+
+HEADER: Final = (
+    "# The twin of an axis, by hdbridge: what the simulated drive is, learned from recordings.\n"
+    "# docs/truth-file.md describes its keys, docs/twin.md how it came about.\n"
+)
+
+
+@dataclass(frozen=True)
+class KeptTwin:
+    """A twin with the file that it was read from."""
+
+    truth: Truth
+    path: Path | None = field(default=None, compare=False)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a twin's file; InputError with file:line:column."""
+        return cls(Truth.load(path), Path(path))
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Axis, drive and gear that it is bound to, date, reason, recordings."""
+        return self.truth.provenance
+
+    def told(self, **provenance: Any) -> Self:
+        """The same twin, with this in its provenance."""
+        known = {**self.truth.provenance, **provenance}
+        return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
+
+    def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
+        """The same twin, bound to an axis and the drive that answered there (else the axis file's)."""
+        return self.told(**binding(axis, identity))
+
+    def check_ratio(self, axis: AxisConfig) -> None:
+        """Refuse (InputError) a twin of another gear ratio than the axis file's.
+
+        The ratio that it was measured with; its gear's own may be off by what `ratio_error` is.
+        """
+        bound = Provenance.model_validate(self.truth.provenance).gear
+        ratio, allowed = (bound.ratio, 1e-9) if bound else (self.truth.gear.ratio, WRONG_RATIO)
+        if not math.isclose(ratio, axis.gear.ratio, rel_tol=allowed):
+            raise InputError(
+                f"{self._name()}: gear.ratio: this twin is of a gear with ratio {ratio:g}, but {axis.path} "
+                f"says {axis.gear.ratio:g}; use the twin of this gear, or make one"
+            )
+
+    def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Refuse (InputError) a twin of another drive, axis or gear."""
+        self.check_ratio(axis)
+        check_binding(self.truth.provenance, axis, identity, self._name(), "twin", "make one")
+
+    def dump(self) -> str:
+        """The file's text; what it says reads back exactly, and what is as usual is left out."""
+        data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
+        drive = data.get("provenance", {}).get("drive")
+        if isinstance(drive, dict):
+            data["provenance"]["drive"] = {
+                name: Hex(value) if isinstance(value, int) else value for name, value in drive.items()
+            }
+        return HEADER + dump_yaml(data)
+
+    def save(self, path: Path | str) -> None:
+        """Write the file atomically."""
+        write_atomically(path, self.dump())
+
+    def _name(self) -> str:
+        return str(self.path) if self.path else "this twin"
+
+
+TWINS: Final = Store(
+    "twin",
+    TWIN_NAME,
+    "pending-twin.yaml",
+    "twin-history",
+    "make one with 'hdbridge twin'",
+    "hdbridge model log PROFILE --twin",
+    KeptTwin.load,
+)
+"""The twins of a profile."""

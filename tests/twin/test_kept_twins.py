@@ -1,0 +1,102 @@
+"""Twins of a profile: pending until committed, kept, undone; and used wherever an axis is simulated."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from support.command import run_here
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
+from hdbridge.model import store
+from hdbridge.sim.truth import Truth
+from hdbridge.simulated import simulated
+from hdbridge.twin.difference import diff
+from hdbridge.twin.kept import TWINS, KeptTwin
+
+DATE = datetime(2026, 3, 1, 12, tzinfo=UTC)
+SERIAL = Identity(vendor_id=0x4844, product_code=0x402, serial=17)
+
+
+@pytest.fixture
+def profile(tmp_path: Path) -> Path:
+    source = Path(__file__).parents[2] / "profiles" / "demo"
+    folder = tmp_path / "demo"
+    shutil.copytree(source, folder)
+    return folder
+
+
+def twin_of(profile: Path, coulomb_nm: float = 0.05) -> KeptTwin:
+    truth = Truth.load(profile)
+    motor = truth.motor.model_copy(update={"coulomb_nm": coulomb_nm})
+    intervals = {"motor.coulomb_nm": (0.9 * coulomb_nm, 1.1 * coulomb_nm)}
+    return KeptTwin(truth.model_copy(update={"motor": motor, "intervals": intervals}))
+
+
+def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(profile: Path) -> None:
+    before = Profile.find(str(profile)).simulated
+    assert before.name == "truth.yaml"
+    TWINS.propose(profile, twin_of(profile, 0.05), "made of a recording", DATE, SERIAL)
+    assert Profile.find(str(profile)).simulated == before
+    assert [each.name for each in TWINS.log(profile)] == ["pending"]
+    assert TWINS.commit(profile, DATE, SERIAL) == 1
+    assert Profile.find(str(profile)).simulated == profile / "twin.yaml"
+    TWINS.propose(profile, twin_of(profile, 0.06), "after a repair", DATE, SERIAL)
+    assert TWINS.commit(profile, DATE, SERIAL) == 2
+    assert TWINS.rollback(profile, "no better", DATE, SERIAL) == 1
+    assert KeptTwin.load(profile / "twin.yaml").truth.motor.coulomb_nm == 0.05
+    # The models of the same profile are kept apart.
+    assert store.log(profile) == []
+
+
+def test_what_a_twin_says_reads_back_exactly(profile: Path) -> None:
+    twin = twin_of(profile).told(reason="made of a recording").bound_to(AxisConfig.load(profile), SERIAL)
+    twin.save(profile / "pending-twin.yaml")
+    assert KeptTwin.load(profile / "pending-twin.yaml") == twin
+    assert "serial: 0x11" in (profile / "pending-twin.yaml").read_text()
+
+
+def test_a_twin_of_another_drive_or_gear_is_refused(profile: Path) -> None:
+    TWINS.propose(profile, twin_of(profile), "", DATE, SERIAL)
+    with pytest.raises(InputError, match="this twin was made for serial 0x11"):
+        TWINS.commit(profile, DATE, Identity(vendor_id=0x4844, product_code=0x402, serial=18))
+    other = twin_of(profile)
+    gear = other.truth.gear.model_copy(update={"ratio": 80.0})
+    with pytest.raises(InputError, match="this twin is of a gear with ratio 80"):
+        TWINS.propose(profile, KeptTwin(other.truth.model_copy(update={"gear": gear})), "", DATE)
+
+
+def test_the_simulated_drive_is_the_twin_where_there_is_one(profile: Path) -> None:
+    data = Truth.load(profile).model_dump(by_alias=True)
+    data["motor"]["encoder"]["counts_per_turn"] = 4000
+    (profile / "twin.yaml").write_text(KeptTwin(Truth.model_validate(data)).dump())
+    axis = AxisConfig.load(profile)
+    with simulated(axis) as drive, pytest.raises(Exception, match="4000"):
+        drive.boot()
+    with simulated(axis, profile / "truth.yaml") as drive:
+        drive.boot()
+
+
+def test_the_difference_of_two_twins_has_half_widths(profile: Path) -> None:
+    rows = {f"{row.effect}.{row.parameter}": row for row in diff(Truth.load(profile), twin_of(profile).truth)}
+    changed = rows["motor.coulomb_nm"]
+    assert (changed.before, changed.after) == (0.034, 0.05)
+    assert changed.half_width == pytest.approx(0.005)
+    assert [name for name, row in rows.items() if row.changed] == ["motor.coulomb_nm"]
+    assert "gear.motor_orders[2].amplitude_arcsec" in rows
+
+
+def test_the_model_command_keeps_twins_too(profile: Path) -> None:
+    assert "no twin yet" in run_here(profile, "model", "log", profile, "--twin").stdout
+    TWINS.propose(profile, twin_of(profile), "made of a recording", DATE)
+    assert "coulomb_nm" in run_here(profile, "model", "diff", profile, "--twin").stdout
+    assert "twin 1 is active" in run_here(profile, "model", "commit", profile, "--twin").stdout
+    run_here(profile, "model", "log", profile, "--twin", "--json", "log.json")
+    told = json.loads((profile / "log.json").read_text())
+    assert told["schema"] == "hdbridge.twin-log/1"
+    assert [each["reason"] for each in told["twins"]] == ["made of a recording"]
