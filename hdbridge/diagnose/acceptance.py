@@ -23,8 +23,8 @@ from hdbridge.effects import (
     SubdivisionalError,
     Wear,
 )
-from hdbridge.effects.hysteresis import branches
 from hdbridge.effects.orders import OrderSeries
+from hdbridge.effects.path import branches
 from hdbridge.estimation.hypothesis import Estimator, Fitted, orthonormal
 
 BLOCKS_S = (1.0, 5.0)

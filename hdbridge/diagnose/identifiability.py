@@ -12,7 +12,6 @@ from hdbridge.diagnose.result import Identifiability
 from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, PENALTY
 from hdbridge.effects import (
     CATALOGUE,
-    CAUSES,
     Compliance,
     CountLoss,
     Effect,
@@ -22,6 +21,7 @@ from hdbridge.effects import (
     Step,
     SubdivisionalError,
     Vibration,
+    causes,
 )
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
@@ -66,7 +66,7 @@ def identifiability(
     best = {name: max(left[name], key=lambda each: each[2]) for name in names}
     spans = {name: _orthonormal(best[name][0]) for name in names}
     result: dict[str, Identifiability] = {}
-    for cause in CAUSES:
+    for cause in causes():
         if cause not in best:
             result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
             continue

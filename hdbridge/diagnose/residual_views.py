@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hdbridge.effects import Channel, FloatArray, Motion
 from hdbridge.effects.base import MEASURED
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.path import branches
 from hdbridge.units import DEG_PER_TURN
 
 if TYPE_CHECKING:

@@ -9,10 +9,15 @@ from hdbridge.effects.base import (
     Channel,
     Compensable,
     Effect,
+    Experiment,
     FloatArray,
     Moment,
     Motion,
+    Moves,
+    Observations,
+    Part,
     Shape,
+    Sought,
     Start,
     Tracker,
     readings,
@@ -20,7 +25,7 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.carried import Loop, loop_of, orders_of
 from hdbridge.effects.channel_skew import ChannelSkew
-from hdbridge.effects.combine import compensable, conflicts, extended, fall_bound, refreshed
+from hdbridge.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
 from hdbridge.effects.compliance import Compliance
 from hdbridge.effects.count_loss import CountLoss, Step
 from hdbridge.effects.creep import Creep, Relaxation
@@ -46,6 +51,7 @@ from hdbridge.effects.velocity_windup import VelocityWindup
 from hdbridge.effects.vibration import Vibration
 from hdbridge.effects.wear import Wear
 from hdbridge.effects.zero_drift import ZeroDrift
+from hdbridge.errors import InputError
 
 CATALOGUE: dict[str, type[Effect]] = {
     each.name: each
@@ -79,19 +85,43 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 """Every effect by its canonical name."""
 
-CAUSES: tuple[str, ...] = tuple(name for name in CATALOGUE if name not in {"synchronous", "hysteresis"})
-"""Names of the causes that a diagnosis can find in addition to the two basic parts of a model."""
+_BASIC = frozenset({Synchronous.name, Hysteresis.name})
+"""The two parts that a model has from its calibration."""
+
+
+def causes() -> tuple[str, ...]:
+    """Names of the causes that a diagnosis can find in addition to the two basic parts of a model."""
+    return tuple(name for name in CATALOGUE if name not in _BASIC)
+
+
+def register(kind: type[Effect]) -> type[Effect]:
+    """Add a kind of effect to the catalogue of this process; a decorator for effects of one's own.
+
+    From then on model files may hold it, a fit and a compensation use it, and a diagnosis can find it.
+    InputError where the name is taken by another kind.
+    """
+    if CATALOGUE.get(kind.name, kind) is not kind:
+        raise InputError(
+            f"an effect '{kind.name}' is in the catalogue already ({CATALOGUE[kind.name].__module__}); "
+            "give yours another name"
+        )
+    CATALOGUE[kind.name] = kind
+    return kind
+
+
+def withdraw(kind: type[Effect]) -> None:
+    """Take a kind of effect out of the catalogue again."""
+    CATALOGUE.pop(kind.name, None)
 
 
 def aliases_of(name: str) -> tuple[str, ...]:
     """The causes that this one can be taken for, whichever of the two says so, in the catalogue's order."""
-    own = CATALOGUE[name].about.aliases
+    own = CATALOGUE[name].about.aliases if name in CATALOGUE else ()
     return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
 
 
 __all__ = [
     "CATALOGUE",
-    "CAUSES",
     "MEASURED",
     "SLOT",
     "AmplitudeDrift",
@@ -105,6 +135,7 @@ __all__ = [
     "Creep",
     "DirectionPhase",
     "Effect",
+    "Experiment",
     "FlexsplineOrders",
     "FloatArray",
     "Hysteresis",
@@ -119,11 +150,15 @@ __all__ = [
     "MotorEncoderEccentricity",
     "MotorOrder",
     "MotorOrders",
+    "Moves",
+    "Observations",
     "Observer",
+    "Part",
     "RateDependence",
     "RatioError",
     "Relaxation",
     "Shape",
+    "Sought",
     "Start",
     "Step",
     "SubdivisionalError",
@@ -136,14 +171,18 @@ __all__ = [
     "Wear",
     "ZeroDrift",
     "aliases_of",
+    "causes",
     "compensable",
     "conflicts",
     "extended",
     "fall_bound",
+    "in_place",
     "loop_of",
     "moments",
     "orders_of",
     "readings",
     "refreshed",
+    "register",
     "unmet",
+    "withdraw",
 ]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -18,11 +18,15 @@ from hdbridge.effects.base import (
     Linear,
     Moment,
     Motion,
+    Observations,
+    Part,
     Start,
     Tracker,
 )
-from hdbridge.effects.carried import Loop, growth_of, loop_of, orders_of
+from hdbridge.effects.carried import Loop, growth_of, has_loop, has_orders, loop_of, orders_of
+from hdbridge.effects.motor_order import MotorOrders
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+from hdbridge.effects.reference import REACH_K, Told, nearest
 from hdbridge.effects.torque import TorqueGrowth
 from hdbridge.effects.warmth import Warmed, WarmthState
 
@@ -50,6 +54,11 @@ class AmplitudeDrift(Linear, Warmed):
     compensable: ClassVar[Compensable] = Compensable(
         True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
     )
+    carries: ClassVar[Mapping[Part, str]] = {
+        Part.ORDERS: "orders",
+        Part.LOOP: "loop",
+        Part.GROWTH: "under_load",
+    }
     linear: ClassVar[tuple[str, ...]] = ("ripple_percent_per_k", "friction_percent_per_k")
     typical: ClassVar[Mapping[str, Any]] = {
         "ripple_percent_per_k": 0.5,
@@ -69,6 +78,63 @@ class AmplitudeDrift(Linear, Warmed):
     friction_percent_per_k: Annotated[
         float, Field(ge=-10, le=10, description="growth of the loop per kelvin")
     ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[AmplitudeDrift]:
+        """By the temperature where that changes, else by time."""
+        if has_orders(base) and has_loop(base):
+            for driven_by, tau_s in cls.lags(observations):
+                yield cls(
+                    orders=orders_of(base), loop=loop_of(base), ripple_percent_per_k=1.0,
+                    friction_percent_per_k=1.0, tau_s=tau_s, driven_by=driven_by,
+                )  # fmt: skip
+
+    def follows_motion(self) -> bool:
+        """Where it is mostly the loop's: a ripple lies in both directions alike."""
+        ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
+        friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
+        return abs(self.ripple_percent_per_k) * ripple <= friction
+
+    def scales(self) -> tuple[Part, Effect]:
+        """Loop or ripple, whichever changes by more."""
+        if self.follows_motion():
+            return Part.LOOP, self.loop.law()
+        return Part.ORDERS, MotorOrders(orders=self.orders)
+
+    def restated(self, observations: Observations) -> Iterator[Self]:
+        """Counted from temperatures of the record.
+
+        At a reference that is far away the line may have no amplitude left of which to tell a share.
+        """
+        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
+        if temperature is not None:
+            for each in (float(np.max(temperature)), float(np.min(temperature))):
+                yield self.model_copy(update={"reference_c": round(each, 1)})
+
+    def retold(
+        self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
+    ) -> tuple[Effect, ...] | None:
+        """Counted from the temperature at which the rest of the model is nearest to what was ``given``."""
+        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
+        if temperature is None or self.driven_by != "temperature":
+            return None
+        coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K
+        growth = (self.ripple_percent_per_k, self.friction_percent_per_k)
+        told = nearest(self.orders, self.loop, growth, now[: len(given)], given)
+        if told is None or not coldest <= self.reference_c + told.warmer_k <= hottest:
+            return None
+        return tuple(
+            each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
+        )
+
+    def _counted(self, told: Told) -> AmplitudeDrift:
+        return self.model_copy(
+            update={
+                "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,
+                "friction_percent_per_k": self.friction_percent_per_k * told.per_loop,
+                "reference_c": round(self.reference_c + told.warmer_k, 1),
+            }
+        )
 
     def needs(self) -> frozenset[Channel]:
         """Those of the warmth, and the torque where the orders grow with it."""

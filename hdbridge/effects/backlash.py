@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -12,10 +12,12 @@ from hdbridge.effects.base import (
     Cause,
     Compensable,
     Effect,
+    Experiment,
     FloatArray,
     Linear,
     Moment,
     Motion,
+    Observations,
     Shape,
     Start,
     Tracker,
@@ -48,6 +50,14 @@ class Backlash(Linear):
         aliases=("hysteresis_parameters", "wear", "hysteresis_memory"),
         source="play operator (dead zone with a resting load)",
         size="2-36 arcsec",
+        apart={
+            "hysteresis_parameters": Experiment(
+                3, "repeat the small reversals with a load torque to one side: it holds a gap closed"
+            ),
+            "hysteresis_memory": Experiment(
+                3, "reversals of 0.1 to 2 deg of the motor, each beyond where the last one turned"
+            ),
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         True,
@@ -56,6 +66,8 @@ class Backlash(Linear):
         "a load that swings freely leave it out",
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
+    ordinary_arcsec: ClassVar[float] = 1.0
+    """Half a gap of two arcsec: no more than an elastic loop of another shape leaves in its place."""
     linear: ClassVar[tuple[str, ...]] = ("gap_arcsec",)
 
     gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
@@ -68,6 +80,23 @@ class Backlash(Linear):
         """A gap that takes ``softness`` times its ideal motor angle; from 1.25 on it has an inverse."""
         crossing = max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
         return cls(gap_arcsec=gap_arcsec, crossing_deg=crossing)
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
+        """From a hard contact to a soft one."""
+        yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
+
+    def implausible(self, observations: Observations) -> str:
+        """It shows at reversals only."""
+        return "" if observations.reversals >= 2 else "no reversal in which play would show"
+
+    def tidied(self, ratio: float) -> Self:
+        """As wide as an inverse needs.
+
+        The load rests while the motor crosses; noise lets a fit make that angle smaller than it can be.
+        """
+        gentlest = self.of_gap(self.gap_arcsec, ratio)
+        return gentlest if gentlest.crossing_deg > self.crossing_deg else self
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A gap of one arcsec, shape (n, 1)."""

@@ -1,8 +1,9 @@
 """What an effect is: one physical cause of transmission error, written once.
 
 From one description an effect is predicted over a whole record (vectorised), tracked on line (sample by
-sample, in plain floats), fitted (columns that are linear in its coefficients, for given shape parameters)
-and named as a cause. Batch and on-line give the same numbers; `tests/effects` holds every effect to it.
+sample, in plain floats), fitted (columns that are linear in its coefficients, for given shape parameters),
+proposed for a record, and named as a cause. Batch and on-line give the same numbers; `tests/effects` holds
+every effect to it.
 
 An effect is a frozen pydantic model: its fields are the parameters of the model file, with the unit in the
 name, a physical range and a description. Nothing here does any I/O.
@@ -15,213 +16,75 @@ inverse is trying out. Otherwise one cycle's correction would be differenced int
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import Any, ClassVar, Final, NamedTuple, Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from hdbridge.errors import InputError
+from hdbridge.effects import coordinate as over
+from hdbridge.effects.coordinate import Coordinate
+from hdbridge.effects.described import (
+    Cause,
+    Coefficient,
+    Compensable,
+    Experiment,
+    Moves,
+    Part,
+    Shape,
+    Sought,
+    Stretch,
+)
+from hdbridge.effects.motion import (
+    AT_REST,
+    MEASURED,
+    SLOT,
+    BoolArray,
+    Channel,
+    FloatArray,
+    Moment,
+    Motion,
+    Start,
+    measured_by_all,
+    missing_error,
+    readings,
+)
+from hdbridge.effects.observations import Observations
 
-FloatArray = NDArray[np.float64]
+__all__ = [
+    "AT_REST",
+    "MEASURED",
+    "SLOT",
+    "BoolArray",
+    "Cause",
+    "Channel",
+    "Coefficient",
+    "Compensable",
+    "Coordinate",
+    "Effect",
+    "Experiment",
+    "FloatArray",
+    "Linear",
+    "Memoryless",
+    "Moment",
+    "Motion",
+    "Moves",
+    "Observations",
+    "Part",
+    "Shape",
+    "Sought",
+    "Start",
+    "Stretch",
+    "Tracker",
+    "measured_by_all",
+    "missing_error",
+    "readings",
+    "unmet",
+]
 
-
-class Channel(Enum):
-    """A quantity that an effect needs to know besides the motor angle; its value is its column in a record.
-
-    This is the one table of measured channels: a row here is read from the drive, recorded, handed to effects
-    and offered to a diagnosis without any further edit.
-    """
-
-    _value_: str
-    about: str
-    """A measured one in words; empty for all others."""
-    unit: str
-    at_rest: float
-    """What stands in where a measured one is not known."""
-    axis_key: str
-    """The key of the axis file that says where it comes from; empty where every drive tells it."""
-
-    def __new__(
-        cls, column: str, about: str = "", unit: str = "", at_rest: float = 0.0, axis_key: str = ""
-    ) -> Self:
-        """A row of the table; derived channels have a column only."""
-        self = object.__new__(cls)
-        self._value_, self.about, self.unit, self.at_rest, self.axis_key = (
-            column,
-            about,
-            unit,
-            at_rest,
-            axis_key,
-        )
-        return self
-
-    LOAD_TORQUE = "load_torque_nm", "torque at the load", "Nm", 0.0, "load_torque"
-    MOTOR_TORQUE = "motor_torque_nm", "torque of the motor", "Nm"
-    TEMPERATURE = "temperature_c", "temperature of the gear", "\N{DEGREE SIGN}C", 20.0, "temperature"
-
-    TIME = "time_s"
-    SPEED = "motor_speed_deg_s"
-    """Of the command; derived from angle and time where it is not given."""
-    ACCELERATION = "motor_acceleration_deg_s2"
-    """Of the command; derived from angle and time where it is not given."""
-    DIRECTION = "direction"
-    """Sign of the last motion of the command, held at rest; always derived."""
-    LOAD_ANGLE = "load_deg"
-    """Predicted load angle: motor angle / N plus the model's error (never the noisy measured one)."""
-
-    @property
-    def title(self) -> str:
-        """Its name in words, without the unit."""
-        return str(self.value).rpartition("_")[0].replace("_", " ")
-
-
-MEASURED: Final = tuple(each for each in Channel if each.about)
-"""The measured channels, in the order in which a `Moment` has them."""
-SLOT: Final[Mapping[Channel, int]] = {each: slot for slot, each in enumerate(MEASURED)}
-"""Where each measured channel stands in `Moment.measured`."""
-AT_REST: Final = tuple(each.at_rest for each in MEASURED)
-"""Readings where none is known."""
-
-
-def readings(known: Mapping[Channel, float]) -> tuple[float, ...]:
-    """`Moment.measured` of what is known; the rest as at rest."""
-    return tuple(known.get(each, each.at_rest) for each in MEASURED)
-
-
-class Start(Enum):
-    """What is known about the gear's past at the first sample.
-
-    A saturated start is what a pre-conditioning move leaves behind: the axis last moved in that direction
-    by more than any memory it has. A virgin start knows nothing and takes the elastic state as zero.
-    """
-
-    VIRGIN = 0
-    FORWARD = 1
-    BACKWARD = -1
-
-
-class Moment(NamedTuple):
-    """The channels of one control cycle; the motor angle is given apart, because the inverse varies it.
-
-    `kinematics.Observer` makes one per cycle from the command, with the derived channels filled in.
-    """
-
-    time_s: float = 0.0
-    measured: tuple[float, ...] = AT_REST
-    """Readings of the channels in `MEASURED`, in that order; `SLOT` says where each stands."""
-    motor_speed_deg_s: float = 0.0
-    motor_acceleration_deg_s2: float = 0.0
-    direction: int = 0
-    """1 or -1, held at rest; 0 before the first motion: then what `Start` says counts."""
-    load_deg: float = 0.0
-    """Predicted load angle, degrees of the load, multi-turn."""
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """What an axis did: the inputs of a prediction, as arrays of one length.
-
-    ``motor_deg`` is the *commanded* multi-turn motor angle where the record has it: a quantised encoder
-    chatters at every reversal, and a hysteresis law with an infinite initial slope turns that into error.
-    """
-
-    motor_deg: FloatArray
-    """Motor angle, degrees, multi-turn, shape (n,)."""
-    time_s: FloatArray | None = None
-    measured: Mapping[Channel, FloatArray] = field(default_factory=dict)
-    """The measured channels that are known (`MEASURED`), each of shape (n,)."""
-    motor_speed_deg_s: FloatArray | None = None
-    """Given where something better is known than differences of a quantised angle."""
-    motor_acceleration_deg_s2: FloatArray | None = None
-    load_deg: FloatArray | None = None
-    """Predicted load angle, degrees of the load; only the load encoder's own lines need it so exactly."""
-
-    def __len__(self) -> int:
-        """Number of samples."""
-        return len(self.motor_deg)
-
-    def available(self) -> frozenset[Channel]:
-        """The channels that these arrays give, derived ones included."""
-        found = {each for each in Channel if self._given(each) is not None}
-        found.add(Channel.DIRECTION)
-        if self.time_s is not None:
-            found |= {Channel.SPEED, Channel.ACCELERATION}
-        return frozenset(found)
-
-    def channel(self, channel: Channel, effect: str) -> FloatArray:
-        """A channel as given, shape (n,); InputError where it is not, naming the effect that asks."""
-        values = self._given(channel)
-        if values is None:
-            raise missing_error(effect, frozenset({channel}))
-        return values
-
-    def _given(self, channel: Channel) -> FloatArray | None:
-        if channel in SLOT:
-            return self.measured.get(channel)
-        values: FloatArray | None = getattr(self, channel.value, None)
-        return values
-
-
-def measured_by_all(parts: Sequence[Mapping[Channel, FloatArray]]) -> dict[Channel, FloatArray]:
-    """The measured channels that every part has, the parts one after the other."""
-    common = [each for each in MEASURED if all(each in part for part in parts)]
-    return {each: np.concatenate([part[each] for part in parts]) for each in common}
-
-
-def missing_error(effect: str, channels: frozenset[Channel]) -> InputError:
-    """The one complaint about channels that are not there."""
-    names = ", ".join(sorted(each.value for each in channels))
-    return InputError(
-        f"the effect '{effect}' needs the channel {names}, which is not there; "
-        "record it (a column of that name), or leave the effect out of the model"
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Shape:
-    """A parameter that the effect is *not* linear in, with the range in which a fit may look for it."""
-
-    name: str
-    lower: float
-    upper: float
-    logarithmic: bool = False
-    """True where the fit should step in the logarithm (widths, time constants)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cause:
-    """The effect in words, for reports and the generated page of the catalogue."""
-
-    title: str
-    """A short name in the field's own terms."""
-    equation: str
-    """The law in plain text."""
-    signature: str
-    """What one sees in a record."""
-    consequence: str
-    """What it does to the axis."""
-    remedy: str
-    """What a person can do about it."""
-    experiment: str
-    """The measurement that separates it from its look-alikes."""
-    aliases: tuple[str, ...] = ()
-    """Names of the causes it can be taken for."""
-    source: str = ""
-    """Where the equation comes from."""
-    size: str = ""
-    """How large it typically is."""
-
-
-@dataclass(frozen=True, slots=True)
-class Compensable:
-    """Whether the compensation should make up for an effect, and why (not)."""
-
-    possible: bool
-    why: str
+GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
+"""Values of each shape that the default proposals try, by the number of shapes."""
 
 
 class Tracker(ABC):
@@ -264,6 +127,27 @@ class Effect(BaseModel, ABC):
     """Whether the load really moves so, and can be told in advance; see `is_compensable`."""
     replaces: ClassVar[str] = ""
     """Name of the effect in whose place it stands in a model, where it does not add to the others."""
+    part: ClassVar[Part | None] = None
+    """The part of a model that it is."""
+    changes: ClassVar[Part | None] = None
+    """The part of a model that it is a change of, where it is no addition to it."""
+    carries: ClassVar[Mapping[Part, str]] = {}
+    """The parts that it carries a copy of, because it scales them, and the field that holds each."""
+    repeats: ClassVar[bool] = False
+    """Whether an axis may have several."""
+    usual: ClassVar[int] = 2
+    """So many nearly equal ones are nothing strange; more are one thing that is none of them."""
+    nonnegative: ClassVar[bool] = False
+    """Whether no coefficient can be negative."""
+    curved: ClassVar[bool] = False
+    """Whether its columns depend on its coefficients: nearly linear, so that one fits, and fits again."""
+    sought: ClassVar[Sought | None] = None
+    """Its form, where no grid covers the places at which it may be: of its first shapes."""
+    ordinary_arcsec: ClassVar[float] = 0.0
+    """Peak that any healthy axis has of it, or of what cannot be distinguished from it."""
+    inexact: ClassVar[float] = 0.0
+    """Share of its square by which a real one may differ from the law here, in the form of a smaller one of
+    its kind."""
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Its non-linear parameters; all others are spoken for by `columns`."""
     typical: ClassVar[Mapping[str, Any]] = {}
@@ -330,6 +214,121 @@ class Effect(BaseModel, ABC):
         """Parameters that are copies of what a model has."""
         return {}
 
+    # --- what it is like in a record
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
+        """Effects of this kind that a record with the model ``base`` may be screened for, over their shapes.
+
+        Their coefficients are of no account. As a rule a grid over the ranges of `shape`, around `candidate`;
+        nothing where the model lacks a part that it would scale.
+        """
+        if not set(cls.carries) <= {each.part for each in base} | {Part.GROWTH}:
+            return
+        typical = cls.candidate(observations.ratio, base)
+        moved = [each for each in cls.shape if each.moves is not Moves.NEVER and cls.sought is None]
+        points = GRID.get(len(moved), 2)
+        for values in product(*(each.grid(points) for each in moved)):
+            shape = {each.name: value for each, value in zip(moved, values, strict=True)}
+            yield typical.fitted(typical.coefficients(), shape)
+
+    def implausible(self, observations: Observations) -> str:
+        """Why this very effect cannot be, or cannot be known from such a record, in words; else empty."""
+        return ""
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """What it depends on, over which a picture shows it; as a rule its first channel."""
+        needs = self.needs()
+        for channel in MEASURED:
+            if channel in needs:
+                return over.measured(motion, channel)
+        for channel, values in (
+            (Channel.SPEED, over.speed),
+            (Channel.ACCELERATION, over.acceleration),
+            (Channel.TIME, over.time),
+        ):
+            if channel in needs:
+                return values(motion)
+        if Channel.LOAD_ANGLE in needs:
+            return over.load_angle(motion, ratio)
+        return over.since_reversal(motion) if self.tracker().memory_deg else over.motor_angle(motion)
+
+    def follows_motion(self) -> bool:
+        """Whether it lies between the directions of motion, or where one goes over to the other."""
+        moving = {Channel.SPEED, Channel.ACCELERATION}
+        return bool(moving & self.needs()) or self.tracker().memory_deg > 0.0
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Where it must be seen by itself, if that is not everywhere."""
+        return None
+
+    def changing(self, motion: Motion) -> FloatArray | None:
+        """What it would add if its first coefficient changed by one along the way, a column per place of
+        change, shape (n, k); None where that is no contradiction to it.
+        """
+        return None
+
+    def scales(self) -> tuple[Part, Effect] | None:
+        """The part of a model that it scales, where a picture can show it as a growth of that."""
+        return None
+
+    def pieces(self) -> tuple[Self, ...]:
+        """What it is made of: one order, one step each."""
+        return (self,)
+
+    def joined(self, other: Effect) -> Self | None:
+        """One effect that is both; None where the two stand side by side."""
+        return None
+
+    def largest_piece_arcsec(self) -> float:
+        """Amplitude of the largest of its parts over all that it may do, seen or not; 0 where all is seen."""
+        return 0.0
+
+    def left_in_mean(self, order: int) -> float:
+        """Share of an order of the motor that is left in the mean over both directions."""
+        return 1.0
+
+    def waves(self) -> tuple[tuple[float, float, float], ...]:
+        """Of a sum of waves of the motor angle: periods per turn, amplitude (arcsec), phase (degrees)."""
+        return ()
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """What reports and files call its coefficients."""
+        return tuple(
+            Coefficient(f"coefficient_{i + 1}_arcsec", (i,), ()) for i in range(len(self.coefficients()))
+        )
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:  # noqa: ARG003
+        """This cause, where it can be what has made ``now`` of ``before``; see `changes`."""
+        return None
+
+    @classmethod
+    def unmeasured(cls, ratio: float) -> Effect | None:  # noqa: ARG003
+        """What it looks like where its channel was not measured; None where that is nothing in particular."""
+        return None
+
+    def restated(self, observations: Observations) -> Iterator[Self]:
+        """The same law with other values of what is only a convention, where the given ones lead nowhere."""
+        return iter(())
+
+    def retold(
+        self,
+        now: Sequence[Effect],
+        given: Sequence[Effect],
+        observations: Observations,
+    ) -> tuple[Effect, ...] | None:
+        """``now``, of which it is one, told by another convention so that the parts are nearest to the
+        model's, ``given``; None where there is nothing to be told otherwise.
+        """
+        return None
+
+    def tidied(self, ratio: float) -> Self:
+        """As it goes into a model of this ratio."""
+        return self
+
+    # --- what it is in a file
+
     def parameters(self) -> dict[str, Any]:
         """The parameters as the model file has them."""
         return self.model_dump(mode="json")
@@ -370,6 +369,10 @@ class Linear(Effect):
     def coefficients(self) -> FloatArray:
         """The linear parameters, in their units."""
         return np.array([getattr(self, each) for each in self.linear], dtype=np.float64)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """By the parameters."""
+        return tuple(Coefficient(each, (i,), (each,)) for i, each in enumerate(self.linear))
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Other linear parameters, and other shape parameters where given."""

@@ -13,7 +13,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hdbridge.effects.base import Effect
+from hdbridge.effects.base import Effect, Part
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder
@@ -57,6 +57,16 @@ def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
         if isinstance(each, Synchronous) and each.orders:
             return each.orders
     return TYPICAL_ORDERS
+
+
+def has_loop(base: Iterable[Effect]) -> bool:
+    """Whether a model has a loop that could be scaled."""
+    return any(each.part is Part.LOOP for each in base)
+
+
+def has_orders(base: Iterable[Effect]) -> bool:
+    """Whether a model has a ripple that could be scaled."""
+    return any(isinstance(each, Synchronous) and each.orders for each in base)
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,17 +12,26 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Effect,
+    Experiment,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
     Start,
     Tracker,
 )
 from hdbridge.effects.kinematics import acceleration_of, speed_of
 from hdbridge.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
+
+OTHERS_MS2, LATE_SHARE = 30.0, 4.0
+"""A delayed sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz
+and more) it is at most so many ms^2 and so many times the delay squared."""
+SPEED_SHARE = 0.15
+"""A skew whose part in speed is less than this of its part in acceleration is none."""
 
 
 class ChannelSkew(Linear):
@@ -46,10 +55,20 @@ class ChannelSkew(Linear):
         aliases=("velocity_windup", "inertial_windup", "rate_dependence"),
         source="Taylor series of the load angle about the sampling instant",
         size="0.5 ms is 103 arcsec at 1 rad/s of the load",
+        apart={
+            "velocity_windup": Experiment(
+                2, "sweep three motor turns both ways at three speeds: skew is a straight line, drag bends"
+            ),
+            "inertial_windup": Experiment(
+                2, "sweep at constant speed both ways: a skew stays, inertia is silent"
+            ),
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         False, "it is an error of the measurement; to compensate it would make the load lag or lead"
     )
+    ordinary_arcsec: ClassVar[float] = 1.0
+    """No two encoders are read at the same instant."""
     linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")
     typical: ClassVar[Mapping[str, Any]] = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
@@ -77,6 +96,21 @@ class ChannelSkew(Linear):
     def of_delay(cls, delay_ms: float, ratio: float) -> Self:
         """A pure delay."""
         return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
+        """The one there is."""
+        yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
+
+    def implausible(self, observations: Observations) -> str:
+        """Whether a part in speed and one in acceleration can be those of one delayed sample."""
+        if abs(self.second_order_ms2) > OTHERS_MS2 + LATE_SHARE * self.delay_ms**2:
+            return "too much of it follows the acceleration for a delay"
+        parts = np.abs(self.columns(observations.motion) * self.coefficients())
+        speed, acceleration = np.quantile(parts, 0.998, axis=0)
+        if speed < SPEED_SHARE * acceleration:
+            return "all but no part of it follows the speed"
+        return ""
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One millisecond, and one of its square, shape (n, 2)."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from hdbridge.effects.amplitude_drift import AmplitudeDrift
-from hdbridge.effects.base import Effect
+from hdbridge.effects.base import Effect, Part
 from hdbridge.effects.carried import Loop, growth_of, loop_of
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
@@ -60,15 +60,24 @@ def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 def _refreshed(
     effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None, growth: TorqueGrowth | None
 ) -> Effect:
+    carries = effect.carries
     update: dict[str, object] = {}
-    fields = type(effect).model_fields
-    if "under_load" in fields:
-        update["under_load"] = growth
-    if loop is not None and "loop" in fields:
-        update["loop"] = loop
-    if orders and effect.name in {"direction_phase", "torque_modulation", "amplitude_drift"}:
-        update["orders"] = orders
+    if Part.GROWTH in carries:
+        update[carries[Part.GROWTH]] = growth
+    if loop is not None and Part.LOOP in carries:
+        update[carries[Part.LOOP]] = loop
+    if orders and Part.ORDERS in carries:
+        update[carries[Part.ORDERS]] = orders
     return effect.model_copy(update=update) if update else effect
+
+
+def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
+    """What can stand in the place of an effect, with its parameters; see `Effect.replaces`."""
+    return tuple(
+        kind.model_validate(effect.parameters())
+        for kind in kinds
+        if kind.replaces == effect.name or effect.replaces == kind.name
+    )
 
 
 def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:

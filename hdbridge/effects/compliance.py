@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -13,19 +14,28 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Effect,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Moves,
+    Observations,
     Shape,
     Start,
     Tracker,
 )
+from hdbridge.effects.load_order import LoadOrders
+from hdbridge.effects.observations import top
+from hdbridge.effects.orders import orders_from
 from hdbridge.effects.torque import TorqueChannel, TorqueLimit
 
 ARCSEC_PER_RAD = 648_000.0 / np.pi
 """A stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
+
+SOFTER = 1.05
+"""A zone may come out so much softer than the one before it by noise alone."""
 
 _Softness = Annotated[float, Field(ge=0, le=1000)]
 
@@ -56,8 +66,8 @@ class Compliance(Linear):
         "model)",
     )
     shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("torque1_nm", 0.1, 500.0, logarithmic=True),
-        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True),
+        Shape("torque1_nm", 0.1, 500.0, logarithmic=True, moves=Moves.NEARBY),
+        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True, moves=Moves.NEARBY),
     )
     linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
     typical: ClassVar[Mapping[str, Any]] = {
@@ -88,6 +98,28 @@ class Compliance(Linear):
         if not self.torque1_nm < self.torque2_nm:
             raise ValueError("T1 (torque1_nm) must be below T2 (torque2_nm)")
         return self
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:  # noqa: ARG003
+        """A straight spring, and one that bends within the torques of the record."""
+        largest = top(observations.motion, Channel.LOAD_TORQUE)
+        if largest:
+            for low, high in ((1e4, 2e4), (0.4 * largest, 0.8 * largest)):
+                yield cls(
+                    c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
+                    torque1_nm=low, torque2_nm=high,
+                )  # fmt: skip
+
+    def implausible(self, observations: Observations) -> str:
+        """A gear's spring stiffens with torque; a zone that the record does not reach has no compliance."""
+        zones = [each for each in self.coefficients().tolist() if each != 0.0]
+        stiffens = all(later <= SOFTER * earlier for earlier, later in pairwise(zones))
+        return "" if stiffens else "a gear's spring does not soften with torque"
+
+    @classmethod
+    def unmeasured(cls, ratio: float) -> Effect:
+        """Under a mass off centre the torque goes once around with the load."""
+        return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
         """The torque channel."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -11,16 +11,22 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Coefficient,
     Compensable,
     Effect,
     FloatArray,
     Memoryless,
     Moment,
     Motion,
+    Moves,
+    Observations,
     Shape,
+    Sought,
     Start,
+    Stretch,
     Tracker,
 )
+from hdbridge.effects.path import away_from_reversals
 
 
 class Step(BaseModel):
@@ -55,13 +61,50 @@ class CountLoss(Effect):
         False,
         "it cannot be foreseen, and after homing it is gone; a loss in the load encoder is no motion at all",
     )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10),)
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
+    repeats: ClassVar[bool] = True
+    sought: ClassVar[Sought | None] = Sought.STEP
+    inexact: ClassVar[float] = 0.03
+    """Something slow leaves small steps next to a large one."""
     typical: ClassVar[Mapping[str, Any]] = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
     """One step of ten arcsec at time zero."""
 
     steps: Annotated[
         tuple[Step, ...], Field(min_length=1, max_length=100, description="losses: time_s, size_arcsec each")
     ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[CountLoss]:  # noqa: ARG003
+        """One in the middle of the record, as an example."""
+        if observations.motion.time_s is not None:
+            middle = float(np.quantile(observations.motion.time_s, 0.5))
+            yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
+
+    def implausible(self, observations: Observations) -> str:
+        """On an axis that is nowhere twice, a step in time may as well be one at a place."""
+        return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Away from reversals, where a loop of another shape leaves steps."""
+        return away_from_reversals(motion)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """One step each."""
+        return tuple(self.model_copy(update={"steps": (each,)}) for each in self.steps)
+
+    def joined(self, other: Effect) -> Self | None:
+        """With the steps of another one."""
+        if not isinstance(other, CountLoss):
+            return None
+        steps = tuple(sorted((*self.steps, *other.steps), key=lambda each: each.time_s))
+        return self.model_copy(update={"steps": steps})
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """The sizes."""
+        return tuple(
+            Coefficient(f"step_{i + 1}_size_arcsec", (i,), ("steps", i, "size_arcsec"))
+            for i in range(len(self.steps))
+        )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""

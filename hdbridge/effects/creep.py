@@ -3,26 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from hdbridge.effects import coordinate as over
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Coefficient,
     Compensable,
+    Coordinate,
     Effect,
     FloatArray,
     Moment,
     Motion,
+    Observations,
     Shape,
     Start,
+    Stretch,
     Tracker,
 )
 from hdbridge.effects.kinematics import speed_of
+from hdbridge.effects.observations import longest_rest_s
+from hdbridge.effects.path import standing_s
 from hdbridge.effects.recurrence import recurrence
+
+RESTS = 3.0
+"""It is known by its bend: its shortest time constant is at most so many times the longest rest."""
+SETTLED_S = 0.5
+LEAST_ARCSEC = 0.25
+"""A gear that creeps does so for seconds: what is over so soon after a stop, or is smaller then, is the
+settling of load and servo, or the end of a loop that depends on speed."""
 
 
 class Relaxation(BaseModel):
@@ -66,6 +80,9 @@ class Creep(Effect):
     )
     """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
 
+    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 8
+    """A real relaxation is a sum of exponentials."""
     typical: ClassVar[Mapping[str, Any]] = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,
@@ -78,6 +95,49 @@ class Creep(Effect):
     build_up: Annotated[
         float, Field(gt=0, le=10, description="time constants in motion, relative to those at rest")
     ] = 1.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:  # noqa: ARG003
+        """One exponential each; what is found is put together afterwards."""
+        for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
+            for build_up in (0.03, 0.3, 1.0):
+                yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
+
+    def implausible(self, observations: Observations) -> str:
+        """What takes far longer than any rest is not known to end with it."""
+        if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
+            return ""
+        return "no rest is long enough to see it bend"
+
+    def shows(self, motion: Motion) -> Stretch:
+        """At rest, when load and servo have settled."""
+        rows = standing_s(motion) > SETTLED_S
+        return Stretch(rows, "over as soon as the axis has come to rest", LEAST_ARCSEC)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Time since the axis last stopped or started."""
+        return over.since_change(motion)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """One exponential each."""
+        return tuple(self.model_copy(update={"parts": (each,)}) for each in self.parts)
+
+    def joined(self, other: Effect) -> Self | None:
+        """With the exponentials of another one."""
+        if not isinstance(other, Creep):
+            return None
+        return self.model_copy(update={"parts": (*self.parts, *other.parts)})
+
+    def largest_piece_arcsec(self) -> float:
+        """The largest amplitude: exponentials may cancel."""
+        return max(abs(each.amplitude_arcsec) for each in self.parts)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """The amplitudes."""
+        return tuple(
+            Coefficient(f"part_{i + 1}_amplitude_arcsec", (i,), ("parts", i, "amplitude_arcsec"))
+            for i in range(len(self.parts))
+        )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""

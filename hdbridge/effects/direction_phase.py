@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,16 +12,19 @@ from pydantic import Field
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Coefficient,
     Compensable,
     Effect,
     FloatArray,
     Memoryless,
     Moment,
     Motion,
+    Observations,
+    Part,
     Start,
     Tracker,
 )
-from hdbridge.effects.carried import orders_of
+from hdbridge.effects.carried import has_orders, orders_of
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors
 
@@ -58,6 +61,8 @@ class DirectionPhase(Effect):
     compensable: ClassVar[Compensable] = Compensable(
         True, "the load really moves so; the direction is commanded"
     )
+    carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
+    curved: ClassVar[bool] = True
     typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
     """A shift of one degree of the base's orders."""
 
@@ -66,6 +71,20 @@ class DirectionPhase(Effect):
         float,
         Field(ge=-45, le=45, description="shift of the motor angle, forward ahead of backward by twice this"),
     ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[DirectionPhase]:  # noqa: ARG003
+        """From no shift on."""
+        if has_orders(base):
+            yield cls(orders=orders_of(base), shift_deg=0.0)
+
+    def left_in_mean(self, order: int) -> float:
+        """Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift."""
+        return math.cos(order * math.radians(self.shift_deg))
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """The shift."""
+        return (Coefficient("shift_deg", (0,), ("shift_deg",)),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""

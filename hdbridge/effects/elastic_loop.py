@@ -19,7 +19,17 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from hdbridge.effects.base import Compensable, Effect, FloatArray, Motion, Shape, Start, Tracker
+from hdbridge.effects.base import (
+    Coefficient,
+    Compensable,
+    Effect,
+    FloatArray,
+    Motion,
+    Part,
+    Shape,
+    Start,
+    Tracker,
+)
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
@@ -62,6 +72,7 @@ class ElasticLoop(Effect):
     )
     typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
     """A published gear of ratio 50."""
+    part: ClassVar[Part | None] = Part.LOOP
     drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
     """Preload settles, grease and friction change; width and exponent keep their shape."""
 
@@ -87,6 +98,10 @@ class ElasticLoop(Effect):
     def coefficients(self) -> FloatArray:
         """The offset, arcsec, shape (1,)."""
         return np.array([self.offset_arcsec])
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """The offset."""
+        return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Another offset, and another width and exponent where given."""

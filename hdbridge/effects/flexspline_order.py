@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-from hdbridge.effects.base import Cause, Compensable
+import numpy as np
+
+from hdbridge.effects.base import Cause, Compensable, Coordinate, Effect, Motion, Observations
 from hdbridge.effects.load_order import Ratio
-from hdbridge.effects.orders import OrderSeries, orders_from
+from hdbridge.effects.orders import OrderSeries, missing_orders, orders_from
+from hdbridge.units import DEG_PER_TURN
 
 
 class FlexsplineOrders(OrderSeries):
@@ -34,6 +37,18 @@ class FlexsplineOrders(OrderSeries):
     """Orders 1, 2 and 4."""
 
     ratio: Ratio
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[FlexsplineOrders]:
+        """Orders 1 to 8, one each; what is found is put together afterwards."""
+        ratio = observations.ratio
+        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 9))), base):
+            yield cls(ratio=ratio, orders=orders_from([number]))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The wave generator's angle, seen from the flexspline."""
+        angle = np.mod(motion.motor_deg * (1.0 + 1.0 / ratio), DEG_PER_TURN)
+        return Coordinate("angle of the wave generator to the flexspline", "deg", angle)
 
     def turns_per_motor_turn(self) -> float:
         """1 + 1 / N."""

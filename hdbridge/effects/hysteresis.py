@@ -15,15 +15,24 @@ encoder count of chatter is several arcseconds. Drive it from the command.
 
 from __future__ import annotations
 
-import weakref
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
 
-from hdbridge.effects.base import Cause, FloatArray, Moment, Start, Tracker
+from hdbridge.effects.base import (
+    Cause,
+    Effect,
+    FloatArray,
+    Moment,
+    Observations,
+    Part,
+    Start,
+    Tracker,
+)
 from hdbridge.effects.elastic_loop import ElasticLoop, rise, rise_at
+from hdbridge.effects.path import path_of
 
 
 class Hysteresis(ElasticLoop):
@@ -45,6 +54,13 @@ class Hysteresis(ElasticLoop):
         source="rolling-friction law with exponent n; the height is twice the offset",
         size="10-80 arcsec from side to side",
     )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:  # noqa: ARG003
+        """Narrow, usual and wide, for a model without a loop."""
+        if all(each.part is not Part.LOOP for each in base):
+            for width in (3.0, 20.0, 60.0):
+                yield cls(offset_arcsec=1.0, width_deg=width, exponent=1.6)
 
     def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
         return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
@@ -77,66 +93,6 @@ class Hysteresis(ElasticLoop):
             height[virgin] = rise(2.0 * xi_of[virgin], self.exponent)
         result[first + near] = sense * np.minimum(sense * begun + height, 1.0)
         return result
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Path:
-    """A motor angle cut at its reversals; see `branches`."""
-
-    turning: tuple[int, ...]
-    signs: tuple[int, ...]
-    angles_deg: tuple[float, ...]
-    """Motor angle at ``turning``."""
-    away_deg: FloatArray
-    """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
-    sense: FloatArray
-    """Their direction."""
-
-    @classmethod
-    def of(cls, motor_deg: FloatArray, start: Start) -> Path:
-        """Take an angle of at least one sample apart."""
-        turning, signs = branches(motor_deg, start)
-        angles, lengths = motor_deg[turning], np.diff(turning)
-        away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
-        sense = np.repeat(np.array(signs, dtype=np.float64), lengths)
-        return cls(tuple(turning), tuple(signs), tuple(angles.tolist()), away, sense)
-
-
-_PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
-"""By the identity of the angle's array, as long as that is there."""
-
-
-def path_of(motor_deg: FloatArray, start: Start) -> Path:
-    """`Path.of`; kept for an array that cannot be written to, of which a fit asks it a thousand times."""
-    if motor_deg.flags.writeable:
-        return Path.of(motor_deg, start)
-    key = (id(motor_deg), start is Start.VIRGIN)
-    kept = _PATHS.get(key)
-    if kept is not None and kept[0]() is motor_deg:
-        return kept[1]
-    path = Path.of(motor_deg, start)
-    _PATHS[key] = (weakref.ref(motor_deg, lambda _: _PATHS.pop(key, None)), path)
-    return path
-
-
-def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
-    """Indices between which the motor moves in one direction (rest included), and that direction.
-
-    Returns ``turning`` of length b + 1 (first index, each turning point, last index) and ``signs`` of length
-    b. A saturated start counts as a direction: going on in it begins no new branch worth telling apart.
-    """
-    steps = np.diff(motor_deg)
-    moving = np.flatnonzero(steps)
-    if not len(moving):
-        return [len(motor_deg) - 1], []
-    forward = steps[moving] > 0.0
-    change = np.flatnonzero(forward[1:] != forward[:-1]) + 1
-    turning = [
-        0 if start is Start.VIRGIN else int(moving[0]),
-        *moving[change].tolist(),
-        len(motor_deg) - 1,
-    ]
-    return turning, [1 if each else -1 for each in (forward[0], *forward[change].tolist())]
 
 
 class _HysteresisTracker(Tracker):

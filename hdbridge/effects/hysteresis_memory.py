@@ -26,9 +26,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Start, Tracker
+from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Observations, Part, Start, Tracker
 from hdbridge.effects.elastic_loop import ElasticLoop, rise, rise_at
-from hdbridge.effects.hysteresis import Hysteresis, branches
+from hdbridge.effects.hysteresis import Hysteresis
+from hdbridge.effects.path import branches
 
 _DEPTH = 200
 """Reversals remembered; beyond it the innermost loop is forgotten early (a fraction of its own height)."""
@@ -39,6 +40,7 @@ class HysteresisMemory(ElasticLoop):
 
     name: ClassVar[str] = "hysteresis_memory"
     replaces: ClassVar[str] = "hysteresis"
+    changes: ClassVar[Part | None] = Part.LOOP
     about: ClassVar[Cause] = Cause(
         title="hysteresis with return-point memory",
         equation="theta_rev + sgn(omega) 2 offset g(|theta_M - theta_M,rev| / width) from each reversal; "
@@ -56,6 +58,18 @@ class HysteresisMemory(ElasticLoop):
 
     def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
         return _MemoryTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:  # noqa: ARG003
+        """The model's loop by this law, or by the other one."""
+        for each in base:
+            if isinstance(each, Hysteresis):
+                yield cls(**each.parameters())
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> HysteresisMemory | None:
+        """Where another law had been taken for it."""
+        return now if isinstance(now, cls) and not isinstance(before, cls) else None
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -16,6 +16,8 @@ from hdbridge.effects.base import (
     FloatArray,
     Moment,
     Motion,
+    Observations,
+    Part,
     Shape,
     Start,
     Tracker,
@@ -49,6 +51,7 @@ class HysteresisParameters(Effect):
     compensable: ClassVar[Compensable] = Compensable(
         True, "through the model's loop, which takes over the new parameters"
     )
+    changes: ClassVar[Part | None] = Part.LOOP
     shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
 
     base: Annotated[Loop, Field(description="the model's loop")]
@@ -57,6 +60,21 @@ class HysteresisParameters(Effect):
     ]
     width_deg: Annotated[float, Field(gt=0, le=3600, description="new width")]
     exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:  # noqa: ARG003
+        """The model's loop, wider."""
+        if any(each.part is Part.LOOP for each in base):
+            loop = loop_of(base)
+            now = loop.model_dump(exclude={"memory"}) | {"width_deg": 1.6 * loop.width_deg}
+            yield cls(base=loop, **now)
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> HysteresisParameters | None:
+        """Other parameters of one law."""
+        if before.part is not Part.LOOP or not isinstance(now, type(before)):
+            return None
+        return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
 
     def changed(self) -> Loop:
         """The loop as it is now."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -12,11 +12,13 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Effect,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
     Start,
     Tracker,
 )
@@ -44,6 +46,8 @@ class InertialWindup(Linear):
     compensable: ClassVar[Compensable] = Compensable(
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
     )
+    ordinary_arcsec: ClassVar[float] = 1.5
+    """Every axis winds up a little in its fastest moves."""
     linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
     typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
     """A resonance at 50 Hz."""
@@ -55,6 +59,11 @@ class InertialWindup(Linear):
     limit_deg_s2: Annotated[
         float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
     ] = 1e6
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:  # noqa: ARG003
+        """The one there is."""
+        yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """J / K of one second squared, shape (n, 1)."""

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from hdbridge.effects.base import Cause, Compensable
-from hdbridge.effects.orders import OrderSeries, orders_from
+from hdbridge.effects import coordinate as over
+from hdbridge.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    Experiment,
+    Motion,
+    Observations,
+)
+from hdbridge.effects.orders import OrderSeries, missing_orders, orders_from
 
 Ratio = Annotated[float, Field(gt=0, le=1000, description="N of the model: motor turns per load turn")]
 
@@ -32,6 +42,16 @@ class LoadOrders(OrderSeries):
         aliases=("compliance", "ratio_error", "zero_drift"),
         source="geometry of an eccentric disc; pitch error of the splines",
         size="5-60 arcsec",
+        apart={
+            "compliance": Experiment(
+                5,
+                "take the mass off or turn it by 90 deg, sweep one load turn both ways: a wind-up goes "
+                "with it",
+            ),
+            "ratio_error": Experiment(
+                6, "sweep two whole load turns both ways: a ramp goes on, a load order comes back"
+            ),
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         False,
@@ -47,6 +67,17 @@ class LoadOrders(OrderSeries):
         Literal["unknown", "gear", "load_encoder"],
         Field(description="where it comes from; only the gear's is compensated"),
     ] = "unknown"
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LoadOrders]:
+        """Orders 1 to 4, one each; what is found is put together afterwards."""
+        ratio = observations.ratio
+        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 5))), base):
+            yield cls(ratio=ratio, orders=orders_from([number]))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The load's angle."""
+        return replace(over.load_angle(motion, ratio), bins=120)
 
     def turns_per_motor_turn(self) -> float:
         """1 / N."""

@@ -3,26 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from hdbridge.effects import coordinate as over
 from hdbridge.effects.base import (
     Cause,
     Compensable,
+    Coordinate,
+    Effect,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
     Shape,
+    Sought,
     Start,
+    Stretch,
     Tracker,
 )
 from hdbridge.effects.load_order import Ratio
+from hdbridge.effects.path import away_from_reversals
 from hdbridge.units import DEG_PER_TURN
+
+PASSES = 3
+OTHER_SPEED = 1.5
+"""It must have been met so often, and in both directions or at speeds that differ by this factor."""
 
 
 class LocalDefect(Linear):
@@ -51,6 +63,10 @@ class LocalDefect(Linear):
         Shape("centre_deg", 0.0, 360.0),
         Shape("half_width_deg", 0.05, 30.0, logarithmic=True),
     )
+    repeats: ClassVar[bool] = True
+    sought: ClassVar[Sought | None] = Sought.BUMP
+    inexact: ClassVar[float] = 0.15
+    """No damaged tooth makes just this bump."""
     linear: ClassVar[tuple[str, ...]] = ("height_arcsec",)
     typical: ClassVar[Mapping[str, Any]] = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
     """Five arcsec, a tooth of 3.6 degrees wide."""
@@ -61,6 +77,42 @@ class LocalDefect(Linear):
     half_width_deg: Annotated[
         float, Field(gt=0, le=180, description="load angle from its centre to its foot")
     ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
+        """A tooth in the middle of the travel, as an example."""
+        load = float(np.median(observations.motion.motor_deg)) / observations.ratio
+        yield cls(
+            ratio=observations.ratio, height_arcsec=1.0, centre_deg=load % DEG_PER_TURN, half_width_deg=3.6
+        )
+
+    def implausible(self, observations: Observations) -> str:
+        """Passes that are all alike cannot distinguish a place from a moment of the move."""
+        return "" if self._is_met(observations) else "not passed often enough, or always alike"
+
+    def _is_met(self, observations: Observations) -> bool:
+        """Whether the axis went over the place several times, in both directions or at different speeds."""
+        motion = observations.motion
+        if motion.motor_speed_deg_s is None or motion.time_s is None:
+            return False
+        turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
+        # Between two records the axis may have jumped over it: faster than it ever went.
+        steps, moved = np.diff(motion.time_s), np.abs(np.diff(motion.motor_deg))
+        real = moved <= 3.0 * float(np.max(np.abs(motion.motor_speed_deg_s))) * steps
+        speed = motion.motor_speed_deg_s[np.flatnonzero((np.diff(np.floor(turns)) != 0.0) & real)]
+        fast = np.abs(speed[speed != 0.0])
+        if len(fast) < PASSES:
+            return False
+        both = bool(np.any(speed > 0.0) and np.any(speed < 0.0)) and observations.reversals >= 2
+        return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Away from reversals, where a loop of another shape leaves bumps that lie at one angle too."""
+        return away_from_reversals(motion)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The load's angle."""
+        return replace(over.load_angle(motion, ratio), bins=120)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A bump of one arcsec, shape (n, 1)."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-from hdbridge.effects.base import Cause, Compensable
+from hdbridge.effects.base import Cause, Compensable, Effect, Observations, Part
 from hdbridge.effects.orders import OrderSeries, orders_from
 
 
@@ -13,6 +13,7 @@ class MotorEncoderEccentricity(OrderSeries):
     """A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2), amplitudes at the load."""
 
     name: ClassVar[str] = "motor_encoder_eccentricity"
+    changes: ClassVar[Part | None] = Part.ORDERS
     few: ClassVar[frozenset[int]] = frozenset({1, 2})
     about: ClassVar[Cause] = Cause(
         title="eccentric motor encoder disc",
@@ -37,6 +38,20 @@ class MotorEncoderEccentricity(OrderSeries):
     )
     typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 3.0)}
     """Eccentricity and tilt."""
+
+    @classmethod
+    def proposals(
+        cls,
+        observations: Observations,  # noqa: ARG003
+        base: Sequence[Effect],  # noqa: ARG003
+    ) -> Iterator[MotorEncoderEccentricity]:
+        """Both orders, whether the model has them or not: they are of one disc."""
+        yield cls(orders=orders_from((1, 2)))
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
+        """Changed orders 1 and 2 of the model."""
+        return cls._change(before, now)
 
     def turns_per_motor_turn(self) -> float:
         """One: the disc is on the motor shaft."""

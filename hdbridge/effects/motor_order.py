@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
-from hdbridge.effects.base import Cause, Compensable, Effect
-from hdbridge.effects.orders import OrderSeries, orders_from
+from hdbridge.effects.base import Cause, Compensable, Effect, Experiment, Observations, Part
+from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, missing_orders, orders_from
 
 
 class MotorOrders(OrderSeries):
@@ -24,14 +24,35 @@ class MotorOrders(OrderSeries):
         aliases=("motor_encoder_eccentricity", "synchronous"),
         source="Fourier series over the wave generator's angle",
         size="0.3-3 arcsec; often k = 3, 5, 7, 10, 12",
+        apart={
+            "motor_encoder_eccentricity": Experiment(
+                15,
+                "re-clock the motor encoder by 90 deg on its shaft and sweep ten motor turns: its part turns "
+                "with it",
+            )
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
+    part: ClassVar[Part | None] = Part.ORDERS
+    usual: ClassVar[int] = 4
+    """A worn bearing of the wave generator has several."""
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
     """As the synchronous part's."""
 
     def turns_per_motor_turn(self) -> float:
         """One: it counts on the motor angle itself."""
         return 1.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:  # noqa: ARG003
+        """One order each; what is found is put together afterwards."""
+        for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
+            yield cls(orders=orders_from([number]))
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> MotorOrders | None:
+        """Changed orders of the model."""
+        return cls._change(before, now)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:

@@ -6,22 +6,28 @@ import cmath
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, ClassVar, Self, TypeVar
+from typing import Annotated, ClassVar, Final, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hdbridge.effects.base import (
+    Coefficient,
     Effect,
     FloatArray,
     Memoryless,
     Moment,
     Motion,
     Start,
+    Stretch,
     Tracker,
 )
+from hdbridge.effects.path import away_from_reversals
 
 RAD_PER_DEG = math.pi / 180.0
+HIGHEST_MOTOR_ORDER: Final = 24
+"""Orders of the motor that are looked for: six times the strongest one of a strain wave gear, order 4 (two
+contacts, two encoders' or bearings' harmonics of each)."""
 _Phasor = TypeVar("_Phasor", complex, "np.ndarray[tuple[int], np.dtype[np.complex128]]")
 
 
@@ -43,6 +49,7 @@ Orders = Annotated[
 class OrderSeries(Effect):
     """Sum of A_k cos(k c theta_M + phi_k), where c says which angle the orders count on."""
 
+    repeats: ClassVar[bool] = True
     few: ClassVar[frozenset[int]] = frozenset()
     """The orders that make sense, where only few do."""
 
@@ -92,8 +99,74 @@ class OrderSeries(Effect):
         """Sum of order times amplitude, per degree."""
         return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
 
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Away from reversals, where a loop of another shape leaves bumps that repeat with the angle too."""
+        return away_from_reversals(motion)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """One order each."""
+        return tuple(self.model_copy(update={"orders": (each,)}) for each in self.orders)
+
+    def joined(self, other: Effect) -> Self | None:
+        """With the orders of another series over the same angle."""
+        if other.name != self.name or not isinstance(other, OrderSeries):
+            return None
+        own = {each.order for each in self.orders}
+        new = [each for each in other.orders if each.order not in own]
+        orders = tuple(sorted((*self.orders, *new), key=lambda each: each.order))
+        return self.model_copy(update={"orders": orders})
+
+    def largest_piece_arcsec(self) -> float:
+        """The largest amplitude: on an arc of its turn an order shows only a part of it."""
+        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
+
+    def waves(self) -> tuple[tuple[float, float, float], ...]:
+        """Its orders."""
+        turns = self.turns_per_motor_turn()
+        return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Amplitude and phase of each order."""
+        return named_orders(self.orders)
+
+    def tidied(self, ratio: float) -> Self:
+        """Without orders of no amplitude, whose phases mean nothing."""
+        orders = tuple(each for each in self.orders if each.amplitude_arcsec > 1e-6)
+        return self.model_copy(update={"orders": orders})
+
+    @classmethod
+    def _change(cls, before: Effect, now: Effect) -> Self | None:
+        """The orders by which two series of the motor's orders differ, as orders of this kind."""
+        if not isinstance(before, OrderSeries) or not isinstance(now, type(before)):
+            return None
+        numbers = [each.order for each in before.orders]
+        if numbers != [each.order for each in now.orders] or (cls.few and not cls.few.issuperset(numbers)):
+            return None
+        change = orders_fitted(before.orders, now.coefficients() - before.coefficients())
+        return cast("Self", cls.model_construct(orders=change))
+
     def _scale(self) -> float:
         return RAD_PER_DEG * self.turns_per_motor_turn()
+
+
+def missing_orders(series: OrderSeries, base: Iterable[Effect]) -> Iterable[int]:
+    """The orders of a series that no series over the same angle in ``base`` has."""
+    turns = series.turns_per_motor_turn()
+    present = {
+        order.order
+        for each in base
+        if isinstance(each, OrderSeries) and each.turns_per_motor_turn() == turns
+        for order in each.orders
+    }
+    return [each.order for each in series.orders if each.order not in present]
+
+
+def named_orders(orders: Iterable[MotorOrder]) -> tuple[Coefficient, ...]:
+    """Names of cosine and sine of each order."""
+    return tuple(
+        Coefficient(f"order_{each.order}_", (2 * i, 2 * i + 1), ("orders", i))
+        for i, each in enumerate(orders)
+    )
 
 
 def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:

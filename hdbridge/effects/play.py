@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from hdbridge.effects.base import FloatArray, Start
-from hdbridge.effects.hysteresis import path_of
+from hdbridge.effects.path import path_of
 
 
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:

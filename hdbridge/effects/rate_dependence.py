@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -13,17 +13,22 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Coordinate,
     Effect,
     FloatArray,
     Linear,
     Moment,
     Motion,
+    Observations,
+    Part,
     Shape,
     Start,
     Tracker,
 )
-from hdbridge.effects.carried import Loop, loop_of
+from hdbridge.effects.carried import Loop, has_loop, loop_of
+from hdbridge.effects.coordinate import Spacing
 from hdbridge.effects.kinematics import speed_of
+from hdbridge.effects.observations import top_speed_deg_s
 
 
 class RateDependence(Linear):
@@ -45,6 +50,7 @@ class RateDependence(Linear):
     )
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so; the speed is commanded")
     shape: ClassVar[tuple[Shape, ...]] = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
+    carries: ClassVar[Mapping[Part, str]] = {Part.LOOP: "loop"}
     linear: ClassVar[tuple[str, ...]] = ("growth_percent",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_percent": 10.0, "reference_deg_s": 30.0}
     """Ten per cent per decade."""
@@ -55,6 +61,26 @@ class RateDependence(Linear):
     limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
         20_000.0
     )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RateDependence]:
+        """Growing from far below the speeds of the record on, and from nearly there."""
+        fastest = top_speed_deg_s(observations.motion)
+        if has_loop(base):
+            for share in (0.02, 0.2):
+                yield cls(
+                    loop=loop_of(base), growth_percent=1.0,
+                    reference_deg_s=min(max(share * fastest, 1.0), 1000.0),
+                )  # fmt: skip
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The speed, whichever way."""
+        speed = np.abs(speed_of(motion, self.name))
+        return Coordinate("speed, forward or backward", "motor deg/s", speed, spacing=Spacing.FILLED)
+
+    def scales(self) -> tuple[Part, Effect]:
+        """The loop."""
+        return Part.LOOP, self.loop.law()
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A growth of one per cent, shape (n, 1)."""

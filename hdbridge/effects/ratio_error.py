@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from hdbridge.effects import coordinate as over
 from hdbridge.effects.base import (
     Cause,
     Compensable,
+    Coordinate,
+    Effect,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
     Start,
     Tracker,
 )
@@ -53,6 +57,22 @@ class RatioError(Linear):
     def true_ratio(self, ratio: float) -> float:
         """The ratio that would leave no ramp, where the model has ``ratio``."""
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
+        """The one there is."""
+        yield cls(ramp_arcsec_per_turn=1.0)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The load's angle over all turns."""
+        return over.position(motion, ratio)
+
+    def changing(self, motion: Motion) -> FloatArray:
+        """Bends at a third and at two thirds of the travel: a wrong ratio has the same slope everywhere."""
+        angle = motion.motor_deg
+        low, span = float(np.min(angle)), float(np.ptp(angle))
+        bends = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
+        return np.column_stack(bends) / DEG_PER_TURN
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One arcsec per motor turn, shape (n, 1)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,13 +12,18 @@ from pydantic import Field, field_validator
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Coefficient,
     Compensable,
+    Coordinate,
     Effect,
     FloatArray,
     Memoryless,
     Moment,
     Motion,
+    Observations,
+    Sought,
     Start,
+    Stretch,
     Tracker,
 )
 from hdbridge.effects.orders import (
@@ -28,12 +33,17 @@ from hdbridge.effects.orders import (
     coefficients_of,
     cosines_and_sines,
     horner,
+    named_orders,
     orders_fitted,
     orders_from,
     phasors,
 )
+from hdbridge.effects.path import away_from_reversals
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 _HARMONICS = (1, 2, 4)
+LEAST_LINES = 256
+"""An encoder that interpolates has at least so many."""
 
 
 class SubdivisionalError(Effect):
@@ -64,6 +74,8 @@ class SubdivisionalError(Effect):
         "it is an error of the measurement; to compensate it would move the load away from where it should "
         "be",
     )
+    repeats: ClassVar[bool] = True
+    sought: ClassVar[Sought | None] = Sought.LINE
     typical: ClassVar[Mapping[str, Any]] = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
     """9000 lines, as an example: the line count is a matter of search or of the data sheet."""
 
@@ -77,6 +89,42 @@ class SubdivisionalError(Effect):
         if len(set(numbers)) != len(numbers) or not set(numbers) <= set(_HARMONICS):
             raise ValueError("orders of the line count are 1, 2 and 4, each once at most")
         return orders
+
+    @classmethod
+    def proposals(
+        cls,
+        observations: Observations,
+        base: Sequence[Effect],  # noqa: ARG003
+    ) -> Iterator[SubdivisionalError]:
+        """One of as many lines as the record's samples lie within, as an example."""
+        step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
+        lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
+        yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
+
+    @classmethod
+    def at_lines(cls, lines_per_turn: int) -> Iterator[SubdivisionalError]:
+        """Those of which this many periods per turn of the load can be one line."""
+        for numbers in ((1,), _HARMONICS):
+            yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))
+        for part in (2, 4):
+            if lines_per_turn % part == 0 and lines_per_turn // part >= LEAST_LINES:
+                few = (1, 2) if part == 2 else _HARMONICS
+                yield cls(lines_per_turn=lines_per_turn // part, orders=orders_from(few))
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Away from reversals, where a loop of another shape leaves bumps."""
+        return away_from_reversals(motion)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The load's angle within a line."""
+        line_deg = DEG_PER_TURN / self.lines_per_turn
+        load = motion.load_deg if motion.load_deg is not None else motion.motor_deg / ratio
+        name = f"load angle within a division of {line_deg * ARCSEC_PER_DEG:.4g} arcsec"
+        return Coordinate(name, "arcsec", np.mod(load, line_deg) * ARCSEC_PER_DEG, bins=48)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Amplitude and phase of each order."""
+        return named_orders(self.orders)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""

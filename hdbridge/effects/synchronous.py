@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from hdbridge.effects.base import Cause, Compensable
+from hdbridge.effects.base import Cause, Compensable, Part
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 
 TYPICAL_ORDERS = tuple(
@@ -36,6 +36,7 @@ class Synchronous(OrderSeries):
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
     typical: ClassVar[Mapping[str, Any]] = {"orders": TYPICAL_ORDERS}
     """The published gear."""
+    part: ClassVar[Part | None] = Part.ORDERS
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
     """Teeth and the wave generator's bearing wear."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,16 +11,23 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Coordinate,
     Effect,
+    Experiment,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
+    Part,
     Start,
     Tracker,
 )
-from hdbridge.effects.carried import orders_of
+from hdbridge.effects.carried import has_orders, orders_of
+from hdbridge.effects.coordinate import Spacing
+from hdbridge.effects.motor_order import MotorOrders
+from hdbridge.effects.observations import top
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
 from hdbridge.effects.torque import TorqueGrowth
 
@@ -41,15 +48,43 @@ class TorqueModulation(TorqueGrowth, Linear):
         aliases=("amplitude_drift", "motor_order"),
         source="kinematic error of strain wave gears under load: amplitude roughly linear in the torque",
         size="10-50 % of the ripple at rated torque",
+        apart={
+            "amplitude_drift": Experiment(10, "the same motor turns under two torques at one temperature")
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         True, "the load really moves so, where the torque is known on line"
     )
+    part: ClassVar[Part | None] = Part.GROWTH
+    carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
     linear: ClassVar[tuple[str, ...]] = ("growth_percent_per_nm",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_percent_per_nm": 1.0}
     """One per cent per Nm of all orders."""
 
     orders: Orders
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[TorqueModulation]:
+        """With the torque and with its size, over the range that the record has."""
+        largest = top(observations.motion, Channel.LOAD_TORQUE)
+        if not largest or not has_orders(base):
+            return
+        # Beyond its limit an effect is held: the record's torques have to lie within.
+        limit = max(TorqueGrowth.model_fields["limit_nm"].default, 2.0 * largest)
+        for signed in (False, True):
+            yield cls(orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed, limit_nm=limit)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The torque, or its size."""
+        channel = Channel(self.torque)
+        torque, name = motion.channel(channel, self.name), channel.title
+        if self.signed:
+            return Coordinate(name, "Nm", torque, spacing=Spacing.FILLED)
+        return Coordinate(f"{name}, either direction", "Nm", np.abs(torque), spacing=Spacing.FILLED)
+
+    def scales(self) -> tuple[Part, Effect]:
+        """The ripple."""
+        return Part.ORDERS, MotorOrders(orders=self.orders)
 
     def needs(self) -> frozenset[Channel]:
         """The torque channel."""

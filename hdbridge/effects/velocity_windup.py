@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -13,16 +13,23 @@ from hdbridge.effects.base import (
     Cause,
     Channel,
     Compensable,
+    Effect,
     FloatArray,
     Linear,
     Memoryless,
     Moment,
     Motion,
+    Observations,
     Shape,
     Start,
     Tracker,
 )
 from hdbridge.effects.kinematics import speed_of
+from hdbridge.effects.observations import top_speed_deg_s
+
+STRAIGHT = 20.0
+"""A drag whose shear speed is so many times the fastest there was differs from a straight line by less than
+this part of itself."""
 
 
 class VelocityWindup(Linear):
@@ -50,6 +57,8 @@ class VelocityWindup(Linear):
         True, "the load really lags and the speed is commanded; at rest it is nothing"
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
+    nonnegative: ClassVar[bool] = True
+    """A drag never pushes. One that is not there would come out on either side of zero by chance."""
     linear: ClassVar[tuple[str, ...]] = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
     typical: ClassVar[Mapping[str, Any]] = {
         "coulomb_arcsec": 3.0,
@@ -70,6 +79,28 @@ class VelocityWindup(Linear):
     limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
         50_000.0
     )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[VelocityWindup]:  # noqa: ARG003
+        """Bent below, at and above the speeds of the record."""
+        fastest = top_speed_deg_s(observations.motion)
+        for share in (0.15, 1.0, 6.0):
+            yield cls(
+                coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.01, shear_deg_s=max(share * fastest, 10.0)
+            )
+
+    def implausible(self, observations: Observations) -> str:
+        """One that does not bend is a delayed sample.
+
+        The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed
+        part of one, with the sign of the direction.
+        """
+        speed = observations.motion.motor_speed_deg_s
+        if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:
+            return ""
+        if self.shear_deg_s < STRAIGHT * float(np.max(np.abs(speed))):
+            return ""
+        return "a straight line in speed is a delay, not a drag"
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Dry and viscous, shape (n, 2)."""

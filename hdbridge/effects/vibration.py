@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,13 +12,19 @@ from pydantic import Field
 from hdbridge.effects.base import (
     Cause,
     Channel,
+    Coefficient,
     Compensable,
+    Coordinate,
     Effect,
+    Experiment,
     FloatArray,
     Memoryless,
     Moment,
     Motion,
+    Moves,
+    Observations,
     Shape,
+    Sought,
     Start,
     Tracker,
 )
@@ -42,11 +48,22 @@ class Vibration(Effect):
         aliases=("motor_order", "subdivisional_error"),
         source="a sinusoid in time",
         size="0.1-5 arcsec",
+        apart={
+            "motor_order": Experiment(
+                2, "stand still for a minute, then sweep at two speeds: a vibration keeps its frequency"
+            )
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         False, "its phase drifts and cannot be foreseen, and it is mostly faster than the axis can follow"
     )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("frequency_hz", 0.05, 5000.0, logarithmic=True),)
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, moves=Moves.NEARBY, is_frequency=True),
+    )
+    repeats: ClassVar[bool] = True
+    sought: ClassVar[Sought | None] = Sought.TONE
+    inexact: ClassVar[float] = 0.03
+    """No source keeps its frequency and amplitude exactly, and the gear's loop answers with others."""
     typical: ClassVar[Mapping[str, Any]] = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
     """One arcsec at 50 Hz, as an example: the frequency is a matter of search."""
 
@@ -55,6 +72,22 @@ class Vibration(Effect):
     phase_deg: Annotated[
         float, Field(ge=-360, le=360, description="phase of the cosine at the record's time zero")
     ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:  # noqa: ARG003
+        """A fast one that the record can show, as an example."""
+        fast_hz = 0.137 / max(observations.period_s, 1e-6)
+        yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Time within a period."""
+        period_s = 1.0 / self.frequency_hz
+        within = 1e3 * np.mod(motion.channel(Channel.TIME, self.name), period_s)
+        return Coordinate(f"time within a period of {1e3 * period_s:.4g} ms", "ms", within, bins=48)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Amplitude and phase."""
+        return (Coefficient("", (0, 1), ()),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""

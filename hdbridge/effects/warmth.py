@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.effects.base import SLOT, Channel, Effect, FloatArray, Moment, Motion, Shape
+from hdbridge.effects.base import (
+    SLOT,
+    Channel,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+)
+from hdbridge.effects.observations import duration_s
 from hdbridge.effects.recurrence import lagged
 
+VARIES_K: Final = 0.3
+"""A temperature that changes by less drives nothing that could be seen."""
+QUICK_S: Final = (2.0, 15.0)
+SLOW_S: Final = (60.0, 240.0, 600.0, 1500.0, 4000.0)
 _TEMPERATURE = SLOT[Channel.TEMPERATURE]
 
 
@@ -39,6 +54,20 @@ class Warmed(Effect):
     limit_k: Annotated[
         float, Field(gt=0, le=200, description="warmth in either direction beyond which the effect is held")
     ] = 60.0
+
+    @classmethod
+    def lags(cls, observations: Observations) -> Iterator[tuple[Literal["temperature", "time"], float]]:
+        """What may drive it in a record, and with which time constants (s).
+
+        A sensor on the gear itself is hardly ahead of it. Without one, what settles within a minute is creep,
+        and what takes far longer than the record is a straight line.
+        """
+        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
+        if temperature is not None and float(np.ptp(temperature)) > VARIES_K:
+            yield from (("temperature", each) for each in (*QUICK_S, *SLOW_S))
+        else:
+            longest = 6.0 * duration_s(observations.motion)
+            yield from (("time", each) for each in SLOW_S if each <= longest)
 
     def needs(self) -> frozenset[Channel]:
         """Time, and temperature where it is driven by it."""

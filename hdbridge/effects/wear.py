@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -12,10 +12,13 @@ from pydantic import Field
 from hdbridge.effects.base import (
     Cause,
     Compensable,
+    Coordinate,
+    Effect,
     FloatArray,
     Linear,
     Moment,
     Motion,
+    Observations,
     Shape,
     Start,
     Tracker,
@@ -70,6 +73,16 @@ class Wear(Linear):
     turns_limit: Annotated[
         float, Field(gt=0, le=1e9, description="motor turns from which on the height is held")
     ] = 10_000.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:  # noqa: ARG003
+        """From a gap to a loop as wide as the elastic one."""
+        yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """The motor's turns since the record began."""
+        run = np.cumsum(np.abs(np.diff(motion.motor_deg, prepend=motion.motor_deg[:1]))) / DEG_PER_TURN
+        return Coordinate("motor turns run", "", run, both_ways=True, bins=20)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A growth of one arcsec in 1000 turns, shape (n, 1)."""

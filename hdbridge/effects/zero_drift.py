@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from hdbridge.effects import coordinate as over
 from hdbridge.effects.base import (
     Cause,
     Compensable,
+    Coordinate,
+    Effect,
+    Experiment,
     FloatArray,
     Linear,
     Moment,
     Motion,
+    Observations,
     Start,
     Tracker,
 )
@@ -39,6 +44,21 @@ class ZeroDrift(Linear, Warmed):
         aliases=("creep", "wear", "count_loss", "load_order", "ratio_error"),
         source="thermal expansion with a first-order lag",
         size="5-60 arcsec, tau 10-60 min",
+        apart={
+            "count_loss": Experiment(
+                4, "return to one reference pose every half minute: a step has happened, a drift goes on"
+            ),
+            "creep": Experiment(
+                10,
+                "stand still for ten minutes after a move in each direction: creep takes the sign of the "
+                "direction",
+            ),
+            "ratio_error": Experiment(
+                3,
+                "sweep a load turn forth and back at twice the speed: a ramp goes with the angle, a drift "
+                "with time",
+            ),
+        },
     )
     compensable: ClassVar[Compensable] = Compensable(
         True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
@@ -48,6 +68,16 @@ class ZeroDrift(Linear, Warmed):
     """One arcsec per kelvin within half an hour."""
 
     drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ZeroDrift]:  # noqa: ARG003
+        """By the temperature where that changes, else by time."""
+        for driven_by, tau_s in cls.lags(observations):
+            yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Time: how a zero has moved since the record began."""
+        return over.time(motion)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One arcsec per kelvin, shape (n, 1)."""

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.path import branches
 from hdbridge.estimation.samples import BoolArray, IntArray, Samples
 from hdbridge.units import ARCSEC_PER_DEG
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.effects.base import Memoryless, measured_by_all
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.samples import IntArray, Samples
 

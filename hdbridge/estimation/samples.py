@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hdbridge.effects import FloatArray, Motion, Start
 from hdbridge.effects.base import measured_by_all
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.path import branches
 from hdbridge.errors import InputError
 from hdbridge.estimation.segment import MINIMUM_SAMPLES, Kind, Segment
 from hdbridge.observations.cuts import jumps

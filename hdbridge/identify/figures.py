@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from hdbridge.effects import FloatArray
-from hdbridge.effects.hysteresis import branches
+from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import REST_DEG_S
 from hdbridge.estimation.samples import KINDS, SLOW, Samples
 from hdbridge.estimation.segment import Kind

@@ -12,7 +12,6 @@ from support.effect_examples import EXAMPLES, motions, starts
 
 from hdbridge.effects import (
     CATALOGUE,
-    CAUSES,
     MEASURED,
     Channel,
     Effect,
@@ -20,6 +19,7 @@ from hdbridge.effects import (
     Motion,
     Start,
     Synchronous,
+    causes,
     moments,
     readings,
     unmet,
@@ -250,7 +250,7 @@ def fields(model: type[BaseModel]):
 
 
 def test_the_causes_are_those_that_findings_use():
-    assert set(CAUSES) == {
+    assert set(causes()) == {
         "motor_order", "motor_encoder_eccentricity", "load_order", "flexspline_order", "direction_phase",
         "torque_modulation", "compliance", "inertial_windup", "velocity_windup", "channel_skew", "backlash",
         "hysteresis_memory", "hysteresis_parameters", "rate_dependence", "subdivisional_error", "zero_drift",

@@ -15,7 +15,6 @@ from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.diagnose import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
 from hdbridge.effects import (
     CATALOGUE,
-    CAUSES,
     Channel,
     CountLoss,
     Hysteresis,
@@ -25,6 +24,7 @@ from hdbridge.effects import (
     Step,
     Synchronous,
     Vibration,
+    causes,
     extended,
 )
 from hdbridge.effects.kinematics import direction_of
@@ -271,7 +271,7 @@ def test_a_cause_that_scales_the_ripple_is_drawn_as_a_scale():
     assert np.all(np.abs(measured - percent) < 5.0 * spread + 0.2)
 
 
-@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize("cause", causes())
 def test_every_cause_of_the_catalogue_has_a_picture(cause):
     text = page(finding(cause))
     assert CATALOGUE[cause].about.title in html.unescape(text)

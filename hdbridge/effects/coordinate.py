@@ -1,0 +1,163 @@
+"""The quantities that an error may depend on, along a motion: for pictures, and for what has no name yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects.motion import BoolArray, Channel, FloatArray, Motion
+from hdbridge.effects.path import branches
+from hdbridge.units import DEG_PER_TURN
+
+IntArray = NDArray[np.intp]
+
+POINTS_PER_BIN: Final = 8
+LEAST_BINS: Final = 2
+SAME: Final = 1e-6
+"""A quantity that varies by less than this share of itself is one value, rounded."""
+NOTHING: Final = 1e-9
+"""... and so is one that varies by no more than this in its unit."""
+SMALLEST_WAY_DEG: Final = 0.01
+SMALLEST_TIME_S: Final = 0.01
+"""Less than this since a reversal counts as this, so that a logarithm can be taken."""
+
+
+class Spacing(Enum):
+    """How the bins over a coordinate lie."""
+
+    EVEN = "even"
+    FILLED = "filled"
+    """With equally many points in each: for what mostly keeps to a few values, like a speed."""
+    LOGARITHMIC = "logarithmic"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coordinate:
+    """A quantity along a motion."""
+
+    name: str
+    unit: str
+    values: FloatArray
+    """One per sample, shape (n,)."""
+    both_ways: bool = False
+    """Whether forward and backward are looked at apart."""
+    spacing: Spacing = Spacing.EVEN
+    bins: int = 72
+    """At most; fewer where there are not `POINTS_PER_BIN` points for each."""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, for an axis."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
+    def at(self, rows: BoolArray | IntArray) -> Coordinate:
+        """The same at some of the samples."""
+        return replace(self, values=self.values[rows])
+
+    def varies(self) -> bool:
+        """Whether it has more than one value, but for rounding."""
+        return bool(np.ptp(self.values) > SAME * np.max(np.abs(self.values)) + NOTHING)
+
+    def edges(self) -> FloatArray:
+        """Of the bins, shape (b + 1,), rising; two equal ones where there is but one value."""
+        low, high = float(np.min(self.values)), float(np.max(self.values))
+        bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
+        if self.spacing is Spacing.FILLED:
+            return np.asarray(np.unique(np.quantile(self.values, np.linspace(0.0, 1.0, bins + 1))))
+        if self.spacing is Spacing.LOGARITHMIC and low > 0.0:
+            return np.geomspace(low, high, bins + 1)
+        return np.linspace(low, high, bins + 1)
+
+    def numbers(self) -> IntArray:
+        """The bin of each point, shape (m,)."""
+        edges = self.edges()
+        found = np.searchsorted(edges, self.values, "right") - 1
+        return np.asarray(np.clip(found, 0, max(len(edges) - 2, 0)), dtype=np.intp)
+
+
+def motor_angle(motion: Motion) -> Coordinate:
+    """Within one turn of the motor."""
+    return Coordinate("motor angle", "deg", np.mod(motion.motor_deg, DEG_PER_TURN), both_ways=True)
+
+
+def load_angle(motion: Motion, ratio: float) -> Coordinate:
+    """Within one turn of the load."""
+    return Coordinate("load angle", "deg", np.mod(motion.motor_deg / ratio, DEG_PER_TURN), both_ways=True)
+
+
+def position(motion: Motion, ratio: float) -> Coordinate:
+    """Of the load, over all its turns."""
+    return Coordinate("position", "deg of the load", motion.motor_deg / ratio, both_ways=True)
+
+
+def speed(motion: Motion) -> Coordinate:
+    """Of the motor, signed; `time` where it is not known."""
+    values = motion.motor_speed_deg_s
+    if values is None:
+        return time(motion)
+    return Coordinate("speed", "motor deg/s", values, spacing=Spacing.FILLED, bins=40)
+
+
+def acceleration(motion: Motion) -> Coordinate:
+    """Of the motor; `time` where it is not known."""
+    values = motion.motor_acceleration_deg_s2
+    if values is None:
+        return time(motion)
+    return Coordinate(
+        "acceleration", "motor deg/s\N{SUPERSCRIPT TWO}", values, spacing=Spacing.FILLED, bins=40
+    )
+
+
+def time(motion: Motion) -> Coordinate:
+    """On the record's clock; the sample's number where there is none."""
+    values = motion.time_s
+    if values is None:
+        return Coordinate("sample", "", np.arange(len(motion), dtype=np.float64), bins=100)
+    return Coordinate("time", "s", values, bins=100)
+
+
+def measured(motion: Motion, channel: Channel) -> Coordinate:
+    """A measured channel; `time` where it was not measured."""
+    values = motion.measured.get(channel)
+    if values is None:
+        return time(motion)
+    spacing = Spacing.EVEN if channel is Channel.TEMPERATURE else Spacing.FILLED
+    return Coordinate(channel.title, channel.unit, values, spacing=spacing, bins=40)
+
+
+def since_reversal(motion: Motion) -> Coordinate:
+    """Motor angle since the axis last reversed or the record began."""
+    angle, last = motion.motor_deg, _last_reversal(motion)
+    away = np.abs(angle - angle[last])
+    return _logarithmic("motor angle since the last reversal", "deg", away, SMALLEST_WAY_DEG)
+
+
+def time_since_reversal(motion: Motion) -> Coordinate:
+    """The time that has passed since then."""
+    clock = time(motion).values
+    since = np.maximum(clock - clock[_last_reversal(motion)], 0.0)
+    return _logarithmic("time since the last reversal", "s", since, SMALLEST_TIME_S)
+
+
+def since_change(motion: Motion) -> Coordinate:
+    """Time since the axis last stopped, started or reversed; `time` where the speed is not known."""
+    if motion.motor_speed_deg_s is None:
+        return time(motion)
+    clock = time(motion).values
+    change = np.flatnonzero(np.diff(np.sign(motion.motor_speed_deg_s), prepend=np.nan) != 0.0)
+    last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
+    return _logarithmic("time since the last stop or start", "s", clock - clock[last], SMALLEST_TIME_S)
+
+
+def _last_reversal(motion: Motion) -> IntArray:
+    turning = np.asarray(branches(motion.motor_deg)[0][:-1] or [0], dtype=np.intp)
+    before = np.searchsorted(turning, np.arange(len(motion)), "left") - 1
+    return np.asarray(turning[np.maximum(before, 0)])
+
+
+def _logarithmic(name: str, unit: str, values: FloatArray, smallest: float) -> Coordinate:
+    return Coordinate(name, unit, np.maximum(values, smallest), True, Spacing.LOGARITHMIC, 40)

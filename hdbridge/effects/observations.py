@@ -1,0 +1,71 @@
+"""What an effect may know of a record before anything is fitted: enough to propose itself, or to decline."""
+
+from __future__ import annotations
+
+from typing import Final, Protocol
+
+import numpy as np
+
+from hdbridge.effects.motion import Channel, Motion
+from hdbridge.effects.path import standing_s
+
+TOP: Final = 0.98
+"""Quantile of a channel's size that counts as its largest: single readings may be wrong."""
+
+
+class Observations(Protocol):
+    """A record, as an effect sees it."""
+
+    @property
+    def motion(self) -> Motion:
+        """What drove the axis."""
+        ...
+
+    @property
+    def ratio(self) -> float:
+        """Motor turns per turn of the load."""
+        ...
+
+    @property
+    def period_s(self) -> float:
+        """Median time between samples."""
+        ...
+
+    @property
+    def reversals(self) -> int:
+        """Turns of the motor with travel on both sides."""
+        ...
+
+    @property
+    def travel_deg(self) -> float:
+        """The largest span of the motor's angle over which a phase is carried."""
+        ...
+
+    @property
+    def motor_count_arcsec(self) -> float:
+        """One count of the motor encoder, at the load."""
+        ...
+
+
+def top_speed_deg_s(motion: Motion) -> float:
+    """The highest motor speed but for single samples; one turn a second where it is not known."""
+    speed = motion.motor_speed_deg_s
+    return 360.0 if speed is None else float(np.quantile(np.abs(speed), 0.99))
+
+
+def top(motion: Motion, channel: Channel) -> float:
+    """The largest size of a measured channel; 0 where it was not measured, or never changes."""
+    values = motion.measured.get(channel)
+    if values is None or not float(np.ptp(values)) > 0.0:
+        return 0.0
+    return float(np.quantile(np.abs(values), TOP))
+
+
+def duration_s(motion: Motion) -> float:
+    """From the first to the last sample; 0 without a clock."""
+    return 0.0 if motion.time_s is None else float(np.ptp(motion.time_s))
+
+
+def longest_rest_s(motion: Motion) -> float:
+    """How long the axis stands still at most."""
+    return float(np.max(standing_s(motion), initial=0.0))

@@ -1,0 +1,101 @@
+"""A path of the motor cut where it reverses: what loops, dead zones and memory are made of."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hdbridge.effects.described import Stretch
+from hdbridge.effects.motion import FloatArray, Motion, Start
+
+LOOP_DEG: Final = 60.0
+"""Motor angle after a reversal within which an elastic loop is felt: three times the width of a published
+gear's loop."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """A motor angle cut at its reversals; see `branches`."""
+
+    turning: tuple[int, ...]
+    signs: tuple[int, ...]
+    angles_deg: tuple[float, ...]
+    """Motor angle at ``turning``."""
+    away_deg: FloatArray
+    """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
+    sense: FloatArray
+    """Their direction."""
+
+    @classmethod
+    def of(cls, motor_deg: FloatArray, start: Start) -> Path:
+        """Take an angle of at least one sample apart."""
+        turning, signs = branches(motor_deg, start)
+        angles, lengths = motor_deg[turning], np.diff(turning)
+        away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
+        sense = np.repeat(np.array(signs, dtype=np.float64), lengths)
+        return cls(tuple(turning), tuple(signs), tuple(angles.tolist()), away, sense)
+
+
+_PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
+"""By the identity of the angle's array, as long as that is there."""
+
+
+def path_of(motor_deg: FloatArray, start: Start) -> Path:
+    """`Path.of`; kept for an array that cannot be written to, of which a fit asks it a thousand times."""
+    if motor_deg.flags.writeable:
+        return Path.of(motor_deg, start)
+    key = (id(motor_deg), start is Start.VIRGIN)
+    kept = _PATHS.get(key)
+    if kept is not None and kept[0]() is motor_deg:
+        return kept[1]
+    path = Path.of(motor_deg, start)
+    _PATHS[key] = (weakref.ref(motor_deg, lambda _: _PATHS.pop(key, None)), path)
+    return path
+
+
+def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
+    """Indices between which the motor moves in one direction (rest included), and that direction.
+
+    Returns ``turning`` of length b + 1 (first index, each turning point, last index) and ``signs`` of length
+    b. A saturated start counts as a direction: going on in it begins no new branch worth telling apart.
+    """
+    steps = np.diff(motor_deg)
+    moving = np.flatnonzero(steps)
+    if not len(moving):
+        return [len(motor_deg) - 1], []
+    forward = steps[moving] > 0.0
+    change = np.flatnonzero(forward[1:] != forward[:-1]) + 1
+    turning = [
+        0 if start is Start.VIRGIN else int(moving[0]),
+        *moving[change].tolist(),
+        len(motor_deg) - 1,
+    ]
+    return turning, [1 if each else -1 for each in (forward[0], *forward[change].tolist())]
+
+
+def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
+    """Motor angle since the axis last reversed (or began), degrees, shape (n,)."""
+    turning, _ = branches(motor_deg)
+    result = np.zeros(len(motor_deg))
+    if len(turning) > 1:
+        begin = np.repeat(motor_deg[turning[:-1]], np.diff(turning))
+        result[turning[0] + 1 :] = np.abs(motor_deg[turning[0] + 1 :] - begin)
+    return result
+
+
+def away_from_reversals(motion: Motion) -> Stretch:
+    """Where no elastic loop is felt, whatever its shape."""
+    rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
+    return Stretch(rows, "seen only where the axis reverses")
+
+
+def standing_s(motion: Motion) -> FloatArray:
+    """Time since the axis came to rest, seconds, shape (n,); 0 in motion, and at unknown speed."""
+    if motion.motor_speed_deg_s is None or motion.time_s is None:
+        return np.zeros(len(motion))
+    moving = motion.motor_speed_deg_s != 0.0
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(motion)), 0))
+    return np.asarray(np.where(moving, 0.0, motion.time_s - motion.time_s[last]))
