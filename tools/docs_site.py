@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import hdbridge
+import hdbridge.testing
 
 ROOT = Path(__file__).resolve().parents[1]
 FROM_THE_TOP = {"contributing.md": "CONTRIBUTING.md", "changes.md": "CHANGELOG.md"}
 REFERENCE = """# API reference
 
-Made from the docstrings of what `import hdbridge` gives. How these work together, with examples:
-[library](api.md).
+Made from the docstrings of what `import hdbridge` and `import hdbridge.testing` give. How these work
+together, with examples: [library](api.md).
 """
 
 
@@ -22,10 +23,12 @@ def reference() -> str:
     """The page of the API: every public name, the errors last."""
     public = {name: getattr(hdbridge, name) for name in getattr(hdbridge, "__all__", ())}
     errors = {name for name, each in public.items() if isinstance(each, type) and issubclass(each, Exception)}
-    groups = (
+    groups: tuple[tuple[str, list[str]], ...] = (
         ("Classes and functions", [name for name in public if name not in errors]),
         ("Errors", sorted(errors)),
     )
+    groups += (("For tests of other programs", list(hdbridge.testing.__all__)),)
+    public |= {name: getattr(hdbridge.testing, name) for name in hdbridge.testing.__all__}
     parts = [REFERENCE]
     for title, names in groups:
         parts.append(f"## {title}\n")

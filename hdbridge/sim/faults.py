@@ -31,8 +31,14 @@ class Faults:
     """The heartbeat stops, the rest goes on."""
     silent: bool = False
     """As good as unplugged: it hears nothing and says nothing; its own watchdogs stop the axis."""
+    deaf: bool = False
+    """It hears nothing and goes on speaking: as if its master hung."""
+    muted_ids: frozenset[int] = frozenset()
+    """Frames with these identifiers are not sent: one TPDO, the answers to SDO requests."""
     load_jump_counts: int = 0
     """Added to the load encoder from the next sample on."""
+    motor_jump_counts: int = 0
+    """Added to the motor encoder from the next sample on; the servo loops act on it."""
     load_reading: Callable[[int], int] | None = None
     """What the load encoder makes of its counts from the next sample on: a drift, a freeze, noise."""
     ignore_lost_heartbeat: bool = False
@@ -51,6 +57,8 @@ class Faults:
     _errors: list[tuple[int, bytes]] = field(default_factory=list)
     _lost_masters: list[int] = field(default_factory=list)
     _boot_ups: int = 0
+    _departures: int = 0
+    _openings: int = 0
 
     def raise_error(self, code: int, additional: bytes = b"") -> None:
         """At the next poll: malfunction ``code`` (EMCY, fault reaction), with up to five bytes of detail."""
@@ -63,6 +71,14 @@ class Faults:
     def boot_up(self) -> None:
         """At the next poll: reset as after a brown-out, with a boot-up message, whatever the axis does."""
         self._boot_ups += 1
+
+    def leave_operational(self) -> None:
+        """At the next poll: into PRE-OPERATIONAL, whatever the axis does, with a heartbeat that says so."""
+        self._departures += 1
+
+    def open_enable_input(self) -> None:
+        """At the next poll: the power stage goes off without a word, as by a hardware enable input."""
+        self._openings += 1
 
     def take_errors(self) -> list[tuple[int, bytes]]:
         """For the node: the errors to raise now."""
@@ -79,10 +95,22 @@ class Faults:
         wanted, self._boot_ups = self._boot_ups > 0, 0
         return wanted
 
+    def take_departure(self) -> bool:
+        """For the node: whether to leave OPERATIONAL now."""
+        wanted, self._departures = self._departures > 0, 0
+        return wanted
+
+    def take_opening(self) -> bool:
+        """For the node: whether the enable input opens now."""
+        wanted, self._openings = self._openings > 0, 0
+        return wanted
+
     @property
     def concerns_poll(self) -> bool:
         """For the node: whether something is to be done at this poll."""
-        return bool(self._errors or self._lost_masters) or self._boot_ups > 0
+        return bool(
+            self._errors or self._lost_masters or self._boot_ups or self._departures or self._openings
+        )
 
     @property
     def concerns_tpdos(self) -> bool:

@@ -297,6 +297,11 @@ class Firmware:
         self._set_state(State.FAULT_REACTION_ACTIVE)
         self._brake(option, State.FAULT)
 
+    def power_cut(self) -> None:
+        """The power stage goes off by itself, and no error tells of it: a hardware enable input opened."""
+        if self.state is not State.FAULT:
+            self._power_off(State.SWITCH_ON_DISABLED)
+
     def connection_lost(self, code: int) -> None:
         """The master is gone, as ``code`` says: react as 6007h says."""
         option = self._dictionary.value(0x6007)

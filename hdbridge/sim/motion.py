@@ -65,6 +65,7 @@ class Motion:
         self.motor_counts = machine.motor_counts
         self.load_counts = machine.load_counts
         self.load_velocity_counts_s = 0.0
+        self.motor_jump_counts = 0
         self.load_jump_counts = 0
         self.load_reading: Callable[[int], int] | None = None
         self._owed_s = 0.0
@@ -119,7 +120,8 @@ class Motion:
         """Move the demand, and the plant after it, for one period."""
         substeps = self._substeps(period_s)
         if substeps:
-            self.machine.follow(self.demand_counts, demand_counts, substeps)
+            jump = self.motor_jump_counts  # the loops close on the encoder as it reads
+            self.machine.follow(self.demand_counts - jump, demand_counts - jump, substeps)
         self.demand_counts = demand_counts
         self.velocity_counts_s = velocity_counts_s
         self._sample(period_s)
@@ -143,7 +145,7 @@ class Motion:
 
     def _sample(self, period_s: float) -> None:
         machine = self.machine
-        self.motor_counts = machine.motor_counts
+        self.motor_counts = machine.motor_counts + self.motor_jump_counts
         counts = machine.load_counts + self.load_jump_counts
         if self.load_reading is not None:
             counts = self.load_reading(counts)

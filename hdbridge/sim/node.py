@@ -190,7 +190,9 @@ class SimulatedDrive:
     def handle(self, message: can.Message, now_s: float) -> None:
         """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
         self._now_s = now_s
-        if message.is_extended_id or message.is_remote_frame or message.is_error_frame or self.faults.silent:
+        if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
+            return
+        if self.faults.silent or self.faults.deaf:
             return
         can_id = message.arbitration_id
         if can_id == self._sync_id:
@@ -209,7 +211,7 @@ class SimulatedDrive:
     # ---------------------------------------------------------------- frames
 
     def _send(self, can_id: int, data: bytes) -> None:
-        if self.faults.silent:
+        if self.faults.silent or can_id in self.faults.muted_ids:
             return
         try:
             self.bus.send(DataFrame(can_id, data))
@@ -306,6 +308,11 @@ class SimulatedDrive:
             self.firmware.fault(code, additional)
         for code in self.faults.take_lost_masters():
             self.firmware.connection_lost(code)
+        if self.faults.take_opening():
+            self.firmware.power_cut()
+        if self.faults.take_departure():
+            self._leave_operational(Nmt.PRE_OPERATIONAL)
+            self._send_heartbeat()
         if self.faults.take_boot_up():
             self._reset_node()
 
@@ -314,6 +321,7 @@ class SimulatedDrive:
     def _advance(self) -> None:
         motion, faults = self.firmware.motion, self.faults
         motion.load_jump_counts, motion.load_reading = faults.load_jump_counts, faults.load_reading
+        motion.motor_jump_counts = faults.motor_jump_counts
         self.firmware.advance(self._period_s)
 
     def _next_due_s(self) -> float:
@@ -332,12 +340,15 @@ class SimulatedDrive:
         if self._rpdo_due_s <= now_s:
             self._miss_rpdo(now_s)
         if self._heartbeat_due_s <= now_s:
-            if not self.faults.mute_heartbeat:
-                self._send(_HEARTBEAT + self.node_id, bytes([self.nmt]))
+            self._send_heartbeat()
             late = now_s - self._heartbeat_due_s
             skipped = int(late / self._heartbeat_s)
             self._heartbeat_due_s += (1 + skipped) * self._heartbeat_s
         self._due_s = self._next_due_s()
+
+    def _send_heartbeat(self) -> None:
+        if not self.faults.mute_heartbeat:
+            self._send(_HEARTBEAT + self.node_id, bytes([self.nmt]))
 
     def _send_events(self, now_s: float) -> None:
         for tpdo in self._event_tpdos:

@@ -12,22 +12,29 @@ from hdbridge.errors import BusError
 from hdbridge.sim.node import SimulatedDrive
 
 LONGEST_WAIT_S: Final = 0.1
-"""How long ``should_stop`` may go unasked."""
+"""How long ``should_stop`` may go unasked, unless a shorter time is wanted."""
 
 PATIENCE_S: Final = 5.0
 """How long reading the bus may fail without a break: an interface that is down may come up again."""
 
 
-def run(bus: can.BusABC, node: SimulatedDrive, clock: Clock, should_stop: Callable[[], bool]) -> None:
+def run(
+    bus: can.BusABC,
+    node: SimulatedDrive,
+    clock: Clock,
+    should_stop: Callable[[], bool],
+    longest_wait_s: float = LONGEST_WAIT_S,
+) -> None:
     """Serve ``node``, whose bus is ``bus``, until ``should_stop`` says so.
 
-    While the interface fails the drive goes on by its own clock, so that its watchdogs stop the axis. Raises
-    BusError when reading has failed for ``PATIENCE_S``.
+    ``longest_wait_s`` is how long a new event of the node's may go unnoticed. While the interface fails the
+    drive goes on by its own clock, so that its watchdogs stop the axis. Raises BusError when reading has
+    failed for ``PATIENCE_S``.
     """
     failing_since_s: float | None = None
     while not should_stop():
         try:
-            wait_s = min(node.next_event_s() - clock.now(), LONGEST_WAIT_S)
+            wait_s = min(node.next_event_s() - clock.now(), longest_wait_s)
             message = bus.recv(max(wait_s, 0.0))
             if message is not None:
                 node.handle(message, clock.now())

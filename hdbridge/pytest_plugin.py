@@ -1,0 +1,110 @@
+"""A simulated CiA-402 drive for a test: pytest's fixture ``hdbridge_drive``; an example is in docs/ci.md.
+
+pytest loads this file in every run of an environment that hdbridge is installed in. So it imports nothing
+but pytest; what simulates is loaded by the first test that asks for a drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+if TYPE_CHECKING:
+    from hdbridge.testing import SimulatedDrive
+
+FIXTURE: Final = "hdbridge_drive"
+MARKER: Final = "hdbridge_drive"
+_DEFAULTS: Final = {"profile": "demo", "bus": "virtual", "seed": "0", "truth": ""}
+_HELP: Final = {
+    "profile": "the axis: a folder with axis.yaml, or a profile that comes with hdbridge (article, demo)",
+    "bus": "virtual, lockstep, or INTERFACE:CHANNEL of python-can such as socketcan:vcan0",
+    "seed": "seed of the simulated axis's noise",
+    "truth": "a truth file in place of the profile's twin.yaml or truth.yaml",
+}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--hdbridge-...`` and the same keys to the ini file."""
+    group = parser.getgroup("hdbridge", "simulated CiA-402 drive (fixture hdbridge_drive)")
+    for name, what in _HELP.items():
+        help_text = f"{what}; default {_DEFAULTS[name]}" if _DEFAULTS[name] else what
+        group.addoption(f"--hdbridge-{name}", metavar=name.upper(), default=None, help=help_text)
+        parser.addini(f"hdbridge_{name}", f"for the fixture hdbridge_drive: {help_text}", default="")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known."""
+    config.addinivalue_line(
+        "markers",
+        f"{MARKER}(profile='demo', bus='virtual', seed=0, truth=None): the drive that the fixture "
+        "hdbridge_drive makes; before the command line and the ini file",
+    )
+
+
+@pytest.fixture
+def hdbridge_drive(request: pytest.FixtureRequest) -> Iterator[SimulatedDrive]:
+    """A simulated CiA-402 drive on a bus, with faults by name and the true angles: ``hdbridge.testing``."""
+    from hdbridge.errors import HdbridgeError  # noqa: PLC0415 - nothing is loaded before a test needs it
+    from hdbridge.testing import simulated_drive  # noqa: PLC0415
+
+    complaint = ""
+    with ExitStack() as stack:
+        try:
+            drive = stack.enter_context(simulated_drive(**_wanted(request)))
+        except HdbridgeError as error:
+            complaint = str(error)
+        if complaint:
+            pytest.fail(f"{FIXTURE}: {complaint}", pytrace=False)
+        yield drive
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Put what the drive went through into the report of a test that failed."""
+    report = yield
+    drive = getattr(item, "funcargs", {}).get(FIXTURE)
+    if drive is not None and report.when == "call" and report.failed:
+        report.sections.append(("simulated drive", drive.report()))
+    return report
+
+
+def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What the marker, the command line, the ini file and the defaults say, in this order.
+
+    Each wins over the next. A relative path starts from the test's folder, the present one, the ini file's.
+    """
+    config = request.config
+    marks: dict[str, Any] = {}
+    for marker in request.node.iter_markers(MARKER):  # the nearest first
+        unknown = sorted({*marker.kwargs} - {*_DEFAULTS})
+        if marker.args or unknown:
+            found = f"found {', '.join(unknown)}" if unknown else f"found {marker.args!r} without a name"
+            pytest.fail(f"the marker {MARKER}: {found}; expected {', '.join(_DEFAULTS)}", pytrace=False)
+        marks = {**marker.kwargs, **marks}
+    ini_folder = config.inipath.parent if config.inipath is not None else config.rootpath
+    wanted: dict[str, Any] = {}
+    for name, default in _DEFAULTS.items():
+        value: Any
+        if name in marks:
+            value, folder = marks[name], request.path.parent
+        elif (option := config.getoption(f"--hdbridge-{name}")) is not None:
+            value, folder = option, config.invocation_params.dir
+        else:
+            value, folder = config.getini(f"hdbridge_{name}") or default, ini_folder
+        if name in ("profile", "truth") and value and (folder / str(value)).exists():
+            value = folder / str(value)
+        wanted[name] = value
+    return {**wanted, "seed": _seed(wanted["seed"]), "truth": wanted["truth"] or None}
+
+
+def _seed(value: Any) -> Any:
+    """As a number where it is one; what else it is, is complained about later."""
+    try:
+        return int(value) if isinstance(value, str) else value
+    except ValueError:
+        return value

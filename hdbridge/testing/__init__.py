@@ -1,0 +1,12 @@
+"""A simulated drive for other people's tests: on a bus, with faults by name and the true angles.
+
+`hdbridge.pytest_plugin` makes one per test (the fixture `hdbridge_drive`); without pytest it is
+``with simulated_drive("article") as drive:``. docs/ci.md has a complete example. These names are public, as
+those of `hdbridge` itself.
+"""
+
+from hdbridge.testing.history import Event, TrueState
+from hdbridge.testing.simulateddrive import DriveTime, SimulatedDrive, simulated_drive
+from hdbridge.testing.watched import Fault
+
+__all__ = ["DriveTime", "Event", "Fault", "SimulatedDrive", "TrueState", "simulated_drive"]

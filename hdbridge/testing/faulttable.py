@@ -1,0 +1,378 @@
+"""The faults that a simulated drive makes by name: one row each.
+
+They are those of the fault table in docs/timing-and-faults.md, seen from the other end of the bus: what the
+drive, its encoders, other nodes and the interface do. What a program does to itself (a target that is not a
+number, a full disk) it has to do itself.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from enum import Enum
+from types import MappingProxyType
+from typing import Any, Final
+
+import can
+
+from hdbridge.errors import BusError, InputError
+from hdbridge.files.expectation import nearest
+from hdbridge.testing.port import Condition, Port
+from hdbridge.testing.watched import End, WatchedDrive, shown
+
+Value = int | float
+_BUS_OFF: Final = 0x40
+"""CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of an error frame."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What a fault may lay hands on."""
+
+    drive: WatchedDrive
+    another: Callable[[], AbstractContextManager[can.BusABC]]
+    """Opens the end of another node on the bus."""
+    port: Port | None
+    """The program's interface, where it is in this process."""
+    bus: str
+    """What the bus is called in complaints."""
+
+    def send(self, can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> End:
+        """Frames of another node."""
+        kind = {"is_extended_id": False, **kind}
+        with self.another() as bus:
+            for _ in range(times):
+                bus.send(can.Message(arbitration_id=can_id, data=data, **kind))
+        return _nothing
+
+    def wish(self, name: str, value: object) -> End:
+        """Set a wish of the drive; its end is that it is as it was."""
+        wishes = self.drive.faults
+        before = getattr(wishes, name)
+        setattr(wishes, name, value)
+        return lambda: setattr(wishes, name, before)
+
+    def mute(self, can_id: int) -> End:
+        """Frames with an identifier are not sent any more."""
+        wishes = self.drive.faults
+        wishes.muted_ids |= {can_id}
+
+        def speaks() -> None:
+            wishes.muted_ids -= {can_id}
+
+        return speaks
+
+    @property
+    def interface(self) -> Port:
+        """The program's interface; for rows that say that they need it."""
+        assert self.port is not None
+        return self.port
+
+
+def _nothing() -> None:
+    """The end of what is over as soon as it has begun."""
+
+
+Make = Callable[..., End]
+
+
+class Needs(Enum):
+    """What not every bus has."""
+
+    NOTHING = "nothing"
+    INTERFACE = "the program's interface, in this process"
+    CLOCK = "a clock that is the drive's to move"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault."""
+
+    name: str
+    what: str
+    """In a sentence; arguments by their names."""
+    make: Make
+    arguments: Mapping[str, Value] = field(default_factory=dict)
+    """With their defaults."""
+    answers: str = ""
+    """The row of the fault table that it is for, as that begins."""
+    needs: Needs = Needs.NOTHING
+    touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
+    """The object that the drive must have for it, by the arguments."""
+
+    def check(self, reach: Reach, arguments: Mapping[str, Any]) -> None:
+        """InputError where this bus or this drive has nothing to make it with."""
+        __tracebackhide__ = True  # pytest shows the test's line
+        if self.needs is Needs.INTERFACE and reach.port is None:
+            raise InputError(
+                f"fault '{self.name}': the interface of {reach.bus} is not the drive's to take away; choose "
+                "the bus 'virtual' or 'lockstep', or do it in the test (ip link set vcan0 down)"
+            )
+        if self.needs is Needs.CLOCK and (reach.port is None or reach.port.clock is None):
+            raise InputError(
+                f"fault '{self.name}' needs the bus 'lockstep', where time is the drive's to move; in real "
+                "time let the program itself sleep, or stop its process (SIGSTOP)"
+            )
+        place = self.touches(arguments) if self.touches else None
+        if place is not None and place not in reach.drive.dictionary:
+            raise InputError(f"fault '{self.name}': the drive has no object {place[0]:04X}h:{place[1]:02X}")
+
+    def begin(self, reach: Reach, arguments: Mapping[str, Value]) -> End:
+        """Make it; BusError where the bus does not take its frames."""
+        try:
+            return self.make(reach, **arguments)
+        except can.CanError as error:
+            raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
+
+    def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
+        """The arguments, or an InputError that says which there are."""
+        __tracebackhide__ = True  # pytest shows the test's line
+        signature = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items()) or "none"
+        for name, value in given.items():
+            if name not in self.arguments:
+                close = nearest(name, list(self.arguments))
+                hint = f"; did you mean '{close}'?" if close else ""
+                raise InputError(f"fault '{self.name}' has no argument '{name}'; expected: {signature}{hint}")
+            wanted = type(self.arguments[name])
+            is_number = isinstance(value, int) and not isinstance(value, bool)
+            if not (is_number or (wanted is float and isinstance(value, float))):
+                raise InputError(
+                    f"fault '{self.name}': {name} is {value!r}; expected a number as in {signature}"
+                )
+        return {**self.arguments, **given}
+
+
+def _wish(name: str, value: object) -> Make:
+    return lambda reach: reach.wish(name, value)
+
+
+def _counted(name: str) -> Make:
+    return lambda reach, count: reach.wish(name, count)
+
+
+def _once(act: Callable[[WatchedDrive], object]) -> Make:
+    def make(reach: Reach) -> End:
+        act(reach.drive)
+        return _nothing
+
+    return make
+
+
+def _frame(can_id: int, data: bytes = b"", *, own: bool = False, **kind: bool) -> Make:
+    """A frame; where ``own``, the drive's node id is added to its identifier."""
+    return lambda reach: reach.send(can_id + own * reach.drive.node_id, data, **kind)
+
+
+def _stale(reach: Reach) -> End:
+    for can_id, data in list(reach.drive.last_tpdos.items()):
+        reach.send(can_id, data)
+    return _nothing
+
+
+def _tpdo(arguments: Mapping[str, Any]) -> tuple[int, int]:
+    return 0x1800 + arguments["number"] - 1, 1
+
+
+def _named_object(arguments: Mapping[str, Any]) -> tuple[int, int]:
+    return arguments["index"], arguments["subindex"]
+
+
+def _tpdo_stopped(reach: Reach, number: int) -> End:
+    return reach.mute(reach.drive.dictionary.value(*_tpdo({"number": number})) & 0x7FF)
+
+
+def _emergencies(reach: Reach, count: int, code: int) -> End:
+    return reach.send(0x080 + reach.drive.node_id, struct.pack("<HB5x", code, 1), times=count)
+
+
+def _drive_fault(reach: Reach, code: int) -> End:
+    reach.drive.faults.raise_error(code)
+    return _nothing
+
+
+def _glitch(reach: Reach, counts: int, samples: int) -> End:
+    left = [counts] * samples
+    return reach.wish("load_reading", lambda right: right + (left.pop() if left else 0))
+
+
+def _frozen(reach: Reach) -> End:
+    counts = reach.drive.firmware.motion.load_counts
+    return reach.wish("load_reading", lambda _: counts)
+
+
+def _drift(reach: Reach, counts_per_s: float) -> End:
+    drive = reach.drive
+    begin_s = drive.time_s
+    return reach.wish("load_reading", lambda right: right + round(counts_per_s * (drive.time_s - begin_s)))
+
+
+def _weak(reach: Reach, percent: float) -> End:
+    machine, value = reach.drive.machine, reach.drive.dictionary.value
+
+    def strong_again() -> None:
+        machine.torque_limit_permille = value(0x6072)
+
+    machine.torque_limit_permille = 10.0 * percent
+    return strong_again
+
+
+def _gone(condition: Condition) -> Make:
+    return lambda reach: reach.interface.fail(condition)
+
+
+def _full(reach: Reach, count: int) -> End:
+    port = reach.interface
+    port.refused_sends += count
+
+    def room_again() -> None:
+        port.refused_sends = 0
+
+    return room_again
+
+
+def _stall(reach: Reach, duration_s: float) -> End:
+    clock = reach.interface.clock
+    assert clock is not None
+    clock.stall_s += duration_s
+    return _nothing
+
+
+def _told(reach: Reach, index: int, subindex: int, value: int) -> End:
+    return reach.drive.tell_instead(index, subindex, value)
+
+
+def _identity(reach: Reach, product_code: int) -> End:
+    return reach.drive.tell_instead(0x1018, 2, product_code)
+
+
+def _no_object(reach: Reach, index: int, subindex: int) -> End:
+    reach.drive.dictionary.remove(index, subindex)
+    return _nothing
+
+
+def _no_watchdogs(reach: Reach) -> End:
+    ends = (reach.wish("ignore_lost_heartbeat", True), reach.wish("ignore_missing_set_points", True))
+
+    def watches_again() -> None:
+        for end in ends:
+            end()
+
+    return watches_again
+
+
+def _slow_brakes(reach: Reach, counts_per_s2: float) -> End:
+    return reach.wish("deceleration_counts_s2", counts_per_s2)
+
+
+_MISSING = "a TPDO is missing"
+_DUPLICATED = "duplicated, delayed or stale TPDO"
+_WRONG_KIND = "a frame of the wrong kind"
+_JUMP = "encoder jump"
+_OWN_ID = "own identifier from elsewhere"
+_CHANNEL = "a load torque or temperature"
+
+_ROWS: Final = (
+    Row("lost_tpdo", "The next `count` TPDOs are not sent.", _counted("drop_tpdos"), {"count": 1}, _MISSING),
+    Row("late_tpdo", "The next `count` TPDOs come one SYNC later, after the fresh ones.",
+        _counted("hold_tpdos"), {"count": 1}, _DUPLICATED),
+    Row("duplicated_tpdo", "The next `count` TPDOs come twice.",
+        _counted("duplicate_tpdos"), {"count": 1}, _DUPLICATED),
+    Row("stale_tpdo", "The TPDOs of the last SYNC come once more, now.", _stale, answers=_DUPLICATED),
+    Row("reordered_tpdos", "After the next `count` SYNCs the TPDOs come in reverse order.",
+        _counted("reverse_tpdos"), {"count": 1}),
+    Row("short_tpdo", "The next `count` TPDOs come without their last byte.",
+        _counted("shorten_tpdos"), {"count": 1}, "a TPDO of the wrong length"),
+    Row("tpdo_stopped", "TPDO `number` is not sent any more, the others are.",
+        _tpdo_stopped, {"number": 1}, _CHANNEL, touches=_tpdo),
+    Row("cable_pulled", "The drive hears nothing and says nothing.", _wish("silent", True), answers=_MISSING),
+    Row("drive_deaf", "The drive hears nothing, and goes on speaking: to its watchdogs the program hangs.",
+        _wish("deaf", True), answers="hang"),
+    Row("program_stalls", "The program's next wait takes `duration_s` longer (only in lockstep).",
+        _stall, {"duration_s": 0.1}, "overrun", Needs.CLOCK),
+    Row("remote_frame", "A remote frame (RTR) with the identifier of TPDO 1.",
+        _frame(0x180, own=True, is_remote_frame=True), answers=_WRONG_KIND),
+    Row("extended_frame", "A frame with a 29-bit identifier, of the number of TPDO 1.",
+        _frame(0x180, bytes(8), own=True, is_extended_id=True), answers=_WRONG_KIND),
+    Row("error_frame", "An error frame.", _frame(0x004, bytes(8), is_error_frame=True), answers=_WRONG_KIND),
+    Row("bus_off", "The error frame with which a CAN controller says that it went bus-off.",
+        _frame(_BUS_OFF, bytes(8), is_error_frame=True), answers="interface down, deleted, bus-off"),
+    Row("babbling_node", "`count` frames of a node that nobody knows, at once.",
+        lambda reach, count: reach.send(0x7E5, bytes(8), times=count), {"count": 300},
+        "more than 256 frames waiting"),
+    Row("emergency_burst", "`count` EMCY messages with `code`; the drive goes on.",
+        _emergencies, {"count": 32, "code": 0x3110}, "EMCY"),
+    Row("drive_fault", "The drive detects an error, sends EMCY `code`, brakes and goes into FAULT.",
+        _drive_fault, {"code": 0x3210}, "the drive reports a fault"),
+    Row("enable_lost", "The power stage goes off without a word, as by a hardware enable input.",
+        _once(lambda drive: drive.faults.open_enable_input()), answers="the drive reports a fault"),
+    Row("restart", "The drive restarts, as after a brown-out: boot-up message, every object as at power-on.",
+        _once(lambda drive: drive.faults.boot_up()), answers="boot-up message"),
+    Row("leaves_operational", "The drive goes into NMT PRE-OPERATIONAL; its heartbeat says so.",
+        _once(lambda drive: drive.faults.leave_operational()), answers="boot-up message"),
+    Row("heartbeat_lost", "The drive's heartbeat stays away, the rest goes on.",
+        _wish("mute_heartbeat", True), answers="heartbeat older"),
+    Row("second_master_sync", "SYNC of another master.", _frame(0x080), answers="SYNC from elsewhere"),
+    Row("second_master_set_point", "An RPDO of another master: no power, target 0.",
+        _frame(0x200, bytes(6), own=True), answers=_OWN_ID),
+    Row("second_master_heartbeat", "A heartbeat of another master, node `node_id`.",
+        lambda reach, node_id: reach.send(0x700 + node_id, b"\x05"), {"node_id": 127}, _OWN_ID),
+    Row("second_master_nmt", "An NMT `command` of another master to all nodes (128: pre-operational).",
+        lambda reach, command: reach.send(0x000, bytes([command, 0])), {"command": 128}, _OWN_ID),
+    Row("second_master_sdo", "An SDO request of another client: it reads 1000h.",
+        _frame(0x600, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]), own=True), answers=_OWN_ID),
+    Row("encoder_jump", "The load encoder reads `counts` more from now on.",
+        lambda reach, counts: reach.wish("load_jump_counts", reach.drive.faults.load_jump_counts + counts),
+        {"counts": 100_000}, _JUMP),
+    Row("encoder_glitch", "The load encoder reads `counts` more for the next `samples` samples.",
+        _glitch, {"counts": 100_000, "samples": 1}, _JUMP),
+    Row("encoder_frozen", "The load encoder goes on telling the same counts.", _frozen),
+    Row("encoder_drift", "The load encoder drifts by `counts_per_s`.", _drift, {"counts_per_s": 1000.0}),
+    Row("motor_encoder_jump", "The motor encoder reads `counts` more; the servo loops act on it.",
+        lambda reach, counts: reach.wish("motor_jump_counts", reach.drive.faults.motor_jump_counts + counts),
+        {"counts": 1000}, _JUMP),
+    Row("motor_weak", "The motor gives at most `percent` of its rated torque, and falls behind.",
+        _weak, {"percent": 0.0}, "following error"),
+    Row("bus_down", "The program's interface goes down (ENETDOWN); its end brings it up again.",
+        _gone(Condition.DOWN), answers="interface down, deleted, bus-off", needs=Needs.INTERFACE),
+    Row("bus_deleted", "The program's interface is deleted (ENXIO); after its end it can be opened anew.",
+        _gone(Condition.DELETED), answers="interface down, deleted, bus-off", needs=Needs.INTERFACE),
+    Row("transmit_queue_full", "The program's next `count` frames find the transmit queue full (ENOBUFS).",
+        _full, {"count": 1}, "transmit queue full", Needs.INTERFACE),
+    Row("sdo_silent", "SDO requests are not answered.",
+        lambda reach: reach.mute(0x580 + reach.drive.node_id)),
+    Row("wrong_value", "The drive tells `value` for an object, by SDO and in its TPDOs.",
+        _told, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
+    Row("wrong_identity", "Object 1018h:02 says another `product_code`.", _identity, {"product_code": 1}),
+    Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
+        _no_object, {"index": 0x60E4, "subindex": 1}, touches=_named_object),
+    Row("no_watchdogs", "The drive does not notice that heartbeat or set-points of its master stay away.",
+        _no_watchdogs),
+    Row("slow_brakes", "The drive brakes with `counts_per_s2`, whatever its objects say.",
+        _slow_brakes, {"counts_per_s2": 2000.0}),
+)  # fmt: skip
+
+FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})
+"""All of them by name."""
+
+OF_THE_PROGRAM: Final = ("target NaN", "it stays away for longer")
+"""Rows of the fault table without one of their own: the program's, and what comes of another by itself."""
+
+
+def find(name: str) -> Row:
+    """The fault of a name; InputError with the nearest right one."""
+    __tracebackhide__ = True  # pytest shows the test's line
+    row = FAULTS.get(name)
+    if row is None:
+        close = nearest(name, list(FAULTS))
+        hint = f"did you mean '{close}'?" if close else f"expected one of: {', '.join(FAULTS)}"
+        raise InputError(f"no fault is called '{name}'; {hint} (drive.faults has all)")
+    return row
+
+
+def sentences() -> Iterator[tuple[str, str, str]]:
+    """Name, arguments with their defaults, what it does: for pages."""
+    for row in _ROWS:
+        arguments = ", ".join(f"{name}={shown(name, value)}" for name, value in row.arguments.items())
+        yield row.name, arguments, row.what

@@ -1,0 +1,82 @@
+"""Which simulated drive a test gets: profile, truth, seed, bus. Everything is checked before it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from hdbridge.axis import AxisConfig
+from hdbridge.errors import InputError
+from hdbridge.files.expectation import nearest
+from hdbridge.files.profile import Profile
+from hdbridge.sim.truth import Truth
+
+VIRTUAL, LOCKSTEP = "virtual", "lockstep"
+EXAMPLES: Final = (VIRTUAL, LOCKSTEP, "socketcan:vcan0", "udp_multicast:239.74.163.2")
+"""Buses as they are written."""
+
+
+@dataclass(frozen=True)
+class BusChoice:
+    """A bus: one of this process, or an interface of python-can with its channel."""
+
+    interface: str
+    channel: str = ""
+
+    @property
+    def in_process(self) -> bool:
+        """Whether only this process can reach it."""
+        return self.interface in (VIRTUAL, LOCKSTEP)
+
+    def __str__(self) -> str:
+        return f"{self.interface}:{self.channel}" if self.channel else self.interface
+
+    @classmethod
+    def parse(cls, text: str) -> BusChoice:
+        """From ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; InputError where it is neither."""
+        interface, colon, channel = text.partition(":")
+        known = [each.partition(":")[0] for each in EXAMPLES]
+        if interface in (VIRTUAL, LOCKSTEP) and not colon:
+            return cls(interface)
+        if interface and channel and interface not in (VIRTUAL, LOCKSTEP):
+            return cls(interface, channel)
+        close = nearest(interface, known)
+        example = next((each for each in EXAMPLES if each.startswith(f"{close}:") or each == close), None)
+        hint = f"; did you mean '{example}'?" if example else ""
+        raise InputError(
+            f"the bus {text!r}; expected {', '.join(EXAMPLES)} or another INTERFACE:CHANNEL{hint}"
+        )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One drive, loaded and checked."""
+
+    axis: AxisConfig
+    truth: Truth
+    truth_path: Path
+    seed: int
+    bus: BusChoice
+
+    @classmethod
+    def load(
+        cls, profile: str, bus: str, seed: int, truth: str | Path | None = None, folder: Path | None = None
+    ) -> Settings:
+        """``folder`` is where relative paths start, by default the present one. InputError in one line.
+
+        Without ``truth``, the profile's ``twin.yaml`` is it where there is one, else its ``truth.yaml``.
+        """
+        folder = folder or Path()
+        choice = BusChoice.parse(bus)
+        if isinstance(seed, bool) or not isinstance(seed, int):
+            raise InputError(f"the seed {seed!r}; expected an integer")
+        files = Profile.find(str(profile), folder)
+        axis = AxisConfig.load(files.axis)
+        path = folder / truth if truth is not None else files.simulated
+        if truth is None and not path.is_file():
+            raise InputError(
+                f"{path}: no such file, and no twin.yaml beside it, so nothing says what the simulated axis "
+                "is like; make a twin of the axis, or name a truth file"
+            )
+        return cls(axis, Truth.load(path), path, seed, choice)

@@ -1,0 +1,227 @@
+"""A simulated drive that keeps its history, and whose faults come when they are wanted."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+import can
+
+from hdbridge.canframe import DataFrame
+from hdbridge.clock import Clock
+from hdbridge.drive.emergencies import error_name
+from hdbridge.sim.lockstep import nameplate_of
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+from hdbridge.testing.history import Event, Frame, History, TrueState
+
+End = Callable[[], None]
+"""Undoes a fault."""
+
+_NEVER: Final = float("inf")
+_EMERGENCIES: Final = range(0x081, 0x100)
+_TPDOS: Final = range(0x180, 0x580)
+_BOOT_UP: Final = (0x700, b"\0")
+
+
+@dataclass
+class Fault:
+    """A fault that a test asked for. As a context manager it ends with its block."""
+
+    name: str
+    arguments: Mapping[str, Any]
+    begun_s: float | None = None
+    """When it began, in the drive's time; None while it waits for its moment."""
+    ended_s: float | None = None
+    """When it ended or was called off; None before."""
+    _end: Callable[[Fault], None] = field(default=lambda _: None, repr=False)
+
+    def end(self) -> None:
+        """End it now; one that has not begun is called off. To end it again is no error."""
+        self._end(self)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def __str__(self) -> str:
+        return self.name + "".join(f" {name}={shown(name, value)}" for name, value in self.arguments.items())
+
+
+@dataclass(frozen=True)
+class When:
+    """The moment for which a fault waits; at once where neither is given."""
+
+    after_s: float = 0.0
+    beyond_deg: float | None = None
+    """Once the load passes this angle, from either side."""
+
+
+@dataclass
+class _Plan:
+    """Something to do at a time, or once the load has passed an angle."""
+
+    act: Callable[[], None]
+    at_s: float = _NEVER
+    beyond_deg: float | None = None
+    from_below: bool = True
+
+    def is_due(self, now_s: float, load_deg: float) -> bool:
+        if now_s >= self.at_s:
+            return True
+        if self.beyond_deg is None:
+            return False
+        return load_deg >= self.beyond_deg if self.from_below else load_deg <= self.beyond_deg
+
+
+class WatchedDrive(SimulatedDrive):
+    """`hdbridge.sim`'s drive of a truth, with a `History`, and faults that begin and end in its own time.
+
+    Any thread may call it.
+    """
+
+    def __init__(
+        self, bus: can.BusABC, truth: Truth, seed: int, eds_path: Path, node_id: int, clock: Clock
+    ) -> None:
+        self.lock = threading.RLock()
+        self.history = History()
+        self.machine = Machine(truth, seed)
+        self.nameplate = nameplate_of(truth)
+        self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
+        self.last_tpdos: dict[int, bytes] = {}
+        """The data last sent, by identifier."""
+        self._plans: list[_Plan] = []
+        self._ends: dict[int, End] = {}
+        self._begin_s = clock.now()
+        super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate)
+        self._last_state, self._last_nmt = self.firmware.state, self.nmt
+
+    @property
+    def time_s(self) -> float:
+        """Since it was made."""
+        return self._clock.now() - self._begin_s
+
+    def note(self, kind: str, text: str) -> None:
+        """Put an event into the history."""
+        self.history.events.append(Event(self.time_s, kind, text))
+
+    def true_state(self) -> TrueState:
+        """The axis now."""
+        machine = self.machine
+        return TrueState(self.time_s, machine.true_motor_deg, machine.true_load_deg, self.ratio)
+
+    # ---------------------------------------------------------------- faults
+
+    def make(self, fault: Fault, begin: Callable[[], End], when: When, for_s: float | None) -> None:
+        """Begin a fault at its moment; it ends ``for_s`` later, or where somebody ends it."""
+
+        def begins() -> None:
+            if fault.ended_s is not None:
+                return
+            fault.begun_s = self.time_s
+            self.note("fault", str(fault))
+            self._ends[id(fault)] = begin()
+            if for_s is not None:
+                self._plans.append(_Plan(lambda: self._finish(fault), at_s=self._clock.now() + for_s))
+
+        fault._end = self._finish
+        with self.lock:
+            if when.beyond_deg is not None:
+                below = self.machine.true_load_deg < when.beyond_deg
+                self._plans.append(_Plan(begins, beyond_deg=when.beyond_deg, from_below=below))
+            else:
+                self._plans.append(_Plan(begins, at_s=self._clock.now() + when.after_s))
+            self.run_until(self._clock.now())
+
+    def _finish(self, fault: Fault) -> None:
+        with self.lock:
+            if fault.ended_s is not None:
+                return
+            fault.ended_s = self.time_s
+            end = self._ends.pop(id(fault), None)
+            if end is not None:
+                end()
+            self.note("fault", f"{fault.name} {'ends' if end else 'is called off'}")
+
+    def tell_instead(self, index: int, subindex: int, value: int) -> End:
+        """Say another value of an object than it has, by SDO and in TPDOs."""
+        entry = self.dictionary[index, subindex]
+        before = entry.bound
+
+        def bind(read: Callable[[], int] | None) -> None:
+            entry.bound = read
+            for pdo in self._tpdos:  # they have compiled what they read
+                pdo.compile()
+
+        bind(lambda: value)
+        return lambda: bind(before)
+
+    # ---------------------------------------------------------------- the drive, watched
+
+    def next_event_s(self) -> float:
+        """See `hdbridge.sim.node.SimulatedDrive`; the moments of faults are events as well."""
+        event_s = super().next_event_s()
+        return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
+
+    def handle(self, message: can.Message, now_s: float) -> None:
+        """See `hdbridge.sim.node.SimulatedDrive`."""
+        with self.lock:
+            self.history.frames.append(Frame(self.time_s, False, message))
+            super().handle(message, now_s)
+            self._look()
+
+    def run_until(self, now_s: float) -> None:
+        """See `hdbridge.sim.node.SimulatedDrive`."""
+        with self.lock:
+            while due := next((each for each in self._plans if self._is_due(each, now_s)), None):
+                self._plans.remove(due)
+                due.act()
+            super().run_until(now_s)
+            self._look()
+
+    def _is_due(self, plan: _Plan, now_s: float) -> bool:
+        return plan.is_due(now_s, self.machine.true_load_deg)
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if not (self.faults.silent or can_id in self.faults.muted_ids):
+            self.history.frames.append(Frame(self.time_s, True, DataFrame(can_id, data)))
+            if can_id in _TPDOS:
+                self.last_tpdos[can_id] = data
+            elif can_id in _EMERGENCIES:
+                code = int.from_bytes(data[:2], "little")
+                self.note(
+                    "emcy", f"{code:04X}h ({error_name(code)})" if code else "0000h (no error any more)"
+                )
+            elif (can_id & 0x780, data) == _BOOT_UP:
+                self.note("nmt", "boot-up message")
+        super()._send(can_id, data)
+
+    def _advance(self) -> None:
+        super()._advance()
+        self.history.trace.append(self.true_state())
+        self._look()
+
+    def _look(self) -> None:
+        """Note what has changed."""
+        if self.firmware.state is not self._last_state:
+            self._last_state = self.firmware.state
+            self.note("state", words(self._last_state.name))
+        if self.nmt is not self._last_nmt:
+            self._last_nmt = self.nmt
+            self.note("nmt", words(self._last_nmt.name))
+
+
+def shown(name: str, value: float) -> str:
+    """The argument of a fault as people write it: codes and objects in hexadecimal."""
+    return f"0x{value:04X}" if name in ("code", "index") and isinstance(value, int) else str(value)
+
+
+def words(name: str) -> str:
+    """The name of an enumeration's member as words."""
+    return name.lower().replace("_", " ")

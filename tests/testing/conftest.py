@@ -1,0 +1,94 @@
+"""A program that knows nothing of hdbridge but the frames: it moves the simulated drive in lockstep."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import can
+import pytest
+
+from hdbridge.testing import SimulatedDrive, simulated_drive
+
+PERIOD_S = 0.004
+STEP_COUNTS = 40
+"""Of the motor per cycle: 9 deg/s at the load of the profile 'article'."""
+
+
+class Program:
+    """Raw frames of CiA 301 and CiA 402 on a bus of python-can."""
+
+    def __init__(self, drive: SimulatedDrive) -> None:
+        self.drive = drive
+        self.bus = drive.open_bus()
+        self.target = 0
+        self.others: list[can.Message] = []
+        """What came beside the answers to SYNC."""
+
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def take(self) -> list[can.Message]:
+        found = []
+        while (message := self.bus.recv(0)) is not None:
+            found.append(message)
+        return found
+
+    def request(self, data: bytes) -> bytes | None:
+        """The answer to an SDO request."""
+        self.others += self.take()
+        self.send(0x601, data)
+        answers = [bytes(each.data) for each in self.take() if each.arbitration_id == 0x581]
+        return answers[0] if answers else None
+
+    def read(self, index: int, subindex: int = 0) -> int | None:
+        """None where there is no answer, or an abort."""
+        answer = self.request(struct.pack("<BHBI", 0x40, index, subindex, 0))
+        return int.from_bytes(answer[4:], "little") if answer and answer[0] != 0x80 else None
+
+    def write(self, index: int, subindex: int, value: int, size: int) -> None:
+        data = value.to_bytes(size, "little").ljust(4, b"\0")
+        answer = self.request(struct.pack("<BHB", 0x23 | (4 - size) << 2, index, subindex) + data)
+        assert answer is not None
+        assert answer[0] == 0x60
+
+    def start(self) -> None:
+        """To 'operation enabled' in cyclic synchronous position, with the drive's own watchdogs set."""
+        for index, subindex, value, size in (
+            (0x6060, 0, 8, 1), (0x1017, 0, 50, 2), (0x1400, 5, 20, 2),
+            (0x6065, 0, 2000, 4), (0x6066, 0, 20, 2),
+        ):  # fmt: skip
+            self.write(index, subindex, value, size)
+        self.send(0x000, b"\x01\x01")
+        for word in (0x00, 0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
+            self.cycle(word, step=0)
+        assert self.drive.state == "operation enabled"
+
+    def cycle(self, word: int = 0x0F, step: int = STEP_COUNTS) -> list[can.Message]:
+        """One period: SYNC, its TPDOs, which are returned, RPDO."""
+        self.others += self.take()
+        self.send(0x080)
+        answers = self.take()
+        self.target += step
+        self.send(0x201, struct.pack("<Hi", word, self.target))
+        self.drive.sleep(PERIOD_S)
+        return answers
+
+    def move(self, cycles: int) -> list[list[can.Message]]:
+        return [self.cycle() for _ in range(cycles)]
+
+
+@pytest.fixture
+def drive() -> Iterator[SimulatedDrive]:
+    with simulated_drive("article", bus="lockstep") as made:
+        yield made
+
+
+@pytest.fixture
+def program(drive: SimulatedDrive) -> Program:
+    """Enabled and moving at constant speed."""
+    made = Program(drive)
+    made.start()
+    made.move(30)
+    made.others.clear()
+    return made

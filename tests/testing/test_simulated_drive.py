@@ -1,0 +1,178 @@
+"""`hdbridge.testing.simulated_drive`: the drive on its buses, its time and its history."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+
+import can
+import pytest
+
+from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.testing import history, simulated_drive
+
+
+def frames_of_a_move(seed: int) -> list[str]:
+    from tests.testing.conftest import Program
+
+    with simulated_drive("demo", bus="lockstep", seed=seed) as drive:
+        program = Program(drive)
+        program.start()
+        return [str(message.data) for answers in program.move(40) for message in answers]
+
+
+def test_the_same_seed_gives_the_same_frames():
+    assert frames_of_a_move(1) == frames_of_a_move(1)
+    assert frames_of_a_move(1) != frames_of_a_move(2)
+
+
+@pytest.mark.parametrize(
+    ("choice", "complaint"),
+    [
+        ({"profile": "articel"}, "nor a bundled profile.*did you mean 'article'"),
+        ({"profile": "no/such"}, "no/such.*no such file"),
+        ({"bus": "lockstp"}, "the bus 'lockstp'; expected virtual, .*did you mean 'lockstep'"),
+        ({"bus": "virtual:x"}, "the bus 'virtual:x'; expected"),
+        ({"bus": "socketcan"}, "did you mean 'socketcan:vcan0'"),
+        ({"bus": "sockecan:vcan9"}, "python-can has no interface 'sockecan'"),
+        ({"bus": "socketcan:vcan9"}, "socketcan:vcan9: cannot open it"),
+        ({"seed": "one"}, "the seed 'one'; expected an integer"),
+        ({"truth": "none.yaml"}, "none.yaml"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(choice, complaint):
+    with pytest.raises(HdbridgeError, match=complaint) as refused, simulated_drive(**choice):
+        pass
+    assert "\n" not in str(refused.value)
+
+
+def test_true_angles_and_their_trace(drive, program):
+    state = drive.truth
+    assert state.load_deg == pytest.approx(state.motor_deg / 50, abs=0.05)
+    assert state.error_arcsec == pytest.approx(3600 * (state.load_deg - state.motor_deg / 50))
+    trace = drive.trace
+    assert trace[-1].load_deg == state.load_deg
+    assert [b.time_s - a.time_s for a, b in zip(trace[-20:], trace[-19:], strict=False)] == pytest.approx(
+        [0.004] * 19
+    )
+    assert trace[-1].load_deg - trace[-11].load_deg == pytest.approx(10 * 40 * 360 / 400_000, rel=0.05)
+
+
+def test_true_angles_are_not_what_a_faulty_encoder_says(drive, program):
+    before = drive.truth.load_deg
+    drive.fault("encoder_jump", counts=800_000)
+    program.move(3)
+    assert drive.truth.load_deg - before < 0.5
+
+
+def test_the_log_has_what_happened_in_order(drive, program):
+    drive.fault("drive_fault")
+    program.move(30)
+    drive.note("seen")
+    kinds = [(each.kind, each.text) for each in drive.log]
+    assert kinds == [
+        ("nmt", "boot-up message"),
+        ("nmt", "pre operational"),
+        ("bus", "the program opens its bus"),
+        ("nmt", "operational"),
+        ("state", "ready to switch on"),
+        ("state", "switched on"),
+        ("state", "operation enabled"),
+        ("fault", "drive_fault code=0x3210"),
+        ("emcy", "3210h (DC link over-voltage)"),
+        ("state", "fault reaction active"),
+        ("state", "fault"),
+        ("note", "seen"),
+    ]
+    times = [each.time_s for each in drive.log]
+    assert times == sorted(times)
+
+
+def test_nothing_grows_without_bound():
+    kept = history.History()
+    assert [each.maxlen for each in vars(kept).values() if isinstance(each, deque)] == [
+        history.EVENTS,
+        history.FRAMES,
+        history.PERIODS,
+    ]
+
+
+def test_time_of_the_drive_stands_in_for_the_module_time(drive):
+    begin = drive.time.monotonic(), drive.time.time(), drive.time.perf_counter(), drive.time.monotonic_ns()
+    drive.time.sleep(2.0)
+    end = drive.time.monotonic(), drive.time.time(), drive.time.perf_counter(), drive.time.monotonic_ns()
+    assert [b - a for a, b in zip(begin, end, strict=True)] == pytest.approx([2.0, 2.0, 2.0, 2e9])
+    assert drive.time.gmtime is time.gmtime
+    assert drive.now == pytest.approx(2.0)
+
+
+def test_waiting_for_what_does_not_come_ends_with_the_log(drive):
+    drive.note("here")
+    with pytest.raises(TimeoutError, match=r"rest did not come about in 2 s\n(.*\n)*.*here"):
+        drive.wait_until(lambda: False, timeout_s=2.0, what="rest")
+    assert drive.now == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_second_thread_in_lockstep_is_refused_with_the_remedy(drive):
+    bus = drive.open_bus()
+    bus.recv(0)
+    complaints = []
+
+    def listen() -> None:
+        try:
+            bus.recv(0)
+        except can.CanOperationError as error:
+            complaints.append(str(error))
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    thread.join()
+    assert "choose the bus 'virtual'" in complaints[0]
+
+
+def test_a_bus_is_only_there_with_its_drive():
+    with simulated_drive("article", bus="virtual") as drive:
+        interface, channel = drive.interface, drive.channel
+    with pytest.raises(can.CanInitializationError, match="no simulated drive has this channel"):
+        can.Bus(interface=interface, channel=channel, ignore_config=True)
+
+
+def test_in_real_time_the_drive_lives_by_itself():
+    """Faults, log and filters from any thread; the program blocks in `recv` meanwhile."""
+    with simulated_drive("article", bus="virtual") as drive, drive.open_bus() as bus:
+        bus.set_filters([{"can_id": 0x081, "can_mask": 0x7FF}])
+        drive.fault("drive_fault", after_s=0.05, code=0x4310)
+        message = bus.recv(10.0)
+        assert message is not None
+        assert bytes(message.data[:2]) == b"\x10\x43"
+        assert drive.state == "fault"
+        with drive.fault("bus_down"), pytest.raises(can.CanOperationError, match="Network is down"):
+            bus.recv(10.0)
+        assert bus.recv(0.02) is None
+
+
+def test_an_interface_of_the_machine_is_not_taken_away():
+    with (
+        simulated_drive("article", bus="udp_multicast:239.74.163.8") as drive,
+        pytest.raises(InputError, match="not the drive's to take away"),
+    ):
+        drive.fault("bus_down")
+
+
+def test_a_bus_of_the_machine_is_for_one_drive_after_the_other():
+    """As with workers of pytest-xdist on one vcan0: the second waits until the first has ended."""
+    bus = "udp_multicast:239.74.163.9"
+    order = []
+
+    def second() -> None:
+        with simulated_drive("article", bus=bus):
+            order.append("second")
+
+    with simulated_drive("article", bus=bus):
+        thread = threading.Thread(target=second)
+        thread.start()
+        time.sleep(0.2)
+        order.append("first")
+    thread.join(30.0)
+    assert order == ["first", "second"]
