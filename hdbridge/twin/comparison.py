@@ -271,16 +271,17 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     A motion that is smooth over four samples is not in it. A reading in steps of q is off by q / sqrt(12).
     """
     squares = count = 0.0
+    resolution, least = math.inf, 1e-9 * float(np.max(np.abs(values), initial=1.0))
     for part in parts:
         third = np.diff(values[part], 3)
         inside = which[part]
+        steps = np.abs(np.diff(values[part]))[inside[1:] & inside[:-1]]
+        resolution = min(resolution, float(np.min(steps, where=steps > least, initial=math.inf)))
         whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
         squares += float(np.sum(third[whole] ** 2))
         count += float(np.count_nonzero(whole))
     spread = math.sqrt(squares / count / 20.0) if count else 0.0
-    steps = np.abs(np.diff(values[which]))
-    steps = steps[steps > 1e-9 * max(1.0, float(np.max(np.abs(values))))] if len(steps) else steps
-    return max(spread, float(np.min(steps)) / math.sqrt(12.0) if len(steps) else 0.0)
+    return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
 
 
 @dataclass(frozen=True, slots=True)

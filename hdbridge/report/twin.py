@@ -1,0 +1,276 @@
+"""The page of a twin: measured and simulated side by side, what was wrong, what was learned, what is left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hdbridge import __version__
+from hdbridge.effects import FloatArray
+from hdbridge.report.page import (
+    Block,
+    Chart,
+    Command,
+    Facts,
+    Grid,
+    Heading,
+    Mark,
+    Page,
+    Section,
+    Series,
+    Status,
+    Table,
+)
+from hdbridge.report.words import sentence
+from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
+from hdbridge.twin.translation import Row as Translated
+
+WINDOW_S: Final = 1.0
+"""A picture of a detail shows so much of the record."""
+MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "difference"
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """A value of the plant before and after."""
+
+    name: str
+    unit: str
+    before: float | None
+    after: float
+    interval: tuple[float, float] | None
+    """95 %; None where nothing shows the value, and it stands as it was assumed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """What was wrong with the simulation, in words."""
+
+    cause: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class TwinReport:
+    """All that the page tells."""
+
+    axis: str
+    before: Comparison
+    """The measured record against the simulation as it was."""
+    after: Comparison | None = None
+    """... and as it is now; None where it was only compared."""
+    learned: Sequence[Learned] = ()
+    named: Sequence[Named] = ()
+    translated: Sequence[Translated] = ()
+    facts: Sequence[tuple[str, str]] = ()
+    verdict: str = ""
+    """What became of the twin, in a sentence."""
+    commands: Sequence[Command] = ()
+    status: Status = Status.MEASURED
+
+    @property
+    def now(self) -> Comparison:
+        """The last of the two comparisons."""
+        return self.after or self.before
+
+
+def twin_page(report: TwinReport) -> Page:
+    """The page."""
+    sections = [
+        Section(
+            "How far simulation and axis are apart",
+            "Each figure is the rms difference of the two records, sample by sample or stop by stop, and "
+            "what it is in units of the noise of the measured channel: two equal axes differ by about one.",
+            [_figures(report)],
+        )
+    ]
+    if report.named:
+        rows = [[each.cause, each.text] for each in report.named]
+        sections.append(Section("What was wrong with the simulation", "", [Table(["cause", ""], rows)]))
+    sections += [_pictures(name, report) for name in report.now.traces]
+    sections.append(
+        Section(
+            "By kind of motion",
+            "The same figures, leg by leg of one kind.",
+            [_by_kind(report)],
+        )
+    )
+    if report.learned:
+        sections.append(
+            Section("What the plant is", "Intervals are of 95 %.", [_learned(report.learned)]),
+        )
+    if report.translated:
+        rows = [[each.effect, each.counterpart or "none", each.note] for each in report.translated]
+        sections.append(
+            Section(
+                "From the model",
+                "What became of each effect of the axis's model in the simulated plant.",
+                [Table(["effect", "place in the truth file", "what differs there"], rows)],
+            )
+        )
+    if report.facts:
+        sections.append(Section("Where it comes from", "", [Facts([*report.facts])]))
+    return Page(
+        title=f"Twin of axis '{report.axis}'",
+        verdict=" ".join(
+            each for each in (sentence(report.verdict) if report.verdict else "", verdict(report)) if each
+        ),
+        status=report.status,
+        commands=report.commands,
+        sections=sections,
+        footer=f"hdbridge {__version__}. The load error is load angle less motor angle over the ratio, in "
+        "arcsec at the load; the following error is command less motor angle. Both records got the same "
+        "commands.",
+    )
+
+
+def verdict(report: TwinReport) -> str:
+    """The signals in one sentence."""
+    parts = []
+    for name in report.now.traces:
+        now, before = report.now.row(name), report.before.row(name)
+        if now is None or before is None:
+            continue
+        was = f" (before: {_figure(before.difference)})" if report.after is not None else ""
+        parts.append(f"{TITLES[name]} {_figure(now.difference)} {now.unit}{was}, {_times(now)}")
+    return f"The simulated drive differs from the axis by, rms: {'; '.join(parts)}." if parts else ""
+
+
+def _times(row: Row) -> str:
+    return (
+        f"{_figure(row.in_noise)} times the noise"
+        if math.isfinite(row.in_noise)
+        else "where nothing is noise"
+    )
+
+
+def _figure(value: float) -> str:
+    """Three digits and a real minus sign."""
+    return f"{value:.3g}".replace("-", "\N{MINUS SIGN}")
+
+
+def title_of(row: Row) -> str:
+    """A channel in words."""
+    name, _, signal = row.channel.partition(":")
+    return f"{TITLES[name]}, {TITLES[signal]}" if signal else TITLES[name]
+
+
+def _figures(report: TwinReport) -> Table:
+    """The whole record, channel by channel."""
+    return Table(_header(report), [_cells(report, row, title_of(row)) for row in _rows(report, ALL)])
+
+
+def _by_kind(report: TwinReport) -> Table:
+    kinds = [kind for kind in dict.fromkeys(row.kind for row in report.now.rows) if kind != ALL]
+    rows = [
+        _cells(report, row, f"{kind}: {title_of(row)}")
+        for kind in kinds
+        for row in _rows(report, kind)
+        if ":" not in row.channel
+    ]
+    return Table(_header(report), rows)
+
+
+def _rows(report: TwinReport, kind: str) -> Iterator[Row]:
+    return (row for row in report.now.rows if row.kind == kind)
+
+
+def _header(report: TwinReport) -> list[str | Heading]:
+    header: list[str | Heading] = ["", Heading("measured", ""), Heading("simulated", "")]
+    if report.after is not None:
+        header.append(Heading("difference before", ""))
+    return [*header, Heading("difference", ""), Heading("of the noise", ""), "unit"]
+
+
+def _cells(report: TwinReport, row: Row, title: str) -> list[str | float]:
+    cells: list[str | float] = [title, _figure(row.measured), _figure(row.simulated)]
+    if report.after is not None:
+        before = report.before.row(row.channel, row.kind)
+        cells.append(_figure(before.difference) if before is not None else "")
+    in_noise = _figure(row.in_noise) if math.isfinite(row.in_noise) else ""
+    return [*cells, _figure(row.difference), in_noise, row.unit]
+
+
+def _learned(learned: Sequence[Learned]) -> Table:
+    rows: list[list[str | float]] = [
+        [
+            each.name,
+            _figure(each.before) if each.before is not None else "",
+            _figure(each.after),
+            f"{_figure(each.interval[0])} to {_figure(each.interval[1])}" if each.interval else "not shown",
+            each.unit,
+        ]
+        for each in learned
+    ]
+    return Table(["", Heading("before", ""), Heading("now", ""), Heading("95 %", ""), "unit"], rows)
+
+
+def _pictures(name: str, report: TwinReport) -> Section:
+    """One signal: the whole record, where the simulation was off most, the spectrum."""
+    trace, before = report.now.traces[name], report.before.traces[name]
+    label = f"{TITLES[name]}, {UNITS[name]}"
+    worst = _worst(before)
+    charts: list[Block] = [
+        Grid(
+            [
+                _chart(f"{TITLES[name].capitalize()} over the whole record", label, trace, slice(None)),
+                _chart(
+                    "Where the simulation was off most"
+                    if report.after
+                    else "Where the simulation is off most",
+                    label,
+                    trace,
+                    worst,
+                    before if report.after else None,
+                ),
+                _difference(f"Difference, {label}", before, trace if report.after else None),
+                *_spectrum(name, report.now.spectra.get(name)),
+            ]
+        )
+    ]
+    return Section(TITLES[name].capitalize(), "", charts)
+
+
+def _chart(caption: str, label: str, trace: Trace, where: slice, before: Trace | None = None) -> Chart:
+    time_s = trace.time_s[where]
+    series = [Series(MEASURED, time_s, trace.measured[where], colour=0)]
+    if before is not None:
+        series.append(Series(BEFORE, time_s, before.simulated[where], Mark.DASHED, colour=2))
+    series.append(Series(SIMULATED, time_s, trace.simulated[where], Mark.DASHED, colour=1))
+    return Chart(caption, "time, s", label, series, height_px=260)
+
+
+def _difference(caption: str, before: Trace, after: Trace | None) -> Chart:
+    series = [Series(BEFORE if after is not None else DIFFERENCE, before.time_s, before.difference, colour=2)]
+    if after is not None:
+        series.append(Series("now", after.time_s, after.difference, colour=1))
+    return Chart(caption, "time, s", "measured less simulated", series, height_px=260)
+
+
+def _spectrum(name: str, spectrum: Spectrum | None) -> list[Chart]:
+    if spectrum is None:
+        return []
+    inside = spectrum.frequency_hz > 0.0
+    x = spectrum.frequency_hz[inside]
+    by_name: Mapping[str, FloatArray] = {
+        MEASURED: spectrum.measured, SIMULATED: spectrum.simulated, DIFFERENCE: spectrum.difference,
+    }  # fmt: skip
+    series = [
+        Series(label, x, values[inside], Mark.DASHED if label == DIFFERENCE else Mark.LINE, colour=colour)
+        for colour, (label, values) in enumerate(by_name.items())
+    ]
+    label = f"{UNITS[name]} per root Hz"
+    return [Chart("Spectrum", "frequency, Hz", label, series, height_px=260, x_log=True, y_log=True)]
+
+
+def _worst(trace: Trace) -> slice:
+    """The rows of the window in which the difference is largest."""
+    time_s = trace.time_s
+    ends = np.searchsorted(time_s, time_s + WINDOW_S)
+    power = np.concatenate([[0.0], np.cumsum(trace.difference**2)])
+    begin = int(np.argmax(power[ends] - power[: len(time_s)]))
+    return slice(begin, int(ends[begin]))
