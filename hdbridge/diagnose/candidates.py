@@ -126,12 +126,13 @@ def _with_torque(
         # Beyond its range an effect is held: the record's torques have to lie within.
         within = {"limit_nm": max(TorqueGrowth.model_fields["limit_nm"].default, 2.0 * top)}
         if channel is Channel.LOAD_TORQUE:
-            straight = {"torque1_nm": 1e4, "torque2_nm": 2e4}
-            broken = {"torque1_nm": 0.4 * top, "torque2_nm": 0.8 * top}
-            for breaks in (straight, broken):
+            # A spring is straight as far as the record goes, or stiffens once, or twice.
+            beyond = (1e4, 2e4)
+            once = ((share * top, beyond[1]) for share in (0.2, 0.45, 0.7))
+            for low, high in (beyond, *once, (0.4 * top, 0.8 * top)):
                 yield Compliance(
                     c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
-                    torque=channel.value, **breaks,
+                    torque1_nm=low, torque2_nm=high, torque=channel.value,
                 )  # fmt: skip
             if has_orders:
                 for signed in (False, True):

@@ -20,7 +20,7 @@ from hdbridge.estimation.hypothesis import CONVERGED, Estimator, Fitted, moved, 
 
 SPEEDS_DIFFER: Final = 0.1
 """Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
-FOUND: Final = frozenset({"frequency_hz", "torque1_nm", "torque2_nm"})
+FOUND: Final = frozenset({"frequency_hz"})
 """Shapes that a search finds among all their values, and that can be moved on from there."""
 STEPS: Final = 4
 _RATE: Final = 30.0

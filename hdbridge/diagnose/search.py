@@ -311,7 +311,10 @@ class Search:
         return 0.5 * float(high - low)
 
     def _shortlist(self, fitted: Fitted, most: int = BEST) -> list[Score]:
-        """The best candidate of each of the best causes."""
+        """The best candidate of each of the best causes, and of each number of parameters that it may have.
+
+        One of more parameters gains more only once its shapes are fitted.
+        """
         present = {each.name for each in fitted.hypothesis.effects[self.base :]} - REPEATED
         scores = [
             each
@@ -322,12 +325,12 @@ class Search:
             and not (isinstance(each.candidate.effect, OrderSeries) and each.share < ORDER_SHARE_LEFT)
         ]
         net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
-        best: dict[str, Score] = {}
-        for each in scores:
-            cause = each.candidate.cause
-            if net[id(each)] > ENTER and (cause not in best or net[id(each)] > net[id(best[cause])]):
-                best[cause] = each
-        return sorted(best.values(), key=lambda each: -net[id(each)])[:most]
+        best: dict[tuple[str, int], Score] = {}
+        for each in sorted(scores, key=lambda each: -net[id(each)]):
+            if net[id(each)] > ENTER:
+                best.setdefault((each.candidate.cause, each.freedom), each)
+        causes = list(dict.fromkeys(cause for cause, _ in best))[:most]
+        return [each for (cause, _), each in best.items() if cause in causes]
 
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)
@@ -362,15 +365,16 @@ class Search:
         return self._screens[key]
 
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
-        """Other causes in the place of one that was taken out, fitted; best first."""
+        """Other causes in the place of one that was taken out, each fitted at its best; best first."""
         self.forget()
-        result = []
+        best: dict[str, Fitted] = {}
         for score in self._shortlist(without, BEST + 1):
             if score.candidate.cause != cause:
                 trial = self.estimator.fit(joined(without.hypothesis, score.candidate.effect, self.base))
-                if self._counts(trial, score.candidate):
-                    result.append((score.candidate.cause, trial))
-        return sorted(result, key=lambda each: each[1].chi_square)
+                other = best.get(score.candidate.cause)
+                if self._counts(trial, score.candidate) and (other is None or cost(trial) < cost(other)):
+                    best[score.candidate.cause] = trial
+        return sorted(best.items(), key=lambda each: each[1].chi_square)
 
 
 def cost(fitted: Fitted) -> float:

@@ -20,7 +20,6 @@ from hdbridge.effects.base import (
     Memoryless,
     Moment,
     Motion,
-    Moves,
     Observations,
     Shape,
     Start,
@@ -66,8 +65,8 @@ class Compliance(Linear):
         "model)",
     )
     shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("torque1_nm", 0.1, 500.0, logarithmic=True, moves=Moves.NEARBY),
-        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True, moves=Moves.NEARBY),
+        Shape("torque1_nm", 0.1, 500.0, logarithmic=True),
+        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True),
     )
     linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
     typical: ClassVar[Mapping[str, Any]] = {
@@ -101,10 +100,12 @@ class Compliance(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:  # noqa: ARG003
-        """A straight spring, and one that bends within the torques of the record."""
+        """A straight spring, and springs that stiffen once or twice within the torques of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if largest:
-            for low, high in ((1e4, 2e4), (0.4 * largest, 0.8 * largest)):
+            beyond = (1e4, 2e4)
+            once = ((share * largest, beyond[1]) for share in (0.2, 0.45, 0.7))
+            for low, high in (beyond, *once, (0.4 * largest, 0.8 * largest)):
                 yield cls(
                     c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
                     torque1_nm=low, torque2_nm=high,

@@ -36,7 +36,7 @@ ROUGHLY = 2e-5
 KEPT_FITS = 8
 KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large."""
-FIXED_SHAPES = frozenset({"time_s", "frequency_hz", "torque1_nm", "torque2_nm"})
+FIXED_SHAPES = frozenset({"time_s", "frequency_hz"})
 """Shapes that a local step cannot improve: found by search over all their values."""
 LOOPS = (Hysteresis, HysteresisMemory)
 ONE_SIDED = (VelocityWindup,)
