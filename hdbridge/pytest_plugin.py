@@ -61,16 +61,13 @@ def hdbridge_drive(request: pytest.FixtureRequest) -> Iterator[SimulatedDrive]:
         yield drive
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(
-    item: pytest.Item,
-) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+@pytest.hookimpl(hookwrapper=True)  # the form that older versions of pytest know as well
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
     """Put what the drive went through into the report of a test that failed."""
-    report = yield
+    report: pytest.TestReport = (yield).get_result()
     drive = getattr(item, "funcargs", {}).get(FIXTURE)
     if drive is not None and report.when == "call" and report.failed:
         report.sections.append(("simulated drive", drive.report()))
-    return report
 
 
 def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:

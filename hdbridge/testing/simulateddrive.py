@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
-from uuid import uuid4
 
 import can
 
-from hdbridge.axis.config import BusConfig
-from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.drive.interfacelock import interface_lock
-from hdbridge.drive.link import open_bus
-from hdbridge.errors import BusInUseError, HdbridgeError, InputError
-from hdbridge.sim.run import run
+from hdbridge.clock import Clock
+from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.testing.faulttable import FAULTS, Reach, find
 from hdbridge.testing.history import Event, TrueState
-from hdbridge.testing.port import INTERFACE, Port, StallingClock
-from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
+from hdbridge.testing.line import Line, open_line
+from hdbridge.testing.settings import LOCKSTEP, Settings
 from hdbridge.testing.watched import Fault, WatchedDrive, When, words
 
-LONGEST_WAIT_S: Final = 0.005
-"""In real time: how long the drive may not notice that a fault is wanted."""
-LONGEST_TURN_S: Final = 600.0
-"""How long a bus of the machine is waited for, that other tests use."""
 POLL_S: Final = 0.005
 
 
@@ -69,14 +57,6 @@ class DriveTime:
         return getattr(time, name)
 
 
-@dataclass(frozen=True)
-class _Where:
-    """How a program reaches the drive."""
-
-    interface: str
-    channel: str
-
-
 class SimulatedDrive:
     """A CiA-402 drive with an axis on a bus. `simulated_drive` and the fixture ``hdbridge_drive`` make it.
 
@@ -84,16 +64,17 @@ class SimulatedDrive:
     """
 
     def __init__(
-        self, settings: Settings, node: WatchedDrive, where: _Where, clock: Clock, reach: Reach
+        self, settings: Settings, node: WatchedDrive, line: Line, failures: Sequence[HdbridgeError]
     ) -> None:
         self._settings = settings
         self._node = node
-        self._clock = clock
-        self._reach = reach
-        self._failure: HdbridgeError | None = None
-        self.interface: Final = where.interface
+        self._line = line
+        self._clock = line.clock
+        self._reach = Reach(node, line.opened, line.port, str(line.choice))
+        self._failures = failures
+        self.interface: Final = line.interface
         """For ``can.Bus``: what python-can calls it."""
-        self.channel: Final = where.channel
+        self.channel: Final = line.channel
         """For ``can.Bus``."""
         self.in_process: Final = settings.bus.in_process
         """Whether only this process reaches the bus; else a program of its own can be the master."""
@@ -108,7 +89,7 @@ class SimulatedDrive:
         self.load_counts_per_turn: Final = node.nameplate.load_counts_per_turn
         self.ratio: Final = node.ratio
         """Motor turns per load turn."""
-        self.time: Final = DriveTime(clock)
+        self.time: Final = DriveTime(line.clock)
         """The drive's time, in the shape of the module ``time``."""
 
     def __repr__(self) -> str:
@@ -199,7 +180,8 @@ class SimulatedDrive:
         made = Fault(name, checked)
         self._node.make(made, lambda: row.begin(self._reach, checked), When(after_s, beyond_deg), for_s)
         if self.lockstep:
-            self._node.poll(self._clock.now())  # frames of another node reach it as well
+            for node in self._line.nodes:  # frames of another node reach them as well
+                node.poll(self._clock.now())
         return made
 
     # ---------------------------------------------------------------- time, and the bus
@@ -230,8 +212,8 @@ class SimulatedDrive:
     def _check(self) -> None:
         """Raise what ended the drive."""
         __tracebackhide__ = True  # pytest shows the test's line
-        if self._failure is not None:
-            raise self._failure
+        if self._failures:
+            raise self._failures[0]
 
 
 @contextmanager
@@ -242,6 +224,7 @@ def simulated_drive(
     seed: int = 0,
     truth: str | Path | None = None,
     folder: Path | None = None,
+    beside: SimulatedDrive | None = None,
 ) -> Iterator[SimulatedDrive]:
     """A simulated drive as long as the block lasts.
 
@@ -249,99 +232,16 @@ def simulated_drive(
     ``folder``. ``bus`` is ``virtual`` (this process, in real time), ``lockstep`` (this process, one thread,
     time passes only while the program waits) or ``INTERFACE:CHANNEL`` of python-can, for programs of any
     process. ``truth`` replaces the profile's twin.yaml or truth.yaml. The same truth and seed give the same
-    axis; in lockstep the same frames. While another test has a drive on a bus of the machine, this one waits.
-    InputError, BusError in one line.
+    axis; in lockstep the same frames. With ``beside`` it stands on the bus of another drive, whose node id is
+    another. While another test has a drive on a bus of the machine, this one waits. InputError, BusError in
+    one line.
     """
-    settings = Settings.load(profile, bus, seed, truth, folder)
-    maker = _in_lockstep if settings.bus.interface == LOCKSTEP else _in_real_time
-    with maker(settings) as drive:
-        yield drive
-
-
-@contextmanager
-def _in_lockstep(settings: Settings) -> Iterator[SimulatedDrive]:
-    clock = StallingClock()
-    channel = f"hdbridge-{uuid4()}"
-    opened = _virtual(channel)
-    with opened() as bus:
-        node = _node(settings, bus, clock)
-        node.poll(clock.now())
-        clock.nodes.append(node)
-        with Port(channel, clock, node.note) as port:
-            reach = Reach(node, opened, port, str(settings.bus))
-            yield SimulatedDrive(settings, node, _Where(INTERFACE, channel), clock, reach)
-
-
-@contextmanager
-def _in_real_time(settings: Settings) -> Iterator[SimulatedDrive]:
-    clock = MonotonicClock()
+    settings = Settings.load(
+        profile, bus if beside is None else str(beside._line.choice), seed, truth, folder
+    )
     with ExitStack() as stack:
-        if settings.bus.in_process:
-            channel = f"hdbridge-{uuid4()}"
-            opened = _virtual(channel)
-        else:
-            channel = settings.bus.channel
-            stack.enter_context(_turn(settings.bus))
-            opened = _real(settings.bus)
-        bus = stack.enter_context(opened())
-        node = _node(settings, bus, clock)
-        port = None
-        if settings.bus.in_process:
-            port = stack.enter_context(Port(channel, None, node.note))
-        where = _Where(INTERFACE if port is not None else settings.bus.interface, channel)
-        drive = SimulatedDrive(settings, node, where, clock, Reach(node, opened, port, str(settings.bus)))
-        node.poll(clock.now())
-        stack.enter_context(_served(drive, bus, node, clock))
+        line = beside._line if beside is not None else stack.enter_context(open_line(settings.bus))
+        node, failures = stack.enter_context(line.drive(settings))
+        drive = SimulatedDrive(settings, node, line, failures)
         yield drive
-
-
-@contextmanager
-def _served(drive: SimulatedDrive, bus: can.BusABC, node: WatchedDrive, clock: Clock) -> Iterator[None]:
-    """A thread in which the drive lives."""
-    ended = threading.Event()
-
-    def serve() -> None:
-        try:
-            run(bus, node, clock, ended.is_set, LONGEST_WAIT_S)
-        except HdbridgeError as error:
-            drive._failure = error
-            node.note("bus", str(error))
-
-    thread = threading.Thread(target=serve, name="simulated drive", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
-def _node(settings: Settings, bus: can.BusABC, clock: Clock) -> WatchedDrive:
-    axis = settings.axis
-    return WatchedDrive(bus, settings.truth, settings.seed, axis.eds_path, axis.drive.node_id, clock)
-
-
-def _virtual(channel: str) -> Callable[[], AbstractContextManager[can.BusABC]]:
-    return lambda: can.Bus(interface="virtual", channel=channel, ignore_config=True)
-
-
-def _real(choice: BusChoice) -> Callable[[], AbstractContextManager[can.BusABC]]:
-    settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
-    return lambda: open_bus(settings, shared=True)
-
-
-@contextmanager
-def _turn(choice: BusChoice) -> Iterator[None]:
-    """Wait until no other test of this machine has a drive on the bus: workers of pytest-xdist share it."""
-    folder = Path(tempfile.gettempdir())
-    end_s = time.monotonic() + LONGEST_TURN_S
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(interface_lock(f"testing-{choice.interface}", choice.channel, folder))
-                break
-            except BusInUseError:
-                if time.monotonic() > end_s:
-                    raise
-            time.sleep(0.05)
-        yield
+        drive._check()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -28,11 +30,25 @@ def test_the_example_in_lockstep(pytester):
     run(pytester).assert_outcomes(passed=13)
 
 
+MY_PROGRAM = """
+import positioner
+
+
+def main(interface, channel):
+    assert positioner.main(["--interface", interface, "--channel", channel, "14"]) == 1
+"""
+
+
 def test_the_example_in_real_time(pytester):
-    done = run(
-        pytester, "--hdbridge-bus", "virtual", NO_CANOPEN, "-k", "goes or encoder_jump or cable_pulled"
-    )
-    done.assert_outcomes(passed=3, deselected=9)
+    """And the few lines with which README and page begin."""
+    pytester.makepyfile(my_program=MY_PROGRAM)
+    for page in (ci_page.PAGE, ci_page.PAGE.parents[1] / "README.md"):
+        (lines,) = re.findall(
+            r"\n\n((?: {4}.*\n)*? {4}def test_my_program.*\n(?: {4}.*\n)*)", page.read_text("utf-8")
+        )
+        pytester.makepyfile(**{f"test_{page.stem}": "import my_program\n" + textwrap.dedent(lines)})
+    done = run(pytester, "--hdbridge-bus", "virtual", NO_CANOPEN, "-k", "goes or encoder_jump or my_program")
+    done.assert_outcomes(passed=4, deselected=10)
 
 
 def test_the_example_in_two_processes(pytester):
@@ -53,8 +69,15 @@ def test_the_workflow_runs_what_is_tested_here():
         "python -m pytest --hdbridge-bus virtual",
         'python -m pytest --hdbridge-bus "$BUS"',
     ]
-    workflow = yaml.safe_load(ci_page.files()[ci_page.WORKFLOW])
-    assert [*workflow["jobs"]] == ["one-process", "two-processes"]
+
+
+def test_what_stands_for_gitlab_does_the_same():
+    after = ci_page.PAGE.read_text("utf-8").split("GitLab CI, in", 1)[1]
+    lines = re.search(r"\n\n((?: {4}.*\n)+)", after)
+    assert lines is not None
+    job = yaml.safe_load(textwrap.dedent(lines[1]))["motion"]
+    one_process = yaml.safe_load(ci_page.files()[ci_page.WORKFLOW])["jobs"]["one-process"]
+    assert job["script"] == [step["run"] for step in one_process["steps"] if "run" in step]
 
 
 @pytest.mark.parametrize(

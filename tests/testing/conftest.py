@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
 import pytest
 
+from hdbridge.files.bundled import bundled_profile
 from hdbridge.testing import SimulatedDrive, simulated_drive
 
 PERIOD_S = 0.004
@@ -76,6 +79,18 @@ class Program:
 
     def move(self, cycles: int) -> list[list[can.Message]]:
         return [self.cycle() for _ in range(cycles)]
+
+
+@pytest.fixture
+def second_axis(tmp_path: Path) -> Path:
+    """A profile of node 2."""
+    folder = tmp_path / "second"
+    shutil.copytree(bundled_profile("article"), folder)
+    axis = folder / "axis.yaml"
+    axis.write_text(
+        axis.read_text(encoding="utf-8").replace("node_id: 1\n", "node_id: 2\n"), encoding="utf-8"
+    )
+    return folder
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from collections import deque
 import can
 import pytest
 
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import BusError, HdbridgeError, InputError
 from hdbridge.testing import history, simulated_drive
 
 
@@ -150,6 +150,57 @@ def test_in_real_time_the_drive_lives_by_itself():
         with drive.fault("bus_down"), pytest.raises(can.CanOperationError, match="Network is down"):
             bus.recv(10.0)
         assert bus.recv(0.02) is None
+
+
+@pytest.mark.parametrize("bus", ["lockstep", "virtual"])
+def test_two_drives_on_one_bus(bus, second_axis):
+    """Each has its own faults, history and axis; the bus is the program's one bus."""
+    with (
+        simulated_drive("article", bus=bus) as one,
+        simulated_drive(str(second_axis), beside=one) as two,
+        one.open_bus() as program,
+    ):
+        assert (one.node_id, two.node_id) == (1, 2)
+        assert (one.interface, one.channel) == (two.interface, two.channel)
+        two.fault("drive_fault")
+        two.wait_until(lambda: two.state == "fault")
+        one.sleep(0.05)
+        assert one.state == "switch on disabled"
+        received = []
+        while (message := program.recv(0.05)) is not None:
+            received.append(message.arbitration_id)
+        assert 0x082 in received
+        assert one.emergencies == ()
+        assert two.emergencies == (0x3210,)
+        with pytest.raises(InputError, match="another simulated drive on this bus is node 2"):
+            simulated_drive(str(second_axis), beside=one).__enter__()
+
+
+def test_a_second_drive_on_a_bus_of_the_machine_says_how_it_is_put_there():
+    bus = "udp_multicast:239.74.163.10"
+    with (
+        simulated_drive("article", bus=bus),
+        pytest.raises(InputError, match="beside=drive"),
+        simulated_drive("demo", bus=bus),
+    ):
+        pass
+
+
+def test_a_drive_whose_bus_has_failed_is_told_of(monkeypatch):
+    """Its thread has ended: the test does not go on as if nothing were."""
+    monkeypatch.setattr("hdbridge.sim.run.PATIENCE_S", 0.0)
+
+    def use() -> None:
+        with simulated_drive("article", bus="virtual") as drive:
+
+            def recv(timeout: float | None = None) -> None:
+                raise can.CanOperationError("Network is down")
+
+            drive._node.bus.recv = recv
+            time.sleep(0.5)
+
+    with pytest.raises(BusError, match="cannot be read"):
+        use()
 
 
 def test_an_interface_of_the_machine_is_not_taken_away():

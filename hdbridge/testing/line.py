@@ -1,0 +1,159 @@
+"""The bus that simulated drives stand on: in lockstep or in real time, of this process or of the machine."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from uuid import uuid4
+
+import can
+
+from hdbridge.axis.config import BusConfig
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.link import open_bus
+from hdbridge.errors import BusInUseError, HdbridgeError, InputError
+from hdbridge.sim.run import run
+from hdbridge.testing.port import INTERFACE, Port, StallingClock
+from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
+from hdbridge.testing.watched import WatchedDrive
+
+LONGEST_WAIT_S: Final = 0.005
+"""In real time: how long a drive may not notice that a fault is wanted."""
+LONGEST_TURN_S: Final = 600.0
+"""How long a bus of the machine is waited for, that other tests use."""
+
+_IN_USE: Final[dict[str, int]] = {}
+"""Buses of the machine with a drive of this process, and the thread that made it."""
+
+
+@dataclass
+class Line:
+    """One bus, with its clock and its drives."""
+
+    choice: BusChoice
+    interface: str
+    """What a program calls it, with the channel."""
+    channel: str
+    clock: Clock
+    opened: Callable[[], AbstractContextManager[can.BusABC]]
+    """Opens the end of a node."""
+    port: Port | None = None
+    """The program's interface, where it is in this process."""
+    nodes: list[WatchedDrive] = field(default_factory=list)
+
+    def note(self, kind: str, text: str) -> None:
+        """Put an event into every drive's history."""
+        for node in self.nodes:
+            node.note(kind, text)
+
+    @contextmanager
+    def drive(self, settings: Settings) -> Iterator[tuple[WatchedDrive, list[HdbridgeError]]]:
+        """Switch a drive on, as long as the block lasts. What ends it before that is in the list.
+
+        InputError where the bus has a drive of that node id.
+        """
+        axis = settings.axis
+        node_id = axis.drive.node_id
+        if any(node.node_id == node_id for node in self.nodes):
+            raise InputError(
+                f"{axis.path}: another simulated drive on this bus is node {node_id}; expected a free one"
+            )
+        with self.opened() as bus:
+            node = WatchedDrive(bus, settings.truth, settings.seed, axis.eds_path, node_id, self.clock)
+            self.nodes.append(node)
+            try:
+                node.poll(self.clock.now())
+                with self._living(bus, node) as failures:
+                    yield node, failures
+            finally:
+                self.nodes.remove(node)
+
+    @contextmanager
+    def _living(self, bus: can.BusABC, node: WatchedDrive) -> Iterator[list[HdbridgeError]]:
+        """On the virtual clock, or in a thread of its own."""
+        if isinstance(self.clock, StallingClock):
+            nodes = self.clock.nodes
+            nodes.append(node)
+            try:
+                yield []
+            finally:
+                nodes.remove(node)
+            return
+        ended = threading.Event()
+        failures: list[HdbridgeError] = []
+
+        def serve() -> None:
+            try:
+                run(bus, node, self.clock, ended.is_set, LONGEST_WAIT_S)
+            except HdbridgeError as error:
+                failures.append(error)
+                node.note("bus", str(error))
+
+        thread = threading.Thread(target=serve, name=f"simulated drive {node.node_id}", daemon=True)
+        thread.start()
+        try:
+            yield failures
+        finally:
+            ended.set()
+            thread.join()
+
+
+@contextmanager
+def open_line(choice: BusChoice) -> Iterator[Line]:
+    """A bus for drives; BusError where it cannot be opened. A bus of the machine is waited for."""
+    if not choice.in_process:
+        settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
+        with _turn(choice):
+            yield Line(
+                choice,
+                choice.interface,
+                choice.channel,
+                MonotonicClock(),
+                lambda: open_bus(settings, shared=True),
+            )
+        return
+    channel = f"hdbridge-{uuid4()}"
+    lockstep = StallingClock() if choice.interface == LOCKSTEP else None
+    line = Line(
+        choice,
+        INTERFACE,
+        channel,
+        lockstep or MonotonicClock(),
+        lambda: can.Bus(interface="virtual", channel=channel, ignore_config=True),
+    )
+    with Port(channel, lockstep, line.note) as line.port:
+        yield line
+
+
+@contextmanager
+def _turn(choice: BusChoice) -> Iterator[None]:
+    """Wait until no other test of this machine has a drive on the bus: workers of pytest-xdist share it."""
+    name = str(choice)
+    if _IN_USE.get(name) == threading.get_ident():
+        raise InputError(
+            f"{name}: this test has a drive on it already, which would be waited for; put the second one "
+            "beside it: simulated_drive(..., beside=drive)"
+        )
+    folder = Path(tempfile.gettempdir())
+    end_s = time.monotonic() + LONGEST_TURN_S
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(interface_lock(f"testing-{choice.interface}", choice.channel, folder))
+                break
+            except BusInUseError:
+                if time.monotonic() > end_s:
+                    raise
+            time.sleep(0.05)
+        _IN_USE[name] = threading.get_ident()
+        try:
+            yield
+        finally:
+            del _IN_USE[name]
