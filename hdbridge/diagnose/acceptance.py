@@ -25,7 +25,8 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.orders import OrderSeries
 from hdbridge.effects.path import branches
-from hdbridge.estimation.hypothesis import Estimator, Fitted, orthonormal
+from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.linear import orthonormal
 
 BLOCKS_S = (1.0, 5.0)
 LEAST_BLOCKS = 30

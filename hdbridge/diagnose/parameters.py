@@ -14,8 +14,9 @@ from hdbridge.diagnose.result import Parameter
 from hdbridge.effects import CountLoss, Creep, Effect, FloatArray, SubdivisionalError, Vibration
 from hdbridge.effects.base import Linear
 from hdbridge.effects.orders import OrderSeries
-from hdbridge.estimation.hypothesis import Estimator, Fitted, shape_value
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.observed import IntArray
+from hdbridge.estimation.shapes import shape_value
 
 NORMAL_95: Final = 1.96
 PARTS: Final = (6, 12)

@@ -47,7 +47,7 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
     )
     data = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
     estimator = Estimator(data)
-    fitted = estimator.fit(Hypothesis(model.effects, start), iterations=2)
+    fitted = estimator.fit(Hypothesis(model.effects, start), steps=2)
     found = identifiability(estimator, fitted, model.effects)
     return {
         "schema": "hdbridge.plan-diagnosis/1",

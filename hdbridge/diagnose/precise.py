@@ -9,20 +9,18 @@ model, and what it takes over would be missing in the loop's own parameters.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG, OrderSeries
-from hdbridge.estimation.hypothesis import CONVERGED, Estimator, Fitted, moved, solve
+from hdbridge.estimation.hypothesis import FIXED_SHAPES, Estimator, Fitted
 
 SPEEDS_DIFFER: Final = 0.1
 """Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
 FOUND: Final = frozenset({"frequency_hz"})
 """Shapes that a search finds among all their values, and that can be moved on from there."""
-STEPS: Final = 4
 _RATE: Final = 30.0
 """Radians per second, of size one in the columns."""
 
@@ -36,27 +34,13 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
     searched = estimator.nuisance
     try:
         estimator.nuisance = shaken
-        return _with_found(estimator, estimator.fit(fitted.hypothesis))
+        plain = estimator.fit(fitted.hypothesis)
+        found = estimator.fit(plain.hypothesis, held=FIXED_SHAPES - FOUND)
+        if any(each.violations() for each in found.hypothesis.effects):
+            return estimator.fit(plain.hypothesis, 1, FIXED_SHAPES - FOUND)
+        return found
     finally:
         estimator.nuisance = searched
-
-
-def _with_found(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """With the shapes that a search found among all their values, moved to where they fit best."""
-    for _ in range(STEPS):
-        full = estimator.with_shapes(fitted, FOUND)
-        if len(full.parameters) == len(fitted.parameters):
-            return fitted
-        new = range(len(fitted.parameters), len(full.parameters))
-        moves = solve(full.tangent, full.residual)
-        effects = moved(
-            fitted.hypothesis.effects, moves[new.start :], [full.parameters[each] for each in new], 1.0
-        )
-        trial = estimator.fit(replace(fitted.hypothesis, effects=effects))
-        if any(each.violations() for each in effects) or trial.chi_square > fitted.chi_square - CONVERGED:
-            return full
-        fitted = trial
-    return estimator.with_shapes(fitted, FOUND)
 
 
 def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,6 +60,10 @@ class Design:
         part = blocks.picked(index)
         part = replace(part, count=np.where(near[index], part.count, part.count / share))
         return Design.of(self.samples, part, self.starts), index
+
+    def roughly(self, effect: Effect) -> FloatArray:
+        """Columns in which the middles of the blocks stand for all samples."""
+        return self.columns(effect, exact=False)
 
     def columns(self, effect: Effect, exact: bool = True) -> FloatArray:
         """Columns of an effect, shape (b, p); ``exact`` averages all samples, else middles stand for them."""
@@ -152,40 +156,6 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
         both = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(index), -1)
         result[part] = blocks.mean_of_part(part, both)
     return result
-
-
-def tangents(
-    design: Design, effect: Effect, coefficients: FloatArray, exact: bool = True
-) -> tuple[list[str], FloatArray]:
-    """Derivatives of an effect's prediction by its shape parameters: their names, and columns (blocks, s).
-
-    Central differences, one-sided at a bound; logarithmic parameters are differentiated by their logarithm.
-    """
-    names: list[str] = []
-    columns: list[FloatArray] = []
-    for shape in effect.shape:
-        here = float(getattr(effect, shape.name))
-        step = 1e-3 * here if shape.logarithmic else 1e-3 * (shape.upper - shape.lower)
-        low, high = max(here - step, shape.lower), min(here + step, shape.upper)
-        span = np.log(high / low) if shape.logarithmic else high - low
-        either = [
-            design.columns(effect.fitted(coefficients, {shape.name: value}), exact) @ coefficients
-            for value in (low, high)
-        ]
-        names.append(shape.name)
-        columns.append((either[1] - either[0]) / span)
-    return names, np.stack(columns, axis=1) if columns else np.empty((len(design.blocks), 0))
-
-
-def moved(effect: Effect, coefficients: FloatArray, steps: Mapping[str, float]) -> Effect:
-    """The effect with its shape parameters moved (some in the logarithm), kept in their ranges."""
-    values: dict[str, float] = {}
-    for shape in effect.shape:
-        here = float(getattr(effect, shape.name))
-        step = steps.get(shape.name, 0.0)
-        there = here * float(np.exp(np.clip(step, -1.0, 1.0))) if shape.logarithmic else here + step
-        values[shape.name] = min(max(there, shape.lower), shape.upper)
-    return effect.fitted(coefficients, values)
 
 
 def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray]]:

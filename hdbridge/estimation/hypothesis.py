@@ -1,34 +1,37 @@
-"""A hypothesis: effects and zeros, fitted together by Gauss-Newton on everything that is free.
+"""A hypothesis: effects and zeros, fitted together with everything that is free (`separable`).
 
 The baseline is refitted with every candidate, so what the baseline can take over is never called a finding.
 """
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from hdbridge.effects import (
     Channel,
-    DirectionPhase,
     Effect,
     FloatArray,
     Motion,
     Start,
     VelocityWindup,
-    refreshed,
 )
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.effects.play import stop
+from hdbridge.estimation.linear import orthonormal
+from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import IntArray, Observed, Series
+from hdbridge.estimation.separable import Separable, Solution
+from hdbridge.estimation.shapes import unit
+from hdbridge.estimation.terms import Column, Effort, Nuisances, Prior, Terms
 
-ITERATIONS = 8
+STEPS = 8
 CONVERGED = 0.5
 """A step that gains less than this in chi square is the last."""
 ROUGHLY = 2e-5
@@ -45,7 +48,6 @@ by chance, and half of the time the effect would be refused for it: it is held a
 sign of `Estimator.loop_sign`, for the same reason."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
-_EPS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +70,7 @@ class Hypothesis:
         return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """What a column of the tangent matrix stands for."""
-
-    effect: int
-    """Place of the effect in the hypothesis; -1 for a zero."""
-    name: str
-    shape: bool = False
-    logarithmic: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Fitted:
     """A hypothesis with its best parameters."""
 
@@ -87,12 +78,21 @@ class Fitted:
     zeros: FloatArray
     residual: FloatArray
     """Weighted residual of the usable points, shape (m,)."""
-    tangent: FloatArray
-    """Weighted derivatives, shape (m, p)."""
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Column, ...]
+    """What the columns of the tangent matrix stand for."""
     chi_square: float
-    basis: FloatArray = field(repr=False, default_factory=lambda: np.empty((0, 0)))
-    """Orthonormal basis of the tangent's columns."""
+    _solution: Solution = field(repr=False)
+    _weight: FloatArray = field(repr=False)
+
+    @cached_property
+    def tangent(self) -> FloatArray:
+        """Weighted derivatives, shape (m, p)."""
+        return self._solution.jacobian * self._weight[:, np.newaxis]
+
+    @cached_property
+    def basis(self) -> FloatArray:
+        """Orthonormal basis of the tangent's columns."""
+        return orthonormal(self.tangent)
 
     def count(self) -> int:
         """Columns of the tangent matrix."""
@@ -100,7 +100,7 @@ class Fitted:
 
     def free(self) -> int:
         """Parameters that do anything in this record."""
-        return int(np.count_nonzero(np.any(self.tangent != 0.0, axis=0)))
+        return self._solution.free()
 
     def places(self, effect: int) -> IntArray:
         """Columns of one effect."""
@@ -127,6 +127,8 @@ class Estimator:
         self.level = float(np.median(self.observed))
         self.loop_sign = 1.0
         """Of the loop's offset: -1 where the load lags."""
+        self.prior: Callable[[Hypothesis], Mapping[tuple[int, str], Prior]] = lambda _: {}
+        """What is known beforehand of a hypothesis's coefficients and shapes."""
         self.nuisance: FloatArray = np.empty((len(self.index), 0))
         """Columns that every fit may use and that mean nothing, shape (m, k)."""
 
@@ -143,10 +145,7 @@ class Estimator:
             )
         # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
         # depend on those, and these are fields of them.
-        unit = effect
-        if not isinstance(effect, DirectionPhase):  # whose column is that at its present shift
-            unit = effect.fitted(np.ones(len(effect.coefficients())))
-        recent = (unit, start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
+        recent = (unit(effect), start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
         if recent in self._recent:
             self._recent.move_to_end(recent)
             return self._recent[recent]
@@ -166,7 +165,8 @@ class Estimator:
 
     def at_points(self, values: FloatArray) -> FloatArray:
         """Of every sample to the usable points, as the observations are averaged."""
-        return np.asarray(self.data.mean(values)[self.index])
+        means = self.data.mean(values)
+        return means if len(means) == len(self.index) else np.asarray(means[self.index])
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
         """What an effect does in the usable samples, arcsec; in means a fast one would seem smaller."""
@@ -191,114 +191,53 @@ class Estimator:
         angle = self.data.full.motion.motor_deg
         return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
 
-    def fit(self, hypothesis: Hypothesis, iterations: int = ITERATIONS) -> Fitted:
-        """Gauss-Newton from where the hypothesis stands; never worse than where it began."""
+    def fit(self, hypothesis: Hypothesis, steps: int = STEPS, held: frozenset[str] = FIXED_SHAPES) -> Fitted:
+        """The minimum near where the hypothesis stands, and never worse; shapes in ``held`` stay."""
         counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
-            hypothesis, iterations, self.nuisance.shape[1],
-            self.load_angles if counted else 0, self.loop_sign,
+            hypothesis, steps, held, self.nuisance.shape[1],
+            self.load_angles if counted else 0, self.loop_sign, self.prior,
         )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
-        fitted = self._fit(hypothesis, iterations)
+        start = hypothesis.start
+        terms = Terms(
+            self.observed - self.level,
+            lambda effect: self.columns(effect, start),
+            White(self.weight),
+            self.nuisances(),
+            self.prior(hypothesis),
+            self._sign,
+            held,
+        )
+        found = Separable(terms).fit(hypothesis.effects, Effort(steps, CONVERGED, ROUGHLY))
+        fitted = Fitted(
+            replace(hypothesis, effects=found.effects),
+            found.nuisances[: self.data.zeros],
+            found.residual * self.weight,
+            found.columns,
+            found.chi_square,
+            found,
+            self.weight,
+        )
         self._fits[key] = fitted
         if len(self._fits) > KEPT_FITS:
             self._fits.popitem(last=False)
         return fitted
 
-    def _fit(self, hypothesis: Hypothesis, iterations: int) -> Fitted:
-        effects = refreshed(hypothesis.effects)
-        best: Fitted | None = None
-        step = 1.0
-        moves = np.empty(0)
-        for _ in range(iterations):
-            here = self._at(replace(hypothesis, effects=effects))
-            if best is None or here.chi_square < best.chi_square:
-                gain = math.inf if best is None else best.chi_square - here.chi_square
-                best = self.with_shapes(here)
-                if gain < max(CONVERGED, ROUGHLY * here.chi_square):
-                    break
-                step = 1.0
-                moves = solve(best.tangent, best.residual)
-            else:
-                step *= 0.35
-                if step < 0.02:
-                    break
-            effects = moved(best.hypothesis.effects, moves, best.parameters, step)
-        assert best is not None
-        return replace(best, basis=orthonormal(best.tangent))
-
-    def _at(self, hypothesis: Hypothesis) -> Fitted:
-        """Residual at these shapes, with everything linear solved for; shapes have no tangents yet."""
-        blocks = [self.zero_columns(), self.nuisance]
-        parameters = [Parameter(-1, f"zero{i}") for i in range(self.data.zeros)]
-        parameters += [Parameter(-1, f"nuisance{i}") for i in range(self.nuisance.shape[1])]
-        for place, effect in enumerate(hypothesis.effects):
-            columns = self.columns(effect, hypothesis.start)
-            blocks.append(columns)
-            parameters += [Parameter(place, str(i)) for i in range(columns.shape[1])]
-        linear = self.weighted(np.hstack(blocks))
-        observed = (self.observed - self.level) * self.weight
-        # Linear in the coefficients: solve for them outright; what is carried elsewhere follows in
-        # `refreshed`.
-        sign = np.array(
-            [0.0 if each.effect < 0 else self._sign(hypothesis.effects[each.effect]) for each in parameters]
-        )
-        solution = solve(linear, observed)
-        while np.any(below := sign * solution < 0.0):
-            linear[:, below] = 0.0
-            solution = solve(linear, observed)
-        effects: list[Effect] = []
-        at = self.data.zeros + self.nuisance.shape[1]
-        for effect in hypothesis.effects:
-            size = len(effect.coefficients())
-            effects.append(effect.fitted(solution[at : at + size]))
-            at += size
-        residual = observed - linear @ solution
-        return Fitted(
-            replace(hypothesis, effects=tuple(effects)),
-            solution[: self.data.zeros],
-            residual,
-            linear,
-            tuple(parameters),
-            float(residual @ residual),
-        )
+    def nuisances(self) -> Nuisances:
+        """A zero for each absolute zero, and what else every fit may use."""
+        names = [f"zero{i}" for i in range(self.data.zeros)]
+        names += [f"nuisance{i}" for i in range(self.nuisance.shape[1])]
+        columns = np.hstack([self.zero_columns(), self.nuisance])
+        return Nuisances(columns, tuple(names), np.zeros(len(names)))
 
     def _sign(self, effect: Effect) -> float:
         """The sign that an effect's coefficients have; 0 where they may have either."""
         if isinstance(effect, LOOPS):
             return self.loop_sign
         return 1.0 if isinstance(effect, ONE_SIDED) else 0.0
-
-    def with_shapes(self, fitted: Fitted, names: Container[str] | None = None) -> Fitted:
-        """With the tangents of these shapes, or of all but `FIXED_SHAPES`; the same where there are none."""
-        hypothesis, parameters = fitted.hypothesis, list(fitted.parameters)
-        shapes: list[FloatArray] = []
-        for place, effect in enumerate(hypothesis.effects):
-            for each in effect.shape:
-                if each.name in FIXED_SHAPES if names is None else each.name not in names:
-                    continue
-                here = shape_value(effect, each.name)
-                delta = 1e-2 * here if each.logarithmic else 2e-3 * (each.upper - each.lower)
-                if each.name == "frequency_hz":  # a small part of a period over the whole record
-                    delta = 0.02 / max(float(np.ptp(self.time_s)), 1e-9)
-                low, high = max(here - delta, each.lower), min(here + delta, each.upper)
-                if high <= low:
-                    continue
-                span = math.log(high / low) if each.logarithmic else high - low
-                coefficients = effect.coefficients()
-                either = [
-                    self.columns(effect.fitted(coefficients, {each.name: value}), hypothesis.start)
-                    @ coefficients
-                    for value in (low, high)
-                ]
-                shapes.append(self.weight * (either[1] - either[0]) / span)
-                parameters.append(Parameter(place, each.name, shape=True, logarithmic=each.logarithmic))
-        if not shapes:
-            return fitted
-        tangent = np.column_stack([fitted.tangent, *shapes])
-        return replace(fitted, tangent=tangent, parameters=tuple(parameters))
 
     def predicted(self, fitted: Fitted) -> FloatArray:
         """What the hypothesis says for each sample, zeros included, arcsec, shape (n,)."""
@@ -315,53 +254,6 @@ class Estimator:
         return self.at_points(total)
 
 
-def shape_value(effect: Effect, name: str) -> float:
-    """A shape parameter; where it is not a field, that of the first of its parts."""
-    holder = effect if hasattr(effect, name) else effect.parts[0]  # type: ignore[attr-defined]
-    return float(getattr(holder, name))
-
-
 def _time(series: Series) -> FloatArray:
     assert series.motion.time_s is not None
     return series.motion.time_s
-
-
-def solve(columns: FloatArray, right: FloatArray) -> FloatArray:
-    """Least squares through the Gram matrix; directions that the data do not see stay at zero."""
-    gram = columns.T @ columns
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > _EPS * max(float(values[-1]), 1e-300)
-    moment = (columns.T @ right) / scale
-    inner = vectors[:, kept] @ ((vectors[:, kept].T @ moment) / values[kept])
-    return np.where(np.diag(gram) > 0.0, inner / scale, 0.0)
-
-
-def orthonormal(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of what the columns span, shape (m, r)."""
-    gram = columns.T @ columns
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > _EPS * max(float(values[-1]), 1e-300)
-    return np.asarray(columns @ (vectors[:, kept] / scale[:, np.newaxis] / np.sqrt(values[kept])))
-
-
-def moved(
-    effects: tuple[Effect, ...], moves: FloatArray, parameters: Sequence[Parameter], step: float
-) -> tuple[Effect, ...]:
-    """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""
-    result = list(effects)
-    for move, parameter in zip(moves, parameters, strict=True):
-        if not parameter.shape:
-            continue
-        effect = result[parameter.effect]
-        shape = next(each for each in effect.shape if each.name == parameter.name)
-        here = shape_value(effect, shape.name)
-        if shape.logarithmic:
-            there = here * math.exp(min(max(step * float(move), -0.7), 0.7))
-        else:
-            reach = 0.15 * (shape.upper - shape.lower)
-            there = here + min(max(step * float(move), -reach), reach)
-        there = min(max(there, shape.lower), shape.upper)
-        result[parameter.effect] = effect.fitted(effect.coefficients(), {shape.name: there})
-    return refreshed(tuple(result))

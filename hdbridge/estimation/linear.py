@@ -12,6 +12,8 @@ RIDGE = 1e-11
 
 NOTHING = 1e-20
 """Information below this is none."""
+SEEN = 1e-9
+"""Share of the largest eigenvalue of scaled columns below which a direction is not in the data."""
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -35,3 +37,22 @@ def inverse_symmetric(matrix: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     inverse = vectors @ ((1.0 / np.maximum(values, 1e-12 * values[-1]))[:, np.newaxis] * vectors.T)
     return np.asarray(inverse / np.outer(scale, scale))
+
+
+def seen_directions(gram: FloatArray) -> FloatArray:
+    """Factor R, shape (p, r), with R' gram R = 1 over the directions that the data see.
+
+    R R' is the pseudo-inverse of columns scaled to one, and ``columns @ R`` an orthonormal basis of theirs.
+    """
+    if not len(gram):
+        return np.empty((0, 0))
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > SEEN * max(float(values[-1]), 1e-300)
+    factor = vectors[:, kept] / scale[:, np.newaxis] / np.sqrt(values[kept])
+    return np.where((np.diag(gram) > 0.0)[:, np.newaxis], factor, 0.0)
+
+
+def orthonormal(columns: FloatArray) -> FloatArray:
+    """An orthonormal basis of what the columns span, shape (m, r)."""
+    return np.asarray(columns @ seen_directions(columns.T @ columns))

@@ -49,6 +49,20 @@ class NoiseModel:
         return np.asarray(mean + blocks.blur)
 
 
+class White:
+    """The inverse covariance of independent noise."""
+
+    def __init__(self, weight: FloatArray) -> None:
+        """``weight`` is one over the standard deviation of each row, shape (m,)."""
+        self._precision = weight**2
+
+    def apply(self, columns: FloatArray) -> FloatArray:
+        """K^-1 times columns of shape (m,) or (m, p)."""
+        return np.asarray(
+            (self._precision if columns.ndim == 1 else self._precision[:, np.newaxis]) * columns
+        )
+
+
 class Precision:
     """The inverse covariance of the noise of some blocks, applied without ever being written out.
 

@@ -11,8 +11,7 @@ faster. Two speeds distinguish that from the orders' amplitudes; at one speed th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +20,7 @@ from hdbridge.effects import Effect, FloatArray
 from hdbridge.estimation.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, locked_counts
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.samples import IntArray
+from hdbridge.estimation.terms import Nuisances
 from hdbridge.units import ARCSEC_PER_DEG
 
 DELAY = "delay_ms"
@@ -49,35 +48,6 @@ SPEEDS_COUNTS_S = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0, 
 """Edges of the classes of speed that round alike; at rest is a class of its own."""
 SHARE = 0.1
 """A nuisance of whose column less than this is left by what else is fitted stays out."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Nuisances:
-    """Columns that are no effect's."""
-
-    columns: FloatArray
-    """Shape (b, q)."""
-    names: tuple[str, ...]
-    prior: FloatArray
-    """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
-
-    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Nuisances:
-        """With further columns of which nothing is known."""
-        return Nuisances(
-            np.concatenate([self.columns, columns], axis=1),
-            (*self.names, *names),
-            np.concatenate([self.prior, np.zeros(columns.shape[1])]),
-        )
-
-    def without(self, left_out: Callable[[str], bool]) -> Nuisances:
-        """Without the columns whose names answer."""
-        keep = np.array([not left_out(each) for each in self.names])
-        names = tuple(each for each in self.names if not left_out(each))
-        return Nuisances(self.columns[:, keep], names, self.prior[keep])
-
-    def rows(self, index: IntArray) -> Nuisances:
-        """For some of the blocks."""
-        return Nuisances(self.columns[index], self.names, self.prior)
 
 
 def zeros(design: Design) -> FloatArray:

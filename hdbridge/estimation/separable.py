@@ -1,61 +1,73 @@
-"""The joint fit: separable non-linear least squares over any effects (variable projection).
+"""Separable non-linear least squares over any effects (variable projection), for calibration and diagnosis.
 
 An effect is linear in its coefficients and not in its shape. For given shapes the coefficients are one linear
-solution; only the shapes are searched: first on a grid, then by Gauss-Newton steps with everything that is
-linear refitted at each step (Golub and Pereyra 1973). Nothing here knows which effects there are.
+solution; only the shapes are searched, by damped Gauss-Newton steps inside their ranges with everything that
+is linear refitted at each (Golub and Pereyra 1973). Nothing here knows which effects there are.
+
+The work is on Gram matrices. Columns that do not change from step to step (those of effects without a shape,
+zeros, nuisances) are put together and multiplied once; a step costs no more than what does change. The loop
+is not scipy's: an effect may carry what another one has fitted (a spring that scales the orders), so that
+what is left is no function of the shapes alone, and what it carries is exchanged at every step
+(`hdbridge.effects.refreshed`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
+from numpy.typing import NDArray
 
-from hdbridge.effects import Effect, FloatArray
-from hdbridge.estimation.design import Design, moved, tangents
+from hdbridge.effects import Effect, FloatArray, refreshed
+from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.noise import Precision
-from hdbridge.estimation.nuisances import Nuisances
-from hdbridge.estimation.samples import BoolArray
+from hdbridge.estimation.shapes import is_valid, leaves, moved, shape_value, tangent, unit
+from hdbridge.estimation.terms import Column, Effort, Prior, Terms
 
+BoolArray = NDArray[np.bool_]
 GRID_LOGARITHMIC = 12
 GRID_LINEAR = 7
-ITERATIONS = 25
-BEGINS = 3
-"""Minima of the grid from which a descent begins."""
-CONVERGED = 1e-4
-"""A step that promises less than this in chi square is the last."""
-
-
-class Column(NamedTuple):
-    """What a column of the joint fit stands for."""
-
-    effect: int
-    """Index of the effect, or -1 for a column that is no effect's."""
-    name: str
-    """Number of the coefficient, name of the shape parameter, or of the other column."""
-    shape: bool = False
+DAMPING = 1e-4
+TRIES = 6
+"""So often a step that does not help is shortened."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """What is to be fitted: observations, effects, and further columns (zeros, nuisances)."""
+class _Fixed:
+    """Columns that stay while shapes move: the nuisances, then those of the effects in ``places``."""
 
-    design: Design
+    places: tuple[int, ...]
+    units: tuple[Effect, ...]
+    matrix: FloatArray
+    weighted: FloatArray
+    gram: FloatArray
+    right: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """Coefficients at some shapes."""
+
+    given: tuple[Effect, ...]
+    """What the columns are those of."""
     effects: tuple[Effect, ...]
-    nuisances: Nuisances
+    """With the coefficients that were found."""
+    fixed: _Fixed
+    moving: tuple[int, ...]
+    """Places of the effects whose columns are in ``matrix``, in their order."""
+    matrix: FloatArray
+    gram: FloatArray
+    """Of all linear columns, those in ``fixed`` first, and what is known beforehand."""
+    coefficients: FloatArray
+    inside: BoolArray
+    """False for coefficients that are held at zero."""
+    chi_square: float
 
-    @property
-    def observed(self) -> FloatArray:
-        """Observations, arcsec, shape (b,)."""
-        return self.design.blocks.error_arcsec
 
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """The minimum, and what intervals and tests need of it."""
 
@@ -63,70 +75,120 @@ class Solution:
     nuisances: FloatArray
     """Coefficients of the columns that are no effect's, shape (q,)."""
     chi_square: float
+    """With what was known beforehand."""
     columns: tuple[Column, ...]
-    jacobian: FloatArray
-    """Shape (b, p): coefficients of the effects, further columns, then shapes."""
-    information: FloatArray
-    """Jacobian' K^-1 Jacobian and what was known beforehand, shape (p, p)."""
+    """The nuisances', the effects' coefficients, then shapes."""
     residual: FloatArray
-    """Shape (b,)."""
+    """Shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
-    """Shape parameters that ended on the edge of their range: effect, name."""
+    """Shapes that ended on the edge of their range: effect, name."""
+    _fit: Separable
+    _point: _Point
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivatives by all columns, shape (m, p)."""
+        fixed, moving = self._point.fixed, self._point
+        both = np.empty((len(self.residual), len(self.columns)))
+        order = self._order
+        split = fixed.matrix.shape[1]
+        for at, source in enumerate(order):
+            part = fixed.matrix[:, source] if source < split else moving.matrix[:, source - split]
+            both[:, at] = part if self._point.inside[source] else 0.0
+        if len(order) < len(self.columns):
+            both[:, len(order) :] = self._fit.tangents(self.effects, central=True)[1]
+        return both
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Jacobian' K^-1 Jacobian and what was known beforehand, shape (p, p)."""
+        shapes = self.jacobian[:, len(self._order) :]
+        cross = self.jacobian.T @ self._fit.terms.weighting.apply(shapes)
+        size = len(self._order)
+        result = np.empty((len(self.columns),) * 2)
+        kept = self._point.inside[self._order]
+        result[:size, :size] = self._point.gram[np.ix_(self._order, self._order)] * np.outer(kept, kept)
+        result[:, size:] = cross
+        result[size:, :] = cross.T
+        for at, each in enumerate(self.columns[size:], size):
+            known = self._fit.terms.prior.get((each.effect, each.name))
+            result[at, at] += known.information if known else 0.0
+        return result
+
+    @property
+    def _order(self) -> NDArray[np.intp]:
+        """Where the linear columns stand in the point's Gram matrix."""
+        return self._fit.order(self._point)
+
+    def free(self) -> int:
+        """Parameters that do anything in the data."""
+        seen = int(np.count_nonzero(self._point.inside & (np.diag(self._point.gram) > 0.0)))
+        idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
+        return seen + sum(each.shape and each.effect not in idle for each in self.columns)
 
 
-class _Linear(NamedTuple):
-    coefficients: FloatArray
-    chi_square: float
-    dynamic: FloatArray
-    """Columns of the effects that have shapes."""
-    information: FloatArray
-    """Of all linear columns: the straight effects', the further ones, those with shapes."""
+class Separable:
+    """Fits of effects to the same data; what does not depend on shapes is kept from one to the next."""
 
+    def __init__(self, terms: Terms) -> None:
+        self.terms = terms
+        self._right = terms.weighting.apply(terms.observed)
+        self._total = float(terms.observed @ self._right)
+        self._fixed: _Fixed | None = None
 
-class JointFit:
-    """One problem under one noise model; whatever does not depend on shapes is prepared once."""
+    def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
+        """The minimum near where the effects stand; never worse than there."""
+        effort = effort or Effort()
+        here = self._at(refreshed(effects))
+        damping = DAMPING
+        for _ in range(effort.steps - 1):
+            enough = effort.enough(here.chi_square)
+            where, tangents = self.tangents(here.effects)
+            system = self._system(here, where, tangents)
+            step, promised = self._step(here, where, system, damping)
+            small = promised < enough
+            if small and self._stands(here, refreshed(here.effects)):
+                break
+            there = None
+            for _ in range(TRIES):
+                trial = refreshed(moved(here.effects, where, step))
+                attempt = self._at(trial)
+                if attempt.chi_square < here.chi_square:
+                    there = attempt
+                    break
+                if small or not np.any(step):
+                    break
+                damping = max(damping, 1e-3) * 10.0
+                step, _ = self._step(here, where, system, damping)
+            if there is None:
+                break
+            damping /= 5.0
+            gained = here.chi_square - there.chi_square
+            here = there
+            if gained < enough:
+                break
+        return self._solution(here)
 
-    def __init__(self, problem: Problem, precision: Precision, exact: bool = True) -> None:
-        """``exact`` averages every sample into its block; without it the blocks' middles stand for them."""
-        self.problem = problem
-        self._precision = precision
-        self._exact = exact
-        self._shaped = [index for index, each in enumerate(problem.effects) if each.shape]
-        self._straight = [index for index, each in enumerate(problem.effects) if not each.shape]
-        parts = [problem.design.columns(problem.effects[index], True) for index in self._straight]
-        self._static = np.concatenate([*parts, problem.nuisances.columns], axis=1)
-        self._weighted_static = precision.apply(self._static)
-        self._prior = np.concatenate(
-            [np.zeros(self._static.shape[1] - problem.nuisances.columns.shape[1]), problem.nuisances.prior]
-        )
-        self._gram = self._static.T @ self._weighted_static + np.diag(self._prior)
-        self._weighted_observed = precision.apply(problem.observed)
-        self._static_right = self._static.T @ self._weighted_observed
-        self._total = float(problem.observed @ self._weighted_observed)
-
-    def grid(self, index: int, others: Sequence[Effect]) -> list[tuple[float, Effect]]:
+    def grid(self, index: int, effects: Sequence[Effect]) -> list[tuple[float, Effect]]:
         """Local minima of chi square over a grid of one effect's shapes, best first; others as they are."""
-        effect = others[index]
+        effect = effects[index]
         axes = [
             np.geomspace(each.lower, each.upper, GRID_LOGARITHMIC)
             if each.logarithmic
             else np.linspace(each.lower, each.upper, GRID_LINEAR)
             for each in effect.shape
         ]
-        sizes = tuple(len(each) for each in axes)
-        costs = np.full(sizes, np.inf)
+        costs = np.full(tuple(len(each) for each in axes), np.inf)
         tried: dict[tuple[int, ...], Effect] = {}
-        for place in product(*(range(size) for size in sizes)):
+        for place in product(*(range(size) for size in costs.shape)):
             shape = {
                 each.name: float(axis[at]) for each, axis, at in zip(effect.shape, axes, place, strict=True)
             }
             candidate = effect.fitted(effect.coefficients(), shape)
-            effects = [*others[:index], candidate, *others[index + 1 :]]
-            linear = self._linear(effects)
-            fitted = self._spread(effects, linear.coefficients)[0]
-            tried[place] = fitted[index]
-            if is_valid(fitted[index]):
-                costs[place] = linear.chi_square
+            point = self._at((*effects[:index], candidate, *effects[index + 1 :]))
+            tried[place] = point.effects[index]
+            if is_valid(tried[place]):
+                costs[place] = point.chi_square
         minima = []
         for place, candidate in tried.items():
             around = tuple(slice(max(at - 1, 0), at + 2) for at in place)
@@ -134,202 +196,196 @@ class JointFit:
                 minima.append((float(costs[place]), candidate))
         return sorted(minima, key=lambda each: each[0])
 
-    def refine(self, effects: Sequence[Effect], iterations: int = ITERATIONS) -> Solution:
-        """Gauss-Newton over all shapes from where the effects stand, damped, inside the ranges."""
-        return self._solution(*self._minimum(effects, iterations))
+    def tangents(
+        self, effects: Sequence[Effect], central: bool = False
+    ) -> tuple[list[tuple[int, Shape]], FloatArray]:
+        """Derivatives of the effects by their free shapes: which, and columns (m, s).
 
-    def descend(self, effects: Sequence[Effect]) -> tuple[float, list[Effect]]:
-        """Like `refine`: chi square and the effects alone."""
-        now, _, linear = self._minimum(effects, ITERATIONS)
-        return linear.chi_square, now
-
-    def _minimum(
-        self, effects: Sequence[Effect], iterations: int
-    ) -> tuple[list[Effect], FloatArray, _Linear]:
-        now = list(effects)
-        linear = self._linear(now)
-        now, rest = self._spread(now, linear.coefficients)
-        damping = 1e-4
-        for _ in range(iterations):
-            where, columns = self._tangents(now)
-            free = np.ones(len(where), dtype=bool)
-            if not where:
-                break
-            step = np.zeros(len(where))
-            for _ in range(len(where) + 1):
-                step, promised = self._step(linear, columns, free, damping)
-                blocked = np.array(
-                    [self._leaves(now, at, move) for at, move in zip(where, step, strict=True)]
-                )
-                if not np.any(blocked & free):
-                    break
-                free &= ~blocked
-            if not np.any(free) or promised < CONVERGED:
-                break
-            better = False
-            for _ in range(8):
-                trial = self._moved(now, where, step)
-                attempt = self._linear(trial)
-                if attempt.chi_square < linear.chi_square:
-                    better = True
-                    break
-                damping = max(damping, 1e-4) * 10.0
-                step, _ = self._step(linear, columns, free, damping)
-            if not better:
-                break
-            damping /= 5.0
-            gained = linear.chi_square - attempt.chi_square
-            linear = attempt
-            now, rest = self._spread(trial, linear.coefficients)
-            if gained < CONVERGED:
-                break
-        return now, rest, linear
-
-    def _linear(self, effects: Sequence[Effect]) -> _Linear:
-        """Coefficients for given shapes."""
-        design = self.problem.design
-        parts = [design.columns(effects[index], self._exact) for index in self._shaped]
-        dynamic = np.concatenate(parts, axis=1) if parts else np.empty((len(design.blocks), 0))
-        weighted = self._precision.apply(dynamic) if parts else dynamic
-        cross = self._static.T @ weighted
-        gram = np.block([[self._gram, cross], [cross.T, dynamic.T @ weighted]])
-        right = np.concatenate([self._static_right, dynamic.T @ self._weighted_observed])
-        coefficients = solve_symmetric(gram, right)
-        return _Linear(coefficients, self._total - float(right @ coefficients), dynamic, gram)
-
-    def _residual(self, linear: _Linear) -> FloatArray:
-        split = self._static.shape[1]
-        fitted = self._static @ linear.coefficients[:split] + linear.dynamic @ linear.coefficients[split:]
-        return np.asarray(self.problem.observed - fitted)
-
-    def _spread(self, effects: Sequence[Effect], coefficients: FloatArray) -> tuple[list[Effect], FloatArray]:
-        """Hand the coefficients to their effects; what is left belongs to the further columns."""
-        result = list(effects)
-        at = 0
-        for index in self._straight:
-            size = len(effects[index].coefficients())
-            result[index] = effects[index].fitted(coefficients[at : at + size])
-            at += size
-        rest = coefficients[at : at + self.problem.nuisances.columns.shape[1]]
-        at += len(rest)
-        for index in self._shaped:
-            size = len(effects[index].coefficients())
-            result[index] = effects[index].fitted(coefficients[at : at + size])
-            at += size
-        return result, rest
-
-    def _tangents(self, effects: Sequence[Effect]) -> tuple[list[tuple[int, str]], FloatArray]:
-        where: list[tuple[int, str]] = []
-        parts = [np.empty((len(self.problem.design.blocks), 0))]
-        for index in self._shaped:
-            effect = effects[index]
-            names, columns = tangents(self.problem.design, effect, effect.coefficients(), self._exact)
-            where += [(index, name) for name in names]
-            parts.append(columns)
-        return where, np.concatenate(parts, axis=1)
-
-    def _step(
-        self, linear: _Linear, columns: FloatArray, free: BoolArray, damping: float
-    ) -> tuple[FloatArray, float]:
-        """Step of the shapes with everything linear refitted, and the fall in chi square that it promises."""
-        weighted = self._precision.apply(columns)
-        cross = np.concatenate([self._static.T @ weighted, linear.dynamic.T @ weighted])
-        inner = columns.T @ weighted - cross.T @ solve_symmetric(linear.information, cross)
-        # At the linear minimum the residual is orthogonal to all linear columns, prior included.
-        slope = weighted.T @ self._residual(linear)
-        step = np.zeros(len(free))
-        chosen = np.flatnonzero(free)
-        inner = inner[np.ix_(chosen, chosen)]
-        damped = inner + damping * np.diag(np.diag(inner)) + 1e-12 * np.eye(len(chosen))
-        step[chosen] = solve_symmetric(damped, slope[chosen])
-        return step, float(slope[chosen] @ step[chosen])
-
-    def _moved(self, effects: list[Effect], where: list[tuple[int, str]], step: FloatArray) -> list[Effect]:
-        result = list(effects)
-        for index in self._shaped:
-            steps = {
-                name: float(move) for (owner, name), move in zip(where, step, strict=True) if owner == index
-            }
-            result[index] = moved(effects[index], effects[index].coefficients(), steps)
-        return result
-
-    def _leaves(self, effects: list[Effect], at: tuple[int, str], move: float) -> bool:
-        """Whether a parameter stands on the edge of its range and the step points outwards."""
-        effect = effects[at[0]]
-        shape = next(each for each in effect.shape if each.name == at[1])
-        here = float(getattr(effect, at[1]))
-        return bool((here <= shape.lower and move < 0) or (here >= shape.upper and move > 0))
-
-    def _solution(self, effects: list[Effect], rest: FloatArray, linear: _Linear) -> Solution:
-        """Put the columns in the order: effects, further columns, shapes."""
-        where, shapes = self._tangents(effects)
-        straight = sum(len(effects[index].coefficients()) for index in self._straight)
-        extra = self.problem.nuisances.columns.shape[1]
-        offsets: dict[int, int] = {}
-        at = 0
-        for index in [*self._straight, -1, *self._shaped]:
-            offsets[index] = at
-            at += extra if index < 0 else len(effects[index].coefficients())
-        order: list[int] = []
-        columns: list[Column] = []
-        for index, effect in enumerate(effects):
-            for number in range(len(effect.coefficients())):
-                order.append(offsets[index] + number)
-                columns.append(Column(index, str(number)))
-        order += range(straight, straight + extra)
-        columns += [Column(-1, name) for name in self.problem.nuisances.names]
-        columns += [Column(index, name, shape=True) for index, name in where]
-        linear_columns = np.concatenate([self._static, linear.dynamic], axis=1)[:, order]
-        jacobian = np.concatenate([linear_columns, shapes], axis=1)
-        weighted = self._precision.apply(shapes)
-        cross = jacobian.T @ weighted
-        information = np.empty((jacobian.shape[1],) * 2)
-        information[: len(order), : len(order)] = linear.information[np.ix_(order, order)]
-        information[:, len(order) :] = cross
-        information[len(order) :, :] = cross.T
-        residual = self._residual(linear)
-        edge = [
-            (index, shape.name)
-            for index in self._shaped
-            for shape in effects[index].shape
-            if getattr(effects[index], shape.name) in {shape.lower, shape.upper}
+        Logarithmic shapes are differentiated by their logarithm.
+        """
+        where = [
+            (place, each)
+            for place, effect in enumerate(effects)
+            for each in effect.shape
+            if each.name not in self.terms.held
         ]
-        return Solution(
-            tuple(effects),
-            rest,
-            linear.chi_square,
-            tuple(columns),
-            jacobian,
-            information,
-            residual,
-            tuple(edge),
+        result = np.empty((len(self.terms.observed), len(where)))
+        for at, (place, shape) in enumerate(where):
+            result[:, at] = tangent(self.terms.columns, effects[place], shape, central)
+        return where, result
+
+    def _at(self, effects: Sequence[Effect]) -> _Point:
+        """Coefficients for given shapes."""
+        terms = self.terms
+        fixed = self._fixed_of(effects)
+        moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
+        matrix = np.empty((len(terms.observed), sum(len(effects[place].coefficients()) for place in moving)))
+        at = 0
+        for place in moving:
+            columns = terms.columns(effects[place])
+            matrix[:, at : at + columns.shape[1]] = columns
+            at += columns.shape[1]
+        split, size = len(fixed.gram), len(fixed.gram) + matrix.shape[1]
+        gram, right = np.empty((size, size)), np.empty(size)
+        gram[:split, :split], right[:split] = fixed.gram, fixed.right
+        if matrix.shape[1]:
+            gram[:split, split:] = fixed.weighted.T @ matrix
+            gram[split:, :split] = gram[:split, split:].T
+            gram[split:, split:] = matrix.T @ terms.weighting.apply(matrix)
+            right[split:] = matrix.T @ self._right
+        information, mean, sign = self._known(effects, fixed.places, moving)
+        gram[np.arange(size), np.arange(size)] += information
+        right = right + information * mean
+        inside = np.ones(size, dtype=np.bool_)
+        while True:
+            coefficients = np.zeros(size)
+            coefficients[inside] = solve_symmetric(gram[np.ix_(inside, inside)], right[inside])
+            below = inside & (sign * coefficients < 0.0)
+            if not np.any(below):
+                break
+            inside &= ~below
+        chi_square = self._total + float(information @ mean**2) - float(right @ coefficients)
+        result = list(effects)
+        at = len(terms.nuisances.names)
+        for place in (*fixed.places, *moving):
+            count = len(effects[place].coefficients())
+            result[place] = effects[place].fitted(coefficients[at : at + count])
+            at += count
+        return _Point(
+            tuple(effects), tuple(result), fixed, moving, matrix, gram, coefficients, inside, chi_square
         )
 
+    def _fixed_of(self, effects: Sequence[Effect]) -> _Fixed:
+        """Columns that can stay: of effects without free shape, as long as they are what they were."""
+        units = {
+            place: unit(effect)
+            for place, effect in enumerate(effects)
+            if all(each.name in self.terms.held for each in effect.shape)
+        }
+        old = self._fixed
+        if old is not None:
+            same = all(
+                place in units and units[place] == each
+                for place, each in zip(old.places, old.units, strict=True)
+            )
+            if same:
+                return old
+            # What was exchanged once is exchanged again at the next step.
+            known = set(old.units)
+            places = tuple(place for place, each in units.items() if each in known) or tuple(units)
+        else:
+            places = tuple(units)
+        parts = [self.terms.nuisances.columns, *(self.terms.columns(effects[place]) for place in places)]
+        matrix = np.concatenate(parts, axis=1)
+        weighted = self.terms.weighting.apply(matrix)
+        self._fixed = _Fixed(
+            places,
+            tuple(units[place] for place in places),
+            matrix,
+            weighted,
+            matrix.T @ weighted,
+            matrix.T @ self._right,
+        )
+        return self._fixed
 
-def joint_fit(
-    problem: Problem, precision: Precision, iterations: int = ITERATIONS, exact: bool = True
-) -> Solution:
-    """The minimum near where the effects stand."""
-    return JointFit(problem, precision, exact).refine(problem.effects, iterations)
+    def _known(
+        self, effects: Sequence[Effect], *places: tuple[int, ...]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Information and mean beforehand, and the sign, of each linear column."""
+        terms = self.terms
+        rows = [(each, 0.0, 0.0) for each in terms.nuisances.prior.tolist()]
+        for place in (each for group in places for each in group):
+            sign = terms.sign(effects[place])
+            for number in range(len(effects[place].coefficients())):
+                known = terms.prior.get((place, str(number)), Prior(0.0, 0.0))
+                rows.append((known.information, known.mean, sign))
+        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return table[:, 0], table[:, 1], table[:, 2]
 
+    def _system(
+        self, here: _Point, where: list[tuple[int, Shape]], tangents: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Matrix and slope of the shapes, with everything linear eliminated."""
+        if not where:
+            return np.empty((0, 0)), np.empty(0)
+        weighted = self.terms.weighting.apply(tangents)
+        cross = np.concatenate([here.fixed.matrix.T @ weighted, here.matrix.T @ weighted])[here.inside]
+        inner = tangents.T @ weighted
+        slope = tangents.T @ self._right - cross.T @ here.coefficients[here.inside]
+        for at, (place, shape) in enumerate(where):
+            known = self.terms.prior.get((place, shape.name))
+            if known:
+                value = shape_value(here.effects[place], shape.name)
+                inner[at, at] += known.information
+                slope[at] -= known.information * (
+                    (np.log(value) if shape.logarithmic else value) - known.mean
+                )
+        gram = here.gram[np.ix_(here.inside, here.inside)]
+        return inner - cross.T @ solve_symmetric(gram, cross), slope
 
-def search(problem: Problem, precision: Precision) -> tuple[float, tuple[Effect, ...]]:
-    """Chi square and effects at the best minimum that a grid over all shapes leads to; by blocks' middles."""
-    fit = JointFit(problem, precision, exact=False)
-    begins = [list(problem.effects)]
-    for index, effect in enumerate(problem.effects):
-        if effect.shape:
-            minima = fit.grid(index, begins[0])[:BEGINS]
-            if minima:
-                begins = [[*begins[0][:index], found, *begins[0][index + 1 :]] for _, found in minima]
-    chi_square, effects = min((fit.descend(each) for each in begins), key=lambda each: each[0])
-    return chi_square, tuple(effects)
+    def _step(
+        self,
+        here: _Point,
+        where: list[tuple[int, Shape]],
+        system: tuple[FloatArray, FloatArray],
+        damping: float,
+    ) -> tuple[FloatArray, float]:
+        """Step of the shapes, none of which leaves its range, and the fall in chi square that it promises."""
+        inner, slope = system
+        free = np.ones(len(where), dtype=np.bool_)
+        step = np.zeros(len(where))
+        while np.any(free):
+            step[:] = 0.0
+            part = inner[np.ix_(free, free)]
+            damped = part + damping * np.diag(np.diag(part)) + 1e-12 * np.eye(len(part))
+            step[free] = solve_symmetric(damped, slope[free])
+            blocked = np.array(
+                [
+                    leaves(here.effects[place], shape, move)
+                    for (place, shape), move in zip(where, step.tolist(), strict=True)
+                ]
+            )
+            if not np.any(blocked & free):
+                break
+            free &= ~blocked
+        step[~free] = 0.0
+        return step, float(slope @ step)
 
+    def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
+        """Whether what effects carry of each other is what they were fitted with."""
+        return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
-def is_valid(effect: Effect) -> bool:
-    """Whether the fitted parameters are ones that the effect can have."""
-    try:
-        type(effect).model_validate(effect.parameters())
-    except ValidationError:
-        return False
-    return True
+    def order(self, point: _Point) -> NDArray[np.intp]:
+        """Where the nuisances and the effects' coefficients, in their order, stand among the columns."""
+        at = len(self.terms.nuisances.names)
+        places: dict[int, range] = {}
+        for place in (*point.fixed.places, *point.moving):
+            count = len(point.effects[place].coefficients())
+            places[place] = range(at, at + count)
+            at += count
+        rest = [each for place in range(len(point.effects)) for each in places[place]]
+        return np.array([*range(len(self.terms.nuisances.names)), *rest], dtype=np.intp)
+
+    def _solution(self, here: _Point) -> Solution:
+        columns = [Column(-1, name) for name in self.terms.nuisances.names]
+        edge = []
+        for place, effect in enumerate(here.effects):
+            columns += [Column(place, str(number)) for number in range(len(effect.coefficients()))]
+        for place, effect in enumerate(here.effects):
+            for each in effect.shape:
+                if each.name not in self.terms.held:
+                    columns.append(Column(place, each.name, True, each.logarithmic))
+                    if shape_value(effect, each.name) in {each.lower, each.upper}:
+                        edge.append((place, each.name))
+        split = here.fixed.matrix.shape[1]
+        told = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
+        return Solution(
+            here.effects,
+            here.coefficients[: len(self.terms.nuisances.names)],
+            here.chi_square,
+            tuple(columns),
+            np.asarray(self.terms.observed - told),
+            tuple(edge),
+            self,
+            here,
+        )

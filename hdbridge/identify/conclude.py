@@ -12,7 +12,8 @@ from hdbridge.estimation.design import Design
 from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.estimation.samples import KINDS, Samples
-from hdbridge.estimation.separable import Solution, is_valid
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.shapes import is_valid
 from hdbridge.identify.figures import laps_arcsec, standing
 from hdbridge.identify.holdout import held_out
 from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths

@@ -26,12 +26,14 @@ from hdbridge.estimation.nuisances import (
 )
 from hdbridge.estimation.samples import Samples, gather
 from hdbridge.estimation.segment import Segment
-from hdbridge.estimation.separable import Problem, Solution, is_valid, joint_fit, search
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.shapes import is_valid
 from hdbridge.identify.conclude import conclude
 from hdbridge.identify.figures import outlying
 from hdbridge.identify.intervals import covariance, effect_intervals
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Selection
+from hdbridge.identify.problem import LINEAR_ONLY, Problem
 from hdbridge.identify.result import FitResult, Outliers
 from hdbridge.identify.state import State, System, candidate_orders, turns_covered
 from hdbridge.units import ARCSEC_PER_DEG
@@ -141,7 +143,7 @@ def _search(state: State, warnings: list[str]) -> State:
 
     def found(design: Design, effects: tuple[Effect, ...]) -> tuple[float, tuple[Effect, ...]]:
         problem = Problem(design, effects, columns.rows(picked))
-        return search(problem, Precision(state.noise, design.blocks))
+        return problem.searched(Precision(state.noise, design.blocks))
 
     cost, effects = found(thin, state.effects)
     starts = list(state.design.starts)
@@ -160,7 +162,7 @@ def _search(state: State, warnings: list[str]) -> State:
     design = state.design.beginning(starts).blurred(effects)
     state = state._replace(design=design, effects=effects)
     problem = Problem(design, effects, columns)
-    solution = joint_fit(problem, state.precision(), 0, exact=False)
+    solution = problem.fitted(state.precision(), LINEAR_ONLY, exact=False)
     return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
 
 
@@ -168,7 +170,7 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
     """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
     selection = state.selected(options)
     problem = state.problem(selection)
-    solution = joint_fit(problem, state.precision(), exact=False)
+    solution = problem.fitted(state.precision(), exact=False)
     samples = state.design.samples
     weight, outliers = outlying(
         problem.design.residual(solution.effects, problem.nuisances.columns @ solution.nuisances),
@@ -179,7 +181,7 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
         state = state.after(solution).remade(samples.delayed(delay_ms / 1000.0), weight, delay_ms)
     for turn in range(ROUNDS):
         state = state.after(solution)
-        solution = joint_fit(state.problem(selection), state.precision())
+        solution = state.problem(selection).fitted(state.precision())
         noise = fit_noise(solution.residual, state.design.blocks, solution.jacobian.shape[1], state.noise)
         state = state.after(solution)._replace(noise=noise)
         system = state.information()
@@ -188,17 +190,17 @@ def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selecti
             break
         selection = again
     problem = state.problem(selection)
-    solution = joint_fit(problem, state.precision())
+    solution = problem.fitted(state.precision())
     if dict(zip(problem.nuisances.names, solution.nuisances.tolist(), strict=True)).get(SWING, 0.0) < 0.0:
         # No load is held back below its natural frequency: something else differs from speed to speed.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
-        solution = joint_fit(state.problem(selection), state.precision())
+        solution = state.problem(selection).fitted(state.precision())
         system = state.information()
     state = state.after(solution)
     problem = state.problem(selection)
     if len(problem.nuisances.names) != len(solution.nuisances):
         # The first orders came in last, and what swings with them, or turns that now matter.
-        solution = joint_fit(problem, state.precision())
+        solution = problem.fitted(state.precision())
         system = state.information()
     return state, solution, selection, system, outliers
 
@@ -231,7 +233,7 @@ def _hold_what_is_unknown(
             )
     if held:
         problem = replace(state.problem(selection), effects=tuple(effects))
-        solution = joint_fit(problem, state.precision(), iterations=0)
+        solution = problem.fitted(state.precision(), LINEAR_ONLY)
         cov = covariance(solution, state.precision(), blocks)
     return solution, cov
 

@@ -15,11 +15,16 @@ from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.samples import KINDS, BoolArray, IntArray
 from hdbridge.estimation.segment import Kind
-from hdbridge.estimation.separable import JointFit, Problem, Solution, is_valid
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.shapes import is_valid
+from hdbridge.estimation.terms import Effort
+from hdbridge.identify.problem import Problem
 from hdbridge.identify.result import HeldOut
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
+BRIEF = Effort(steps=5)
+"""From the whole record's minimum it is not far to that of most of it."""
 RECORDINGS = "recordings"
 CELL_DEG = 30.0
 SAME_WAY = 0.8
@@ -53,7 +58,7 @@ def held_out(
         precision = Precision(noise, blocks, out)
         if np.count_nonzero(~out) < 2 * solution.jacobian.shape[1]:
             continue
-        fit = JointFit(problem, precision, exact=False).refine(solution.effects, iterations=4)
+        fit = problem.under(precision, exact=False).fit(solution.effects, BRIEF)
         # The active model has no nuisances of its own: it is given those that suit it best.
         rest = _least_squares(shift, problem.observed - active_arcsec, precision)
         either = (problem.observed - active_arcsec - shift @ rest, fit.residual)

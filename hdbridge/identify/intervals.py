@@ -19,11 +19,13 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Synchronous
 from hdbridge.estimation.blocks import Blocks
-from hdbridge.estimation.design import clusters, moved
+from hdbridge.estimation.design import clusters
 from hdbridge.estimation.linear import inverse_symmetric
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_turn
-from hdbridge.estimation.separable import Column, Solution
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.shapes import shape_value
+from hdbridge.estimation.terms import Column
 
 NORMAL_95 = 1.959964
 STRETCHES = 100
@@ -181,9 +183,6 @@ def difference(name: str, low: float, high: float) -> float:
 def _free_move(effect: Effect, name: str, step: float) -> Effect:
     """Move one shape parameter without regard to its range (only to differentiate)."""
     shape = next(each for each in effect.shape if each.name == name)
-    here = float(getattr(effect, name))
-    inside = moved(effect, effect.coefficients(), {name: step})
-    if float(getattr(inside, name)) in {shape.lower, shape.upper}:
-        there = here * float(np.exp(step)) if shape.logarithmic else here + step
-        return effect.model_copy(update={name: there})
-    return inside
+    here = shape_value(effect, name)
+    there = here * float(np.exp(step)) if shape.logarithmic else here + step
+    return effect.fitted(effect.coefficients(), {name: there})

@@ -8,13 +8,16 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, MotorOrder, Synchronous
 from hdbridge.estimation.blocks import make_blocks
-from hdbridge.estimation.design import Design, harmonics, tangents
+from hdbridge.estimation.design import Design, harmonics
 from hdbridge.estimation.noise import NoiseModel, Precision
-from hdbridge.estimation.nuisances import Nuisances, nuisances_of
+from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
-from hdbridge.estimation.separable import Problem, Solution, is_valid
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.shapes import is_valid, tangent
+from hdbridge.estimation.terms import Nuisances
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, select
+from hdbridge.identify.problem import Problem
 from hdbridge.units import DEG_PER_TURN
 
 WHOLE_TURN = 0.95
@@ -74,8 +77,11 @@ class State(NamedTuple):
         extra = self.nuisance_columns()
         parts = [self.waves, extra.columns]
         for effect in self.effects:
-            parts.append(self.design.columns(effect, exact=False))
-            parts.append(tangents(self.design, effect, effect.coefficients(), exact=False)[1])
+            parts.append(self.design.roughly(effect))
+            parts += [
+                tangent(self.design.roughly, effect, each, central=True)[:, np.newaxis]
+                for each in effect.shape
+            ]
         columns = np.concatenate(parts, axis=1)
         weighted = self.precision().apply(columns)
         gram = columns.T @ weighted

@@ -1,0 +1,91 @@
+"""Shapes, the parameters that an effect is not linear in: their values, their steps, their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import ValidationError
+
+from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects.base import Shape
+from hdbridge.estimation.terms import Columns
+
+LOGARITHM = 0.7
+RANGE = 0.15
+"""A step goes no further than this: in the logarithm of a shape, or in shares of its range."""
+DIFFERENCE = 1e-3
+"""Step of a derivative: of the logarithm of a shape, or of its range."""
+LINEAR = 0.3
+"""A step that changes more than this share of what the effect does is too long to differentiate with."""
+
+
+def unit(effect: Effect) -> Effect:
+    """What the columns of an effect depend on: all but its coefficients, where it is linear in them."""
+    return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
+
+
+def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = False) -> FloatArray:
+    """Derivative of what an effect does by one of its shapes, shape (m,); one-sided at a bound."""
+    coefficients = effect.coefficients()
+    here = shape_value(effect, shape.name)
+    told = columns(effect) @ coefficients
+    size = float(told @ told)
+    length = DIFFERENCE
+
+    def change(sign: float) -> tuple[FloatArray, float]:
+        there = (
+            here * np.exp(sign * length)
+            if shape.logarithmic
+            else here + sign * length * (shape.upper - shape.lower)
+        )
+        there = float(np.clip(there, shape.lower, shape.upper))
+        moved_by = np.log(there / here) if shape.logarithmic else there - here
+        if not moved_by:
+            return np.zeros(len(told)), 0.0
+        return columns(effect.fitted(coefficients, {shape.name: there})) @ coefficients - told, moved_by
+
+    up, rise = change(1.0)
+    while rise and float(up @ up) > LINEAR**2 * size and length > 1e-9:
+        length *= 0.1
+        up, rise = change(1.0)
+    down, fall = change(-1.0) if central or not rise else (np.zeros(len(told)), 0.0)
+    return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(told))
+
+
+def moved(
+    effects: Sequence[Effect], where: Sequence[tuple[int, Shape]], step: FloatArray
+) -> tuple[Effect, ...]:
+    """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""
+    result = list(effects)
+    for (place, shape), move in zip(where, step.tolist(), strict=True):
+        here = shape_value(result[place], shape.name)
+        if shape.logarithmic:
+            there = here * float(np.exp(np.clip(move, -LOGARITHM, LOGARITHM)))
+        else:
+            reach = RANGE * (shape.upper - shape.lower)
+            there = here + min(max(move, -reach), reach)
+        there = min(max(there, shape.lower), shape.upper)
+        result[place] = result[place].fitted(result[place].coefficients(), {shape.name: there})
+    return tuple(result)
+
+
+def shape_value(effect: Effect, name: str) -> float:
+    """A shape parameter; where it is not a field, that of the first of its parts."""
+    holder = effect if hasattr(effect, name) else effect.parts[0]  # type: ignore[attr-defined]
+    return float(getattr(holder, name))
+
+
+def is_valid(effect: Effect) -> bool:
+    """Whether the fitted parameters are ones that the effect can have."""
+    try:
+        type(effect).model_validate(effect.parameters())
+    except ValidationError:
+        return False
+    return True
+
+
+def leaves(effect: Effect, shape: Shape, move: float) -> bool:
+    """Whether a shape stands on the edge of its range and the step points outwards."""
+    here = shape_value(effect, shape.name)
+    return bool((here <= shape.lower and move < 0) or (here >= shape.upper and move > 0))

@@ -1,0 +1,108 @@
+"""What a fit is given: observations, columns, their weighting, what is known beforehand, its effort."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects import Effect, FloatArray
+
+Columns = Callable[[Effect], FloatArray]
+IntArray = NDArray[np.intp]
+
+
+class Weighting(Protocol):
+    """The inverse covariance of the noise, K^-1."""
+
+    def apply(self, columns: FloatArray) -> FloatArray:
+        """K^-1 times columns of shape (m,) or (m, p)."""
+        ...
+
+
+class Prior(NamedTuple):
+    """What is known of a coefficient or shape beforehand (of a logarithmic shape: of its logarithm)."""
+
+    mean: float
+    information: float
+    """One over the variance."""
+
+
+class Column(NamedTuple):
+    """What a column of the fit stands for."""
+
+    effect: int
+    """Place of the effect, or -1 for a column that is no effect's."""
+    name: str
+    """Number of the coefficient, name of the shape parameter, or of the other column."""
+    shape: bool = False
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How far a fit goes."""
+
+    steps: int = 25
+    converged: float = 1e-4
+    """A step that promises, or gains, less than this in chi square is the last."""
+    roughly: float = 0.0
+    """... or less than this share of chi square: where much is left, exactness is of no use."""
+
+    def enough(self, chi_square: float) -> float:
+        """Gain in chi square below which the fit stands."""
+        return max(self.converged, self.roughly * chi_square)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nuisances:
+    """Columns that are no effect's."""
+
+    columns: FloatArray
+    """Shape (b, q)."""
+    names: tuple[str, ...]
+    prior: FloatArray
+    """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
+
+    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Nuisances:
+        """With further columns of which nothing is known."""
+        return Nuisances(
+            np.concatenate([self.columns, columns], axis=1),
+            (*self.names, *names),
+            np.concatenate([self.prior, np.zeros(columns.shape[1])]),
+        )
+
+    def without(self, left_out: Callable[[str], bool]) -> Nuisances:
+        """Without the columns whose names answer."""
+        keep = np.array([not left_out(each) for each in self.names])
+        names = tuple(each for each in self.names if not left_out(each))
+        return Nuisances(self.columns[:, keep], names, self.prior[keep])
+
+    def rows(self, index: IntArray) -> Nuisances:
+        """For some of the blocks."""
+        return Nuisances(self.columns[index], self.names, self.prior)
+
+
+def _either(_: Effect) -> float:
+    return 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terms:
+    """What is fitted to what; arrays of m rows."""
+
+    observed: FloatArray
+    """Arcsec, shape (m,)."""
+    columns: Columns
+    """Of an effect, (m, p): whatever its coefficients are."""
+    weighting: Weighting
+    nuisances: Nuisances
+    prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
+    """By place of the effect, and number of the coefficient or name of the shape."""
+    sign: Callable[[Effect], float] = _either
+    """The sign that an effect's coefficients have; 0 where they may have either."""
+    held: Container[str] = ()
+    """Shapes that stay as they are."""
