@@ -17,6 +17,7 @@ from hdbridge.effects import CountLoss, Effect, FloatArray, LocalDefect, Step, S
 from hdbridge.effects.orders import orders_from
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.screening import Candidate
+from hdbridge.observations.reading import median_deviation
 from hdbridge.units import DEG_PER_TURN
 
 BINS = 1 << 17
@@ -121,7 +122,7 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
     # What is slow is none of the business of those who ask for this, and would leak into their peaks.
     window = 9
     smooth = np.convolve(residual, np.ones(window) / window, mode="same")
-    spread = 6.0 * float(np.median(np.abs(residual - smooth))) * 1.4826 + 1e-9
+    spread = 6.0 * median_deviation(residual - smooth) + 1e-9
     load = full.motion.motor_deg / estimator.data.ratio + predicted / 3600.0
     return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
 

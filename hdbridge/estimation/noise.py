@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.samples import BoolArray, IntArray
+from hdbridge.observations.reading import median_deviation
 
 PIECES = 16
 PIECE_BLOCKS = 250
@@ -224,9 +225,9 @@ def first_guess(residual: FloatArray, blocks: Blocks) -> NoiseModel:
         picked = scaled[neighbours & which[1:] & which[:-1]]
         if len(picked) < 10:
             picked = scaled[neighbours]
-        return float(1.4826 * np.median(np.abs(picked))) if len(picked) else 1.0
+        return median_deviation(picked) if len(picked) else 1.0
 
-    rest = max(float(np.median(np.abs(residual)) * 1.4826), SMALLEST_ARCSEC) * np.sqrt(0.5)
+    rest = max(median_deviation(residual), SMALLEST_ARCSEC) * np.sqrt(0.5)
     return NoiseModel(
         max(white(~blocks.moving), SMALLEST_ARCSEC),
         max(white(blocks.moving), SMALLEST_ARCSEC),

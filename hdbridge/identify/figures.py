@@ -13,6 +13,7 @@ from hdbridge.estimation.blocks import REST_DEG_S
 from hdbridge.estimation.samples import KINDS, SLOW, Samples
 from hdbridge.estimation.segment import Kind
 from hdbridge.identify.result import Outliers, Standing
+from hdbridge.observations.reading import median_deviation
 from hdbridge.units import ARCSEC_PER_DEG
 
 SHORTEST_REST_S = 1.0
@@ -99,7 +100,7 @@ def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArra
         return weight, Outliers(0, 0)
     values = residual[index]
     off = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
-    scale = max(1.4826 * float(np.median(off)), 0.1)
+    scale = max(median_deviation(off), 0.1)
     out = off > OUTLYING * scale + count_arcsec
     weight[index[out]] = 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))

@@ -80,9 +80,16 @@ def jitter_deg(angle_deg: FloatArray) -> float:
     return float(np.sqrt(np.mean(kept**2)) / _THIRD)
 
 
+def median_deviation(off: FloatArray) -> float:
+    """Standard deviation of Gaussian values about zero by the median of their sizes: a few wild ones do not
+    matter.
+    """
+    return float(_MAD * np.median(np.abs(off)))
+
+
 def third_deviation(third: FloatArray) -> float:
-    """Standard deviation of white noise from its third differences, by their median."""
-    return float(_MAD * np.median(np.abs(third)) / _THIRD)
+    """Standard deviation of white noise from its third differences."""
+    return float(median_deviation(third) / _THIRD)
 
 
 def quantum_deg(angle_deg: FloatArray) -> float:
