@@ -15,12 +15,11 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG, OrderSeries
-from hdbridge.estimation.hypothesis import FIXED_SHAPES, Estimator, Fitted
+from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.terms import FOUND
 
 SPEEDS_DIFFER: Final = 0.1
 """Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
-FOUND: Final = frozenset({"frequency_hz"})
-"""Shapes that a search finds among all their values, and that can be moved on from there."""
 _RATE: Final = 30.0
 """Radians per second, of size one in the columns."""
 
@@ -35,9 +34,9 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
     try:
         estimator.nuisance = shaken
         plain = estimator.fit(fitted.hypothesis)
-        found = estimator.fit(plain.hypothesis, held=FIXED_SHAPES - FOUND)
+        found = estimator.fit(plain.hypothesis, moves=FOUND)
         if any(each.violations() for each in found.hypothesis.effects):
-            return estimator.fit(plain.hypothesis, 1, FIXED_SHAPES - FOUND)
+            return estimator.fit(plain.hypothesis, 1, FOUND)
         return found
     finally:
         estimator.nuisance = searched

@@ -18,8 +18,8 @@ from hdbridge.effects import (
     FloatArray,
     Motion,
     Start,
-    VelocityWindup,
 )
+from hdbridge.effects.described import Moves, Part
 from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder, OrderSeries
@@ -29,7 +29,7 @@ from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import IntArray, Observed, Series
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
-from hdbridge.estimation.terms import Column, Effort, Nuisances, Prior, Terms
+from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms
 
 STEPS = 8
 CONVERGED = 0.5
@@ -39,13 +39,7 @@ ROUGHLY = 2e-5
 KEPT_FITS = 8
 KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large."""
-FIXED_SHAPES = frozenset({"time_s", "frequency_hz"})
-"""Shapes that a local step cannot improve: found by search over all their values."""
 LOOPS = (Hysteresis, HysteresisMemory)
-ONE_SIDED = (VelocityWindup,)
-"""Effects of which no coefficient is negative. One that is not there would come out on either side of zero
-by chance, and half of the time the effect would be refused for it: it is held at zero instead. A loop has the
-sign of `Estimator.loop_sign`, for the same reason."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -88,6 +82,16 @@ class Fitted:
     def tangent(self) -> FloatArray:
         """Weighted derivatives, shape (m, p)."""
         return self._solution.jacobian * self._weight[:, np.newaxis]
+
+    @property
+    def information(self) -> FloatArray:
+        """What was known of each column beforehand: one over its variance, shape (p,)."""
+        return self._solution.known[:, 0]
+
+    @property
+    def pull(self) -> FloatArray:
+        """That times how far its mean is from where the column stands, shape (p,)."""
+        return self._solution.known[:, 1]
 
     @cached_property
     def basis(self) -> FloatArray:
@@ -191,28 +195,41 @@ class Estimator:
         angle = self.data.full.motion.motor_deg
         return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
 
-    def fit(self, hypothesis: Hypothesis, steps: int = STEPS, held: frozenset[str] = FIXED_SHAPES) -> Fitted:
-        """The minimum near where the hypothesis stands, and never worse; shapes in ``held`` stay."""
+    def fit(self, hypothesis: Hypothesis, steps: int = STEPS, moves: frozenset[Moves] = LOCAL) -> Fitted:
+        """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says."""
         counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
-            hypothesis, steps, held, self.nuisance.shape[1],
+            hypothesis, steps, moves, self.nuisance.shape[1],
             self.load_angles if counted else 0, self.loop_sign, self.prior,
         )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
+        fitted = self._solved(hypothesis, Effort(steps, CONVERGED, ROUGHLY), moves, self.prior(hypothesis))
+        self._fits[key] = fitted
+        if len(self._fits) > KEPT_FITS:
+            self._fits.popitem(last=False)
+        return fitted
+
+    def _solved(
+        self,
+        hypothesis: Hypothesis,
+        effort: Effort,
+        moves: frozenset[Moves],
+        prior: Mapping[tuple[int, str], Prior],
+    ) -> Fitted:
         start = hypothesis.start
         terms = Terms(
             self.observed - self.level,
             lambda effect: self.columns(effect, start),
             White(self.weight),
             self.nuisances(),
-            self.prior(hypothesis),
+            prior,
             self._sign,
-            held,
+            moves,
         )
-        found = Separable(terms).fit(hypothesis.effects, Effort(steps, CONVERGED, ROUGHLY))
-        fitted = Fitted(
+        found = Separable(terms).fit(hypothesis.effects, effort)
+        return Fitted(
             replace(hypothesis, effects=found.effects),
             found.nuisances[: self.data.zeros],
             found.residual * self.weight,
@@ -221,10 +238,6 @@ class Estimator:
             found,
             self.weight,
         )
-        self._fits[key] = fitted
-        if len(self._fits) > KEPT_FITS:
-            self._fits.popitem(last=False)
-        return fitted
 
     def nuisances(self) -> Nuisances:
         """A zero for each absolute zero, and what else every fit may use."""
@@ -235,9 +248,9 @@ class Estimator:
 
     def _sign(self, effect: Effect) -> float:
         """The sign that an effect's coefficients have; 0 where they may have either."""
-        if isinstance(effect, LOOPS):
+        if effect.part is Part.LOOP:
             return self.loop_sign
-        return 1.0 if isinstance(effect, ONE_SIDED) else 0.0
+        return 1.0 if effect.nonnegative else 0.0
 
     def predicted(self, fitted: Fitted) -> FloatArray:
         """What the hypothesis says for each sample, zeros included, arcsec, shape (n,)."""

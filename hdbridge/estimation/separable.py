@@ -13,10 +13,10 @@ what is left is no function of the shapes alone, and what it carries is exchange
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from hdbridge.effects import Effect, FloatArray, refreshed
 from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.shapes import is_valid, leaves, moved, shape_value, tangent, unit
+from hdbridge.estimation.shapes import free_shapes, leaves, moved, shape_value, tangent, unit
 from hdbridge.estimation.terms import Column, Effort, Prior, Terms
 
 BoolArray = NDArray[np.bool_]
-GRID_LOGARITHMIC = 12
-GRID_LINEAR = 7
 DAMPING = 1e-4
 TRIES = 6
 """So often a step that does not help is shortened."""
+EXCHANGES = 3
+"""So often what effects carry of each other is exchanged though that makes the fit worse at first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,9 +110,26 @@ class Solution:
         result[:size, :size] = self._point.gram[np.ix_(self._order, self._order)] * np.outer(kept, kept)
         result[:, size:] = cross
         result[size:, :] = cross.T
-        for at, each in enumerate(self.columns[size:], size):
-            known = self._fit.terms.prior.get((each.effect, each.name))
-            result[at, at] += known.information if known else 0.0
+        result[np.arange(size, len(result)), np.arange(size, len(result))] += self.known[size:, 0]
+        return result
+
+    @cached_property
+    def known(self) -> FloatArray:
+        """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
+        prior = self._fit.terms.prior
+        result = np.zeros((len(self.columns), 2))
+        result[: len(self.nuisances), 0] = self._fit.terms.nuisances.prior
+        result[: len(self.nuisances), 1] = -self._fit.terms.nuisances.prior * self.nuisances
+        for at, each in enumerate(self.columns):
+            known = prior.get((each.effect, each.name)) if each.effect >= 0 else None
+            if known is not None:
+                effect = self.effects[each.effect]
+                if each.shape:
+                    value = shape_value(effect, each.name)
+                    value = math.log(value) if each.logarithmic else value
+                else:
+                    value = float(effect.coefficients()[int(each.name)])
+                result[at] = known.information, known.information * (known.mean - value)
         return result
 
     @property
@@ -139,8 +156,8 @@ class Separable:
     def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
         """The minimum near where the effects stand; never worse than there."""
         effort = effort or Effort()
-        here = self._at(refreshed(effects))
-        damping = DAMPING
+        here = best = self._at(refreshed(effects))
+        damping, exchanged = DAMPING, 0
         for _ in range(effort.steps - 1):
             enough = effort.enough(here.chi_square)
             where, tangents = self.tangents(here.effects)
@@ -149,52 +166,28 @@ class Separable:
             small = promised < enough
             if small and self._stands(here, refreshed(here.effects)):
                 break
-            there = None
             for _ in range(TRIES):
-                trial = refreshed(moved(here.effects, where, step))
-                attempt = self._at(trial)
-                if attempt.chi_square < here.chi_square:
-                    there = attempt
-                    break
-                if small or not np.any(step):
+                there = self._at(refreshed(moved(here.effects, where, step)))
+                better = there.chi_square < here.chi_square
+                if better or small or not np.any(step):
                     break
                 damping = max(damping, 1e-3) * 10.0
                 step, _ = self._step(here, where, system, damping)
-            if there is None:
-                break
-            damping /= 5.0
             gained = here.chi_square - there.chi_square
+            if not better:
+                # Only what is carried has changed: to exchange it may lead downhill at the second step.
+                exchanged += 1
+                if not small or exchanged > EXCHANGES:
+                    break
+                here = there
+                continue
+            damping /= 5.0
             here = there
-            if gained < enough:
+            if here.chi_square < best.chi_square:
+                best = here
+            if 0.0 <= gained < enough:
                 break
-        return self._solution(here)
-
-    def grid(self, index: int, effects: Sequence[Effect]) -> list[tuple[float, Effect]]:
-        """Local minima of chi square over a grid of one effect's shapes, best first; others as they are."""
-        effect = effects[index]
-        axes = [
-            np.geomspace(each.lower, each.upper, GRID_LOGARITHMIC)
-            if each.logarithmic
-            else np.linspace(each.lower, each.upper, GRID_LINEAR)
-            for each in effect.shape
-        ]
-        costs = np.full(tuple(len(each) for each in axes), np.inf)
-        tried: dict[tuple[int, ...], Effect] = {}
-        for place in product(*(range(size) for size in costs.shape)):
-            shape = {
-                each.name: float(axis[at]) for each, axis, at in zip(effect.shape, axes, place, strict=True)
-            }
-            candidate = effect.fitted(effect.coefficients(), shape)
-            point = self._at((*effects[:index], candidate, *effects[index + 1 :]))
-            tried[place] = point.effects[index]
-            if is_valid(tried[place]):
-                costs[place] = point.chi_square
-        minima = []
-        for place, candidate in tried.items():
-            around = tuple(slice(max(at - 1, 0), at + 2) for at in place)
-            if np.isfinite(costs[place]) and costs[place] <= np.min(costs[around]):
-                minima.append((float(costs[place]), candidate))
-        return sorted(minima, key=lambda each: each[0])
+        return self._solution(best)
 
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
@@ -206,8 +199,7 @@ class Separable:
         where = [
             (place, each)
             for place, effect in enumerate(effects)
-            for each in effect.shape
-            if each.name not in self.terms.held
+            for each in free_shapes(effect, self.terms.moves)
         ]
         result = np.empty((len(self.terms.observed), len(where)))
         for at, (place, shape) in enumerate(where):
@@ -244,7 +236,10 @@ class Separable:
             if not np.any(below):
                 break
             inside &= ~below
-        chi_square = self._total + float(information @ mean**2) - float(right @ coefficients)
+        # Not by the normal equations, which a ridge satisfies only nearly.
+        chi_square = self._total + float(information @ mean**2)
+        chi_square += float(coefficients @ (gram @ coefficients) - 2.0 * (right @ coefficients))
+        chi_square += self._of_shapes(effects)
         result = list(effects)
         at = len(terms.nuisances.names)
         for place in (*fixed.places, *moving):
@@ -260,7 +255,7 @@ class Separable:
         units = {
             place: unit(effect)
             for place, effect in enumerate(effects)
-            if all(each.name in self.terms.held for each in effect.shape)
+            if not free_shapes(effect, self.terms.moves)
         }
         old = self._fixed
         if old is not None:
@@ -302,6 +297,18 @@ class Separable:
         table = np.array(rows, dtype=np.float64).reshape(-1, 3)
         return table[:, 0], table[:, 1], table[:, 2]
 
+    def _of_shapes(self, effects: Sequence[Effect]) -> float:
+        """What the shapes cost for being other than was known beforehand."""
+        total = 0.0
+        for (place, name), known in self.terms.prior.items():
+            shape = next((each for each in effects[place].shape if each.name == name), None)
+            if shape is not None:
+                value = shape_value(effects[place], name)
+                total += (
+                    known.information * ((math.log(value) if shape.logarithmic else value) - known.mean) ** 2
+                )
+        return total
+
     def _system(
         self, here: _Point, where: list[tuple[int, Shape]], tangents: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -316,10 +323,9 @@ class Separable:
             known = self.terms.prior.get((place, shape.name))
             if known:
                 value = shape_value(here.effects[place], shape.name)
+                value = math.log(value) if shape.logarithmic else value
                 inner[at, at] += known.information
-                slope[at] -= known.information * (
-                    (np.log(value) if shape.logarithmic else value) - known.mean
-                )
+                slope[at] += known.information * (known.mean - value)
         gram = here.gram[np.ix_(here.inside, here.inside)]
         return inner - cross.T @ solve_symmetric(gram, cross), slope
 
@@ -372,11 +378,10 @@ class Separable:
         for place, effect in enumerate(here.effects):
             columns += [Column(place, str(number)) for number in range(len(effect.coefficients()))]
         for place, effect in enumerate(here.effects):
-            for each in effect.shape:
-                if each.name not in self.terms.held:
-                    columns.append(Column(place, each.name, True, each.logarithmic))
-                    if shape_value(effect, each.name) in {each.lower, each.upper}:
-                        edge.append((place, each.name))
+            for each in free_shapes(effect, self.terms.moves):
+                columns.append(Column(place, each.name, True, each.logarithmic))
+                if shape_value(effect, each.name) in {each.lower, each.upper}:
+                    edge.append((place, each.name))
         split = here.fixed.matrix.shape[1]
         told = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
         return Solution(

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.effects.base import Shape
+from hdbridge.effects.described import Moves
 from hdbridge.estimation.terms import Columns
 
 LOGARITHM = 0.7
@@ -68,6 +69,15 @@ def moved(
         there = min(max(there, shape.lower), shape.upper)
         result[place] = result[place].fitted(result[place].coefficients(), {shape.name: there})
     return tuple(result)
+
+
+def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
+    """The shapes that may be moved; one that stands outside its range is of no account, and stays."""
+    return [
+        each
+        for each in effect.shape
+        if each.moves in moves and each.lower <= shape_value(effect, each.name) <= each.upper
+    ]
 
 
 def shape_value(effect: Effect, name: str) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -10,6 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects.described import Moves
+
+LOCAL = frozenset({Moves.ANYWHERE})
+"""Shapes that a local step improves from anywhere."""
+FOUND = LOCAL | {Moves.NEARBY}
+"""... and those that a search has brought next to their best value."""
 
 Columns = Callable[[Effect], FloatArray]
 IntArray = NDArray[np.intp]
@@ -28,7 +34,7 @@ class Prior(NamedTuple):
 
     mean: float
     information: float
-    """One over the variance."""
+    """One over the variance; less than nothing takes back what columns that are noisy themselves claim."""
 
 
 class Column(NamedTuple):
@@ -104,5 +110,5 @@ class Terms:
     """By place of the effect, and number of the coefficient or name of the shape."""
     sign: Callable[[Effect], float] = _either
     """The sign that an effect's coefficients have; 0 where they may have either."""
-    held: Container[str] = ()
-    """Shapes that stay as they are."""
+    moves: frozenset[Moves] = LOCAL
+    """Shapes that are moved; the others stay as they are."""
