@@ -53,6 +53,8 @@ class Faults:
     """Transition 16 at once, by a controlword that only repeats 'enable operation'."""
     deceleration_counts_s2: float | None = None
     """How it brakes, whatever its objects say."""
+    concerns_poll: bool = False
+    """For the node: whether something is to be done at this poll."""
     _held: list[Outgoing] = field(default_factory=list)
     _errors: list[tuple[int, bytes]] = field(default_factory=list)
     _lost_masters: list[int] = field(default_factory=list)
@@ -63,22 +65,27 @@ class Faults:
     def raise_error(self, code: int, additional: bytes = b"") -> None:
         """At the next poll: malfunction ``code`` (EMCY, fault reaction), with up to five bytes of detail."""
         self._errors.append((code, additional))
+        self.concerns_poll = True
 
     def lose_master(self, code: int) -> None:
         """At the next poll: react as 6007h says to the loss of the master, without a word of it."""
         self._lost_masters.append(code)
+        self.concerns_poll = True
 
     def boot_up(self) -> None:
         """At the next poll: reset as after a brown-out, with a boot-up message, whatever the axis does."""
         self._boot_ups += 1
+        self.concerns_poll = True
 
     def leave_operational(self) -> None:
         """At the next poll: into PRE-OPERATIONAL, whatever the axis does, with a heartbeat that says so."""
         self._departures += 1
+        self.concerns_poll = True
 
     def open_enable_input(self) -> None:
         """At the next poll: the power stage goes off without a word, as by a hardware enable input."""
         self._openings += 1
+        self.concerns_poll = True
 
     def take_errors(self) -> list[tuple[int, bytes]]:
         """For the node: the errors to raise now."""
@@ -104,13 +111,6 @@ class Faults:
         """For the node: whether the enable input opens now."""
         wanted, self._openings = self._openings > 0, 0
         return wanted
-
-    @property
-    def concerns_poll(self) -> bool:
-        """For the node: whether something is to be done at this poll."""
-        return bool(
-            self._errors or self._lost_masters or self._boot_ups or self._departures or self._openings
-        )
 
     @property
     def concerns_tpdos(self) -> bool:

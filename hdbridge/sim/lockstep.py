@@ -101,11 +101,16 @@ class _PolledBus(VirtualBus):
             self.channel[place] = self.queue = _PolledQueue()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        if not _is_plain(msg):
+        if type(msg) is not DataFrame and not _is_plain(msg):
             super().send(msg, timeout)
             return
+        own = self.queue
         for waiting in self.channel:
-            if waiting is not self.queue:
+            if waiting is own:
+                continue
+            if type(msg) is DataFrame and type(waiting) is _PolledQueue:
+                waiting.queue.append(msg)  # nobody changes it: one for all
+            else:
                 waiting.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -125,6 +130,7 @@ class LockstepBus(can.BusABC):
 
     def __init__(self, channel: str, clock: VirtualClock, **kwargs: Any) -> None:
         self._inner = _PolledBus(channel)
+        self._waiting = self._inner.queue.queue
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
         self.private = False
@@ -158,7 +164,9 @@ class LockstepBus(can.BusABC):
         return message
 
     def _take(self) -> can.Message | None:
-        while (message := self._inner.recv(0)) is not None:
+        waiting = self._waiting
+        while waiting:
+            message: can.Message = waiting.popleft()
             if self._filters is None or self._matches_filters(message):
                 message.timestamp = self._clock.now()
                 return message

@@ -162,14 +162,13 @@ class SimulatedDrive:
         self._now_s = now_s
         if self.nmt is Nmt.INITIALISING:
             self._boot()
-        receive, now = self.bus.recv, self._clock.now
+        receive = self.bus.recv
         # Bounded, and each frame at its own time: a master that answers at once (as in an SDO transfer) can
         # keep this loop busy for long, and the watchdogs must not be behind then.
-        for _ in range(FRAMES_PER_POLL):
-            message = receive(0)
-            if message is None:
-                break
-            now_s = now()
+        left = FRAMES_PER_POLL
+        while left and (message := receive(0)) is not None:
+            left -= 1
+            now_s = self._clock.now()
             self.handle(message, now_s)
         self.run_until(now_s)
 
@@ -177,6 +176,7 @@ class SimulatedDrive:
         """Do what is due until ``now_s`` without looking at the bus; ``poll`` ends with it."""
         self._now_s = now_s
         if self.faults.concerns_poll:
+            self.faults.concerns_poll = False
             self._make_faults()
         if now_s >= self._due_s:
             self._do_what_is_due(now_s)
