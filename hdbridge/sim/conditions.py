@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from hdbridge.sim.state import state
 
+
+@state
 class Conditions:
     """The conditions as they are now; the plant keeps them up to date."""
 
-    __slots__ = ("load_deg", "motor_deg", "temperature_c", "torque_nm")
+    motor_deg: float
+    load_deg: float
+    torque_nm: float
+    """Torque of the flexspline's spring on the load."""
+    temperature_c: float
 
     def __init__(self, temperature_c: float) -> None:
-        self.motor_deg = 0.0
-        self.load_deg = 0.0
-        self.torque_nm = 0.0
-        """Torque of the flexspline's spring on the load."""
+        self.motor_deg = self.load_deg = self.torque_nm = 0.0
         self.temperature_c = temperature_c

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Final, Protocol
 
+from hdbridge.sim.state import state
 from hdbridge.sim.truth.encoder import (
     TrueCable,
     TrueDisc,
@@ -21,6 +22,9 @@ from hdbridge.sim.truth.encoder import (
 )
 from hdbridge.units import ARCSEC_PER_DEG
 
+BACK_DEG: Final = 0.05
+"""Load travel within which a cable's drag turns over."""
+
 
 class ReadingError(Protocol):
     """One cause of a wrong reading, with its state."""
@@ -30,6 +34,7 @@ class ReadingError(Protocol):
         ...
 
 
+@state
 class Disc:
     """A disc off its shaft's axis, and distorted twice per turn.
 
@@ -37,7 +42,10 @@ class Disc:
     another angle than from the axis: ``atan2(e sin a, R + e cos a)``, about e/R sin a.
     """
 
-    __slots__ = ("_eccentric_rad", "_oval", "_oval_rad", "_relative")
+    _eccentric_rad: float
+    _oval: float
+    _oval_rad: float
+    _relative: float
 
     def __init__(self, truth: TrueDisc) -> None:
         self._relative = truth.eccentricity_um / 1000.0 / truth.radius_mm
@@ -77,48 +85,64 @@ class Signals:
         return math.degrees(math.remainder(math.atan2(sine, cosine) - phase, math.tau)) / self._lines
 
 
+@state
 class Cable:
     """A cable that is taut beyond an angle and pulls the encoder's body along; it reads that much less."""
 
-    __slots__ = ("_drag", "_from_deg", "_last_deg", "_per_deg", "_way")
-
-    BACK_DEG = 0.05
-    """Load travel within which the cable's drag turns over."""
+    _drag: float
+    _from_deg: float
+    _last_deg: float
+    _led: bool
+    _per_deg: float
+    _way: float
 
     def __init__(self, truth: TrueCable) -> None:
         self._from_deg = truth.taut_from_deg
         self._per_deg = truth.arcsec_per_deg / ARCSEC_PER_DEG
         self._drag = truth.drag
-        self._last_deg: float | None = None
+        self._led = False
+        self._last_deg = 0.0
         self._way = 0.0
 
     def error_deg(self, shaft_deg: float) -> float:
         """See `ReadingError`."""
-        if self._last_deg is not None:
-            travel = (shaft_deg - self._last_deg) / self.BACK_DEG
+        if self._led:
+            travel = (shaft_deg - self._last_deg) / BACK_DEG
             self._way = min(1.0, max(-1.0, self._way + travel))
+        self._led = True
         self._last_deg = shaft_deg
         beyond = shaft_deg - self._from_deg
         return -self._per_deg * beyond * (1.0 + self._drag * self._way) if beyond > 0.0 else 0.0
 
 
+@state
 class SensorWarming:
     """A shift that follows the square of the speed as the encoder warms and cools."""
 
-    __slots__ = ("_goal", "_interval_s", "_last_deg", "_nearer", "_shift_deg")
+    _exponent: float
+    _goal: float
+    _interval_s: float
+    _last_deg: float
+    _led: bool
+    _nearer: float
+    _shift_deg: float
 
     def __init__(self, truth: TrueSensorWarming, interval_s: float) -> None:
         self._goal = truth.arcsec_at_10_deg_s / 100.0 / ARCSEC_PER_DEG
         self._interval_s = interval_s
         self._nearer = -math.expm1(-interval_s / truth.time_constant_s)
-        self._last_deg: float | None = None
+        self._exponent = 2.0
+        self._led = False
+        self._last_deg = 0.0
         self._shift_deg = 0.0
 
     def error_deg(self, shaft_deg: float) -> float:
         """See `ReadingError`."""
-        if self._last_deg is not None:
-            speed_deg_s = (shaft_deg - self._last_deg) / self._interval_s
-            self._shift_deg += (self._goal * speed_deg_s**2 - self._shift_deg) * self._nearer
+        if self._led:
+            speed_deg_s = abs(shaft_deg - self._last_deg) / self._interval_s
+            goal_deg = self._goal * speed_deg_s**self._exponent
+            self._shift_deg += (goal_deg - self._shift_deg) * self._nearer
+        self._led = True
         self._last_deg = shaft_deg
         return self._shift_deg
 
@@ -139,23 +163,39 @@ class Losses:
         return self._counts
 
 
+@state
 class Late:
     """What a shaft's angle was some time ago; fed once per substep."""
 
-    __slots__ = ("_angles", "_part")
+    deg: float
+    """The delayed angle."""
+    _angles: list[float]
+    """The angles since then, in a ring of which ``_oldest`` is the first."""
+    _kept: int
+    _oldest: int
+    _part: float
 
     def __init__(self, late_s: float, dt_s: float, start_deg: float) -> None:
         whole, self._part = divmod(late_s / dt_s, 1.0)
-        self._angles = deque([start_deg] * (int(whole) + 2), maxlen=int(whole) + 2)
+        self._kept = int(whole) + 2
+        self._angles = [0.0] * self._kept
+        self.begin(start_deg)
+
+    def begin(self, shaft_deg: float) -> None:
+        """The shaft has always stood at this angle."""
+        self._oldest = 0
+        self.deg = shaft_deg
+        for place in range(self._kept):
+            self._angles[place] = shaft_deg
 
     def feed(self, shaft_deg: float) -> None:
         """The angle after one more substep."""
-        self._angles.append(shaft_deg)
-
-    @property
-    def deg(self) -> float:
-        """The delayed angle."""
-        return self._angles[1] + (self._angles[0] - self._angles[1]) * self._part
+        angles, oldest = self._angles, self._oldest
+        angles[oldest] = shaft_deg
+        first = oldest + 1 if oldest + 1 < self._kept else 0
+        second = first + 1 if first + 1 < self._kept else 0
+        self._oldest = first
+        self.deg = angles[second] + (angles[first] - angles[second]) * self._part
 
 
 def fixed_errors(truth: TrueEncoder) -> tuple[ReadingError, ...]:
@@ -168,13 +208,17 @@ def fixed_errors(truth: TrueEncoder) -> tuple[ReadingError, ...]:
     return tuple(errors)
 
 
+@state
 class Body:
     """What moves the load encoder's body against its shaft, by the travel of the shaft.
 
     It has a state, so it is led once per substep, and read as often as one likes.
     """
 
-    __slots__ = ("_errors", "deg")
+    deg: float
+    """The present shift of the reading."""
+    moves: bool
+    _errors: tuple[ReadingError, ...]
 
     def __init__(self, truth: TrueLoadEncoder, dt_s: float) -> None:
         errors: list[ReadingError] = []
@@ -183,12 +227,12 @@ class Body:
         if truth.sensor_warming is not None:
             errors.append(SensorWarming(truth.sensor_warming, dt_s))
         self._errors = tuple(errors)
+        self.moves = bool(errors)
         self.deg = 0.0
-        """The present shift of the reading."""
-
-    def __bool__(self) -> bool:
-        return bool(self._errors)
 
     def feed(self, shaft_deg: float) -> None:
         """The shaft's angle after one more substep."""
-        self.deg = sum(each.error_deg(shaft_deg) for each in self._errors)
+        shift_deg = 0.0
+        for each in self._errors:
+            shift_deg += each.error_deg(shaft_deg)
+        self.deg = shift_deg

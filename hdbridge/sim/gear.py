@@ -8,7 +8,6 @@ from the `Conditions`. A cause that is off has no piece, and costs nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import ClassVar, Protocol
 
 from hdbridge.sim.ageing import AgeFactor, WornTeeth
@@ -27,10 +26,18 @@ from hdbridge.sim.gear_pieces import (
 )
 from hdbridge.sim.hysteresis_laws import Law, law_of
 from hdbridge.sim.orders import Orders
+from hdbridge.sim.state import state
 from hdbridge.sim.truth import TrueOrder, Truth
+from hdbridge.sim.truth.gear import TrueFlank
 from hdbridge.units import ARCSEC_PER_DEG
 
-Factor = Callable[[Conditions], float]
+
+class Factor(Protocol):
+    """What a cause grows by."""
+
+    def factor(self, now: Conditions) -> float:
+        """The factor under these conditions, one substep after it was last asked."""
+        ...
 
 
 class Piece(Protocol):
@@ -44,11 +51,13 @@ class Piece(Protocol):
         ...
 
 
+@state
 class MotorOrders:
     """Tooth error by the motor's angle, and by the angle between wave generator and flexspline."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
-    __slots__ = ("_orders", "_rad_per_deg")
+    _orders: Orders
+    _rad_per_deg: float
 
     def __init__(self, orders: tuple[TrueOrder, ...], turns: float) -> None:
         self._orders = Orders(orders)
@@ -59,35 +68,41 @@ class MotorOrders:
         return self._orders.at(now.motor_deg * self._rad_per_deg)
 
 
+@state
 class VaryingOrders:
     """Tooth error by the motor's angle that depends on more: the flank that carries, torque, warmth."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_factors", "_flank", "_orders")
+    _factors: tuple[Factor, ...]
+    _flank: Flank
+    _flanked: bool
+    _orders: Orders
 
     def __init__(
-        self, orders: tuple[TrueOrder, ...], flank: Flank | None, factors: tuple[Factor, ...]
+        self, orders: tuple[TrueOrder, ...], flank: TrueFlank | None, factors: tuple[Factor, ...]
     ) -> None:
         self._orders = Orders(orders)
-        self._flank = flank
+        self._flanked = flank is not None
+        self._flank = Flank(flank if flank is not None else TrueFlank(shift_deg=0.0, travel_deg=1.0))
         self._factors = factors
 
     def arcsec(self, now: Conditions) -> float:
         """See `Piece`."""
         angle_deg = now.motor_deg
-        if self._flank is not None:
+        if self._flanked:
             angle_deg += self._flank.shift_deg(angle_deg)
         error = self._orders.at(math.radians(angle_deg))
         for factor in self._factors:
-            error *= factor(now)
+            error *= factor.factor(now)
         return error
 
 
+@state
 class LoadOrders:
     """Tooth error by the load's angle."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_orders",)
+    _orders: Orders
 
     def __init__(self, orders: tuple[TrueOrder, ...]) -> None:
         self._orders = Orders(orders)
@@ -97,43 +112,48 @@ class LoadOrders:
         return self._orders.at(math.radians(now.load_deg))
 
 
+@state
 class ElasticHysteresis:
     """The elastic part, by the travel of the motor."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
-    __slots__ = ("_advance",)
+    _law: Law
 
     def __init__(self, law: Law) -> None:
-        self._advance = law.advance
+        self._law = law
 
     def arcsec(self, now: Conditions) -> float:
         """See `Piece`."""
-        return self._advance(now.motor_deg)
+        return self._law.advance(now.motor_deg)
 
 
+@state
 class VaryingHysteresis:
     """An elastic part that depends on speed or warmth too."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_advance", "_factors")
+    _factors: tuple[Factor, ...]
+    _law: Law
 
     def __init__(self, law: Law, factors: tuple[Factor, ...]) -> None:
-        self._advance = law.advance
+        self._law = law
         self._factors = factors
 
     def arcsec(self, now: Conditions) -> float:
         """See `Piece`."""
-        error = self._advance(now.motor_deg)
+        error = self._law.advance(now.motor_deg)
         for factor in self._factors:
-            error *= factor(now)
+            error *= factor.factor(now)
         return error
 
 
+@state
 class ZeroDrift:
     """A shift that goes with the temperature."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_ambient_c", "_arcsec_per_k")
+    _ambient_c: float
+    _arcsec_per_k: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float) -> None:
         self._ambient_c = ambient_c
@@ -144,11 +164,15 @@ class ZeroDrift:
         return self._arcsec_per_k * (now.temperature_c - self._ambient_c)
 
 
+@state
 class SlowZeroDrift:
     """A shift by the temperature of a housing that follows the measured one in its time."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_ambient_c", "_arcsec_per_k", "_housing_c", "_nearer")
+    _ambient_c: float
+    _arcsec_per_k: float
+    _housing_c: float
+    _nearer: float
 
     def __init__(self, ambient_c: float, arcsec_per_k: float, start_c: float, nearer: float) -> None:
         self._ambient_c = ambient_c
@@ -200,7 +224,7 @@ def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
 
 def _motor_orders(truth: Truth) -> Piece:
     gear = truth.gear
-    flank = Flank(gear.flank) if gear.flank is not None and gear.flank.shift_deg else None
+    flank = gear.flank if gear.flank is not None and gear.flank.shift_deg else None
     torque = TorqueFactor(gear.torque_growth_per_nm) if gear.torque_growth_per_nm else None
     warmth = warmth_factor(truth, truth.temperature.tooth_growth_per_k)
     factors = tuple(factor for factor in (torque, warmth) if factor is not None)
@@ -237,21 +261,24 @@ def _zero_drift(truth: Truth) -> list[Piece]:
     return [SlowZeroDrift(heat.ambient_c, per_k, start_c, nearer)]
 
 
+@state
 class Gear:
     """The output of the gear before its spring, in degrees of the load."""
 
-    __slots__ = ("_pieces", "_ratio", "by_motor_only")
+    by_motor_only: bool
+    _pieces: tuple[Piece, ...]
+    _ratio: float
 
     def __init__(self, truth: Truth) -> None:
         pieces = pieces_of(truth)
         self._ratio = truth.gear.ratio
-        self._pieces = tuple(piece.arcsec for piece in pieces)
+        self._pieces = tuple(pieces)
         self.by_motor_only = all(piece.BY_MOTOR_ONLY for piece in pieces)
         """Whether the output cannot change while the motor stands."""
 
-    def output_deg(self, now: Conditions) -> float:
+    def turned_deg(self, now: Conditions) -> float:
         """Where the output would turn an unloaded shaft."""
         error = 0.0
-        for arcsec in self._pieces:
-            error += arcsec(now)
+        for piece in self._pieces:
+            error += piece.arcsec(now)
         return now.motor_deg / self._ratio + error / ARCSEC_PER_DEG

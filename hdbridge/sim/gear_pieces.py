@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import random
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from hdbridge.sim.conditions import Conditions
+from hdbridge.sim.state import state
 from hdbridge.sim.truth.gear import (
     TrueCreep,
     TrueDamage,
@@ -22,11 +23,18 @@ from hdbridge.sim.truth.gear import (
 )
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
+SLIDING_DEG_S: Final = 0.5
+"""Motor speed by which the teeth's drag is there by half."""
 
+
+@state
 class Flank:
     """Which flank of the teeth carries: -1 to 1, by the travel of the motor."""
 
-    __slots__ = ("_last_deg", "_share", "_shift_deg", "_travel_deg")
+    _last_deg: float
+    _share: float
+    _shift_deg: float
+    _travel_deg: float
 
     def __init__(self, truth: TrueFlank) -> None:
         self._shift_deg = truth.shift_deg
@@ -42,10 +50,16 @@ class Flank:
         return self._shift_deg * self._share
 
 
+@state
 class SpeedFactor:
     """Growth of the rolling friction with the logarithm of speed, behind which it lags."""
 
-    __slots__ = ("_dt", "_from_deg_s", "_gain", "_last_deg", "_nearer", "_now")
+    _dt: float
+    _from_deg_s: float
+    _gain: float
+    _last_deg: float
+    _nearer: float
+    _now: float
 
     def __init__(self, truth: TrueRate, dt_s: float) -> None:
         self._gain = truth.growth_per_decade
@@ -55,7 +69,7 @@ class SpeedFactor:
         self._last_deg = 0.0
         self._now = 0.0
 
-    def __call__(self, now: Conditions) -> float:
+    def factor(self, now: Conditions) -> float:
         """The factor after one more substep."""
         speed_deg_s = abs(now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
@@ -64,29 +78,32 @@ class SpeedFactor:
         return 1.0 + self._now
 
 
+@state
 class TorqueFactor:
     """Growth of the tooth error with the torque that the teeth carry."""
 
-    __slots__ = ("_per_nm",)
+    _per_nm: float
 
     def __init__(self, per_nm: float) -> None:
         self._per_nm = per_nm
 
-    def __call__(self, now: Conditions) -> float:
+    def factor(self, now: Conditions) -> float:
         """The factor under these conditions."""
         return 1.0 + self._per_nm * abs(now.torque_nm)
 
 
+@state
 class WarmthFactor:
     """Growth with the temperature; never below a twentieth."""
 
-    __slots__ = ("_per_k", "_reference_c")
+    _per_k: float
+    _reference_c: float
 
     def __init__(self, per_k: float, reference_c: float) -> None:
         self._per_k = per_k
         self._reference_c = reference_c
 
-    def __call__(self, now: Conditions) -> float:
+    def factor(self, now: Conditions) -> float:
         """The factor under these conditions."""
         return self.at(now.temperature_c)
 
@@ -95,11 +112,17 @@ class WarmthFactor:
         return max(0.05, 1.0 + self._per_k * (temperature_c - self._reference_c))
 
 
+@state
 class Wear:
     """Lost motion between the teeth: the output lags in either direction, by what its travel has worn."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
-    __slots__ = ("_exponent", "_follower_deg", "_last_deg", "_per_1000", "_ratio", "_turns")
+    _exponent: float
+    _follower_deg: float
+    _last_deg: float
+    _per_1000: float
+    _ratio: float
+    _turns: float
 
     def __init__(self, truth: TrueWear, ratio: float) -> None:
         self._per_1000 = truth.arcsec_per_1000_turns
@@ -120,6 +143,7 @@ class Wear:
         return (self._follower_deg - motor_deg) / self._ratio * ARCSEC_PER_DEG
 
 
+@state
 class Creep:
     """Kelvin-Voigt elements in series: each yields, in its time, to the teeth's drag and to the load.
 
@@ -128,15 +152,18 @@ class Creep:
     """
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    SLIDING_DEG_S: ClassVar[float] = 0.5
-    __slots__ = ("_dt", "_elements", "_last_deg", "_states")
+    _amplitudes: tuple[float, ...]
+    _dt: float
+    _last_deg: float
+    _nearer: tuple[float, ...]
+    _per_nm: tuple[float, ...]
+    _states: list[float]
 
     def __init__(self, elements: tuple[TrueCreep, ...], dt_s: float) -> None:
         self._dt = dt_s
-        self._elements = tuple(
-            (each.amplitude_arcsec, each.arcsec_per_nm, -math.expm1(-dt_s / each.time_constant_s))
-            for each in elements
-        )
+        self._amplitudes = tuple(each.amplitude_arcsec for each in elements)
+        self._per_nm = tuple(each.arcsec_per_nm for each in elements)
+        self._nearer = tuple(-math.expm1(-dt_s / each.time_constant_s) for each in elements)
         self._states = [0.0] * len(elements)
         self._last_deg = 0.0
 
@@ -144,23 +171,34 @@ class Creep:
         """See `Piece`."""
         speed_deg_s = (now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
-        sliding = speed_deg_s / (abs(speed_deg_s) + self.SLIDING_DEG_S)
-        states, torque_nm = self._states, now.torque_nm
-        for position, (amplitude, per_nm, nearer) in enumerate(self._elements):
-            state = states[position]
-            states[position] = state + (-amplitude * sliding - per_nm * torque_nm - state) * nearer
-        return sum(states)
+        sliding = speed_deg_s / (abs(speed_deg_s) + SLIDING_DEG_S)
+        total = 0.0
+        for element in range(len(self._states)):
+            yielded = self._states[element]
+            goal = -self._amplitudes[element] * sliding - self._per_nm[element] * now.torque_nm
+            yielded += (goal - yielded) * self._nearer[element]
+            self._states[element] = yielded
+            total += yielded
+        return total
 
 
+@state
 class Jumps:
     """Teeth jumped, each within its time."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_dt", "_jumps", "_step", "_tooth_arcsec")
+    _dt: float
+    _duration_s: tuple[float, ...]
+    _step: int
+    _teeth: tuple[float, ...]
+    _time_s: tuple[float, ...]
+    _tooth_arcsec: float
 
     def __init__(self, jumps: tuple[TrueJump, ...], teeth: float, dt_s: float) -> None:
         self._dt = dt_s
-        self._jumps = jumps
+        self._time_s = tuple(each.time_s for each in jumps)
+        self._duration_s = tuple(each.duration_s for each in jumps)
+        self._teeth = tuple(float(each.teeth) for each in jumps)
         self._tooth_arcsec = DEG_PER_TURN / teeth * ARCSEC_PER_DEG
         self._step = -1
 
@@ -169,36 +207,49 @@ class Jumps:
         self._step += 1
         time_s = self._step * self._dt
         done = 0.0
-        for each in self._jumps:
-            part = min(1.0, max(0.0, (time_s - each.time_s) / each.duration_s))
-            done += each.teeth * 0.5 * (1.0 - math.cos(math.pi * part))
+        for jump in range(len(self._teeth)):
+            if self._teeth[jump]:
+                part = min(1.0, max(0.0, (time_s - self._time_s[jump]) / self._duration_s[jump]))
+                done += self._teeth[jump] * 0.5 * (1.0 - math.cos(math.pi * part))
         return done * self._tooth_arcsec
 
 
+@state
 class Damage:
     """Damaged teeth: smooth bumps by load angle."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_bumps",)
+    _at_deg: tuple[float, ...]
+    _height: tuple[float, ...]
+    _reach_deg: tuple[float, ...]
 
     def __init__(self, teeth: tuple[TrueDamage, ...]) -> None:
-        self._bumps = tuple((each.at_deg, each.width_deg / 2.0, each.height_arcsec) for each in teeth)
+        self._at_deg = tuple(each.at_deg for each in teeth)
+        self._reach_deg = tuple(each.width_deg / 2.0 for each in teeth)
+        self._height = tuple(each.height_arcsec for each in teeth)
 
     def arcsec(self, now: Conditions) -> float:
         """See `Piece`."""
         error = 0.0
-        for at_deg, reach_deg, height in self._bumps:
-            off = math.remainder(now.load_deg - at_deg, DEG_PER_TURN) / reach_deg
-            if -1.0 < off < 1.0:
-                error += height * 0.5 * (1.0 + math.cos(math.pi * off))
+        for bump in range(len(self._height)):
+            if self._height[bump]:
+                off_deg = math.remainder(now.load_deg - self._at_deg[bump], DEG_PER_TURN)
+                off = off_deg / self._reach_deg[bump]
+                if -1.0 < off < 1.0:
+                    error += self._height[bump] * 0.5 * (1.0 + math.cos(math.pi * off))
         return error
 
 
+@state
 class Roller:
     """A roller on the motor's hub that disturbs it by its own angle, most where the load presses it on."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
-    __slots__ = ("_amplitude", "_order", "_phase_rad", "_pressed_at_deg", "_sharpness")
+    _amplitude: float
+    _order: float
+    _phase_rad: float
+    _pressed_at_deg: float
+    _sharpness: float
 
     def __init__(self, truth: TrueRoller) -> None:
         self._amplitude = truth.amplitude_arcsec

@@ -7,9 +7,13 @@ direction of motion, so a closed loop of the motor angle has a positive area, th
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Final, Protocol
 
+from hdbridge.sim.state import state
 from hdbridge.sim.truth.hysteresis import BoucWen, Dahl, Hysteresis, MaxwellSlip, RollingFriction
+
+PIECE: Final = 0.05
+"""Longest piece of travel, in units of the yield, over which the Bouc-Wen law is integrated at once."""
 
 
 class Law(Protocol):
@@ -31,6 +35,7 @@ def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
     return None if truth is None else BoucWenLaw(truth, motor_deg)
 
 
+@state
 class RollingFrictionLaw:
     """The article's law, continuous at reversals.
 
@@ -39,10 +44,15 @@ class RollingFrictionLaw:
     ``x (1 - ln x)`` for n = 2. Only the last reversal counts: it has no return-point memory.
     """
 
-    __slots__ = (
-        "_branch_arcsec", "_branch_deg", "_direction", "_error", "_exponent", "_motor_deg", "_offset",
-        "_saturated", "_width",
-    )  # fmt: skip
+    _branch_arcsec: float
+    _branch_deg: float
+    _direction: float
+    _error: float
+    _exponent: float
+    _motor_deg: float
+    _offset: float
+    _saturated: bool
+    _width: float
 
     def __init__(self, truth: RollingFriction, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -85,16 +95,20 @@ class RollingFrictionLaw:
         return self._error
 
 
+@state
 class MaxwellSlipLaw:
     """Parallel springs with sliders (Prandtl-Ishlinskii stop operators). Has return-point memory."""
 
-    __slots__ = ("_elements", "_error", "_motor_deg", "_states")
+    _error: float
+    _limits: tuple[float, ...]
+    _motor_deg: float
+    _states: list[float]
+    _stiffnesses: tuple[float, ...]
 
     def __init__(self, truth: MaxwellSlip, motor_deg: float) -> None:
-        self._elements = tuple(
-            (each.limit_arcsec / each.yield_deg, each.limit_arcsec) for each in truth.elements
-        )
-        self._states = [0.0] * len(self._elements)
+        self._stiffnesses = tuple(each.limit_arcsec / each.yield_deg for each in truth.elements)
+        self._limits = tuple(each.limit_arcsec for each in truth.elements)
+        self._states = [0.0] * len(self._limits)
         self._motor_deg = motor_deg
         self._error = 0.0
 
@@ -104,28 +118,34 @@ class MaxwellSlipLaw:
         if travel == 0.0:
             return self._error
         self._motor_deg = motor_deg
-        states = self._states
+        states, stiffnesses, limits = self._states, self._stiffnesses, self._limits
         total = 0.0
-        for position, (stiffness, limit) in enumerate(self._elements):
-            state = states[position] + stiffness * travel
-            if state > limit:
-                state = limit
-            elif state < -limit:
-                state = -limit
-            states[position] = state
-            total += state
+        for element in range(len(states)):
+            error, limit = states[element] + stiffnesses[element] * travel, limits[element]
+            if error > limit:
+                error = limit
+            elif error < -limit:
+                error = -limit
+            states[element] = error
+            total += error
         self._error = total
         return total
 
 
+@state
 class BoucWenLaw:
     """``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``, beta + gamma = 1; the error is offset * z.
 
     Integrated over the motor's travel x by the midpoint rule in pieces short against the yield travel.
     """
 
-    PIECE = 0.05
-    __slots__ = ("_beta", "_exponent", "_gamma", "_motor_deg", "_offset", "_yield", "_z")
+    _beta: float
+    _exponent: float
+    _gamma: float
+    _motor_deg: float
+    _offset: float
+    _yield: float
+    _z: float
 
     def __init__(self, truth: BoucWen, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec
@@ -142,7 +162,7 @@ class BoucWenLaw:
         z = self._z
         if travel != 0.0:
             self._motor_deg = motor_deg
-            pieces = math.ceil(abs(travel) / self.PIECE)
+            pieces = math.ceil(abs(travel) / PIECE)
             step = travel / pieces
             direction = 1.0 if travel > 0.0 else -1.0
             for _ in range(pieces):
@@ -156,10 +176,15 @@ class BoucWenLaw:
         return float(1.0 - abs(z) ** self._exponent * (turned + self._gamma))
 
 
+@state
 class DahlLaw:
     """``dz/dx = (1 - z sgn dx)^i / yield``, exactly; the error is offset * z."""
 
-    __slots__ = ("_exponent", "_motor_deg", "_offset", "_yield", "_z")
+    _exponent: float
+    _motor_deg: float
+    _offset: float
+    _yield: float
+    _z: float
 
     def __init__(self, truth: Dahl, motor_deg: float) -> None:
         self._offset = truth.offset_arcsec

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from hdbridge.sim.plant import RAD_PER_DEG, Plant
+from hdbridge.sim.state import state
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.gear import TrueStiffening
 from hdbridge.units import ARCSEC_PER_DEG
@@ -17,10 +18,18 @@ from hdbridge.units import ARCSEC_PER_DEG
 GRAVITY_M_S2 = 9.80665
 
 
+@state
 class Spring:
     """Torque by wind-up: nothing within the dead zone, then three stages."""
 
-    __slots__ = ("_first_deg", "_first_nm", "_gap_deg", "_k1", "_k2", "_k3", "_second_deg", "_second_nm")
+    _first_deg: float
+    _first_nm: float
+    _gap_deg: float
+    _k1: float
+    _k2: float
+    _k3: float
+    _second_deg: float
+    _second_nm: float
 
     def __init__(self, stiffness: float, later: TrueStiffening | None, gap_deg: float) -> None:
         self._gap_deg = gap_deg
@@ -34,7 +43,7 @@ class Spring:
             self._first_deg = self._first_nm / self._k1
             self._second_deg = self._first_deg + (self._second_nm - self._first_nm) / self._k2
 
-    def torque_nm(self, wind_up_deg: float) -> float:
+    def pull_nm(self, wind_up_deg: float) -> float:
         """Torque on the load for a wind-up (output before load) in degrees."""
         size = abs(wind_up_deg) - self._gap_deg
         if size <= 0.0:
@@ -49,27 +58,48 @@ class Spring:
 
     def touches(self, wind_up_deg: float) -> bool:
         """Whether the sides of the dead zone touch."""
-        return abs(wind_up_deg) > self._gap_deg or not self._gap_deg
+        return abs(wind_up_deg) > self._gap_deg or self._gap_deg == 0.0
 
 
+@state
 class LoadedPlant(Plant):
     """A `Plant` with all that the truth file can put on its spring and load."""
 
-    __slots__ = (
-        "_arm_nm", "_breakaway", "_breakaway_speed", "_down_deg", "_gap_deg", "_held_deg", "_held_nm",
-        "_play_deg", "_played_deg", "_shaking", "_sliders", "_spring", "_step", "_thinning", "_viscous",
-        "_whole_inertia",
-    )  # fmt: skip
+    _arm_nm: float
+    _breakaway: float
+    _breakaway_exponent: float
+    _breakaway_speed: float
+    _down_deg: float
+    _gap_deg: float
+    _held_deg: float
+    _held_nm: list[float]
+    _play_deg: float
+    _played_deg: float
+    _shaken: bool
+    _shaking_nm: tuple[float, ...]
+    _shaking_phase: tuple[float, ...]
+    _shaking_turn: tuple[float, ...]
+    _slider_limit: tuple[float, ...]
+    _slider_stiffness: tuple[float, ...]
+    _slides: bool
+    _spring: Spring
+    _step: int
+    _thinning_exponent: float
+    _thinning_from: float
+    _viscous: float
+    _whole_inertia: float
 
     def __init__(self, truth: Truth) -> None:
-        super().__init__(truth)
+        Plant.__init__(self, truth)
         gear, load = truth.gear, truth.load_
         self._gap_deg = 0.5 * gear.backlash_arcsec / ARCSEC_PER_DEG
         self._spring = Spring(self._stiffness, gear.stiffening, self._gap_deg)
         self._whole_inertia = load.whole_inertia_kg_m2 * RAD_PER_DEG
         self._viscous = load.viscous_nm_s_per_rad * RAD_PER_DEG
-        self._thinning = (load.thinning.speed_rad_s, load.thinning.exponent) if load.thinning else None
+        self._thinning_from = load.thinning.speed_rad_s if load.thinning else 0.0
+        self._thinning_exponent = load.thinning.exponent if load.thinning else 0.0
         self._breakaway = self._breakaway_speed = 0.0
+        self._breakaway_exponent = 2.0
         if load.stribeck is not None:
             rise_nm = load.stribeck.breakaway_nm - load.coulomb_nm
             self._breakaway = rise_nm / load.whole_inertia_kg_m2 / RAD_PER_DEG * self._dt
@@ -79,12 +109,14 @@ class LoadedPlant(Plant):
             mass = load.gravity
             self._arm_nm = mass.mass_kg * GRAVITY_M_S2 * mass.arm_m * math.cos(math.radians(mass.tilt_deg))
             self._down_deg = mass.down_deg
-        self._shaking = tuple(
-            (math.tau * each.frequency_hz * self._dt, math.radians(each.phase_deg), each.torque_nm)
-            for each in load.vibration
-        )
-        self._sliders = tuple((each.limit_nm / each.travel_deg, each.limit_nm) for each in load.presliding)
-        self._held_nm = [0.0] * len(self._sliders)
+        self._shaken = bool(load.vibration)
+        self._shaking_turn = tuple(math.tau * each.frequency_hz * self._dt for each in load.vibration)
+        self._shaking_phase = tuple(math.radians(each.phase_deg) for each in load.vibration)
+        self._shaking_nm = tuple(each.torque_nm for each in load.vibration)
+        self._slides = bool(load.presliding)
+        self._slider_stiffness = tuple(each.limit_nm / each.travel_deg for each in load.presliding)
+        self._slider_limit = tuple(each.limit_nm for each in load.presliding)
+        self._held_nm = [0.0] * len(self._slider_limit)
         self._held_deg = self.now.load_deg
         self._step = 0
         coupling = load.encoder.coupling
@@ -108,12 +140,11 @@ class LoadedPlant(Plant):
             or (coupling is not None and coupling.play_arcsec)
         )
 
-    @property
-    def outer_torque_nm(self) -> float:
+    def weight_nm(self, load_deg: float) -> float:
         """See `Plant`."""
-        return -self._arm_nm * math.sin((self.now.load_deg - self._down_deg) * RAD_PER_DEG)
+        return -self._arm_nm * math.sin((load_deg - self._down_deg) * RAD_PER_DEG)
 
-    def advance(self, torque_nm: float, brake_nm: float) -> None:
+    def step(self, torque_nm: float, brake_nm: float) -> None:
         """See `Plant`."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
@@ -123,34 +154,37 @@ class LoadedPlant(Plant):
         # What the spring does beyond its linear first stage, halfway through the substep.
         closing = self.motor_deg_s / self._ratio - load_speed
         halfway = lag + 0.5 * dt * closing
-        beyond = self._spring.torque_nm(halfway) - self._stiffness * halfway
+        beyond = self._spring.pull_nm(halfway) - self._stiffness * halfway
         if not self._spring.touches(halfway):
             beyond -= self._damping * closing
         spring = self._stiffness * (lag - 0.5 * dt * load_speed) - self._damping * load_speed
         moved = self._turn_motor(torque_nm, brake_nm, spring + beyond)
 
         if moved or not self._gear.by_motor_only:
-            self.output_deg = new_output = self._gear.output_deg(now)
+            self.output_deg = new_output = self._gear.turned_deg(now)
             rate = (new_output - output) / dt
         else:
             new_output, rate = output, 0.0
         outer = beyond + self._outer_nm(load + 0.5 * dt * load_speed, load_speed)
         shift = outer / self._stiffness
-        a, b, c, d = self._flexspline
+        spline = self._flexspline
         slip = load_speed - rate
         lag += shift
-        new_load = new_output + shift + b * slip - a * lag
-        new_load_speed = rate + d * slip - c * lag
+        new_load = new_output + shift + spline.distance_by_rate * slip - spline.distance_by_distance * lag
+        new_load_speed = rate + spline.rate_by_rate * slip - spline.rate_by_distance * lag
         loss = self._load_friction
         if self._breakaway:
-            loss += self._breakaway * math.exp(-((load_speed / self._breakaway_speed) ** 2))
+            speeds = abs(load_speed / self._breakaway_speed)
+            loss += self._breakaway * math.exp(-(speeds**self._breakaway_exponent))
         if loss:
             new_load, new_load_speed = self._rub(load, new_load, new_load_speed, loss)
-        now.torque_nm = self._spring.torque_nm(new_output - new_load)
+        now.torque_nm = self._spring.pull_nm(new_output - new_load)
         now.load_deg = new_load
         self.load_deg_s = new_load_speed
-        if self._sliders:
-            self._held_nm, self._held_deg = self._held_at(new_load), new_load
+        if self._slides:
+            for slider in range(len(self._slider_limit)):
+                self._held_nm[slider] = self._held_at(slider, new_load)
+            self._held_deg = new_load
         if self._play_deg:
             load, new_load = self._played_deg, self._play(new_load)
         self._turn_encoder(load, new_load)
@@ -159,30 +193,32 @@ class LoadedPlant(Plant):
         """Gravity, viscous drag and shaking, on the load."""
         outer = 0.0
         if self._arm_nm:
-            outer -= self._arm_nm * math.sin((load_deg - self._down_deg) * RAD_PER_DEG)
+            outer += self.weight_nm(load_deg)
         if self._viscous:
             viscous = self._viscous
-            if self._thinning is not None:
-                from_rad_s, exponent = self._thinning
-                viscous /= (1.0 + abs(load_speed) * RAD_PER_DEG / from_rad_s) ** exponent
+            if self._thinning_exponent:
+                turning = abs(load_speed) * RAD_PER_DEG
+                viscous /= (1.0 + turning / self._thinning_from) ** self._thinning_exponent
             # No more than stops the load within the substep.
             inertia = self._whole_inertia
             outer += inertia * math.expm1(-viscous / inertia * self._dt) / self._dt * load_speed
-        if self._sliders:
-            outer -= sum(self._held_at(load_deg))
-        if self._shaking:
+        if self._slides:
+            held = 0.0
+            for slider in range(len(self._slider_limit)):
+                held += self._held_at(slider, load_deg)
+            outer -= held
+        if self._shaken:
             self._step += 1
-            for turn, phase, torque in self._shaking:
-                outer += torque * math.sin(turn * self._step + phase)
+            for number in range(len(self._shaking_nm)):
+                angle = self._shaking_turn[number] * self._step + self._shaking_phase[number]
+                outer += self._shaking_nm[number] * math.sin(angle)
         return outer
 
-    def _held_at(self, load_deg: float) -> list[float]:
-        """The friction of each slider once the load has moved straight to this angle."""
-        travel = load_deg - self._held_deg
-        return [
-            min(limit, max(-limit, held + stiffness * travel))
-            for (stiffness, limit), held in zip(self._sliders, self._held_nm, strict=True)
-        ]
+    def _held_at(self, slider: int, load_deg: float) -> float:
+        """The friction of a slider once the load has moved straight to this angle."""
+        limit = self._slider_limit[slider]
+        held = self._held_nm[slider] + self._slider_stiffness[slider] * (load_deg - self._held_deg)
+        return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
         """The coupling's near side, which the load takes along once the play is used up."""
@@ -198,7 +234,7 @@ class LoadedPlant(Plant):
         for _ in range(80):
             middle = 0.5 * (low + high)
             self.now.load_deg = middle
-            if self._spring.torque_nm(output - middle) + self.outer_torque_nm > 0.0:
+            if self._spring.pull_nm(output - middle) + self.outer_torque_nm > 0.0:
                 low = middle
             else:
                 high = middle

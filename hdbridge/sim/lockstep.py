@@ -222,7 +222,8 @@ def simulated_bench(
 ) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
     """The simulated axis of a truth file on a bench; the same truth and seed give the same frames."""
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
-    with lockstep_bench(Machine(known, seed), eds_path, node_id, channel, nameplate_of(known)) as bench:
+    machine = Machine(known, seed, may_compile=True)
+    with lockstep_bench(machine, eds_path, node_id, channel, nameplate_of(known)) as bench:
         yield bench
 
 
@@ -252,6 +253,7 @@ def simulated_benches(
         raise InputError(f"two simulated drives are node {twice}; give each a node id of its own")
     private = channel is None
     channel = channel or f"hdbridge-{uuid4()}"
+    may_compile = clock is None  # another clock may be tied to real time
     clock = clock if clock is not None else VirtualClock()
     with ExitStack() as stack:
         for serial, axis in enumerate(axes, start=1):
@@ -259,7 +261,7 @@ def simulated_benches(
             node_bus = stack.enter_context(_PolledBus(channel))
             node = SimulatedDrive(
                 node_bus,
-                Machine(known, axis.seed),
+                Machine(known, axis.seed, may_compile=may_compile),
                 axis.eds_path,
                 axis.node_id,
                 clock,

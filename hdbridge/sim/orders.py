@@ -6,13 +6,15 @@ import cmath
 import math
 from collections.abc import Iterable
 
+from hdbridge.sim.state import state
 from hdbridge.sim.truth.hysteresis import TrueOrder
 
 
+@state
 class Orders:
     """``sum of amplitude cos(order angle + phase)`` as a function of an angle."""
 
-    __slots__ = ("_coefficients",)
+    _coefficients: tuple[complex, ...]
 
     def __init__(self, orders: Iterable[TrueOrder]) -> None:
         terms = {

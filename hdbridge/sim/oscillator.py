@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
+
+from hdbridge.sim.state import state
 
 
 class Step(NamedTuple):
@@ -13,6 +15,35 @@ class Step(NamedTuple):
     distance_by_rate: float
     rate_by_distance: float
     rate_by_rate: float
+
+
+class Oscillator(Protocol):
+    """A damped mass on a spring as a truth file describes it."""
+
+    @property
+    def frequency_hz(self) -> float: ...
+    @property
+    def damping_ratio(self) -> float: ...
+
+
+@state
+class Transition:
+    """A `Step` in the state of the simulation."""
+
+    distance_by_distance: float
+    distance_by_rate: float
+    rate_by_distance: float
+    rate_by_rate: float
+
+    def __init__(self, step: Step) -> None:
+        self.distance_by_distance, self.distance_by_rate, self.rate_by_distance, self.rate_by_rate = step
+
+
+def transition(truth: Oscillator | None, step_s: float) -> Transition:
+    """The exact step of an oscillator; where there is none, of one that goes with its base."""
+    if truth is None:
+        return Transition(Step(0.0, 0.0, 0.0, 0.0))
+    return Transition(exact_step(math.tau * truth.frequency_hz, truth.damping_ratio, step_s))
 
 
 def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> Step:

@@ -16,20 +16,42 @@ import math
 
 from hdbridge.sim.conditions import Conditions
 from hdbridge.sim.gear import Gear
-from hdbridge.sim.oscillator import exact_step
+from hdbridge.sim.oscillator import Transition, exact_step, transition
+from hdbridge.sim.state import state
 from hdbridge.sim.truth import Truth
 
 RAD_PER_DEG = math.pi / 180.0
 
 
+@state
 class Plant:
     """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
 
-    __slots__ = (
-        "_arm", "_cold_coulomb", "_cold_drag", "_coulomb", "_coupling", "_damping", "_drag", "_dt",
-        "_encoder_rate", "_flexspline", "_gear", "_inertia", "_load_drag", "_load_friction", "_ratio",
-        "_stiffness", "encoder_deg", "load_deg_s", "loss_j", "motor_deg_s", "now", "output_deg",
-    )  # fmt: skip
+    now: Conditions
+    """The motor's and the load's angle, and what else the gear depends on."""
+    motor_deg_s: float
+    load_deg_s: float
+    output_deg: float
+    encoder_deg: float
+    loss_j: float
+    """Friction work at the motor shaft since it was last set to zero."""
+    _arm: float
+    _cold_coulomb: float
+    _cold_drag: float
+    _coulomb: float
+    _coupled: bool
+    _coupling: Transition
+    _damping: float
+    _drag: float
+    _dt: float
+    _encoder_rate: float
+    _flexspline: Transition
+    _gear: Gear
+    _inertia: float
+    _load_drag: float
+    _load_friction: float
+    _ratio: float
+    _stiffness: float
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s
@@ -47,26 +69,23 @@ class Plant:
         inertia = load.whole_inertia_kg_m2
         frequency = math.sqrt(gear.stiffness_nm_per_rad / inertia)
         damping_ratio = gear.damping_nm_s_per_rad / (2.0 * inertia * frequency)
-        self._flexspline = exact_step(frequency, damping_ratio, dt)
+        self._flexspline = Transition(exact_step(frequency, damping_ratio, dt))
         self._load_drag = math.exp(-load.viscous_nm_s_per_rad / inertia * dt)
         self._load_friction = load.coulomb_nm / inertia / RAD_PER_DEG * dt
 
         coupling = load.encoder.coupling
-        self._coupling = (
-            exact_step(math.tau * coupling.frequency_hz, coupling.damping_ratio, dt) if coupling else None
-        )
+        self._coupled = coupling is not None
+        self._coupling = transition(coupling, dt)
 
         start_c = truth.temperature.start_c
         self.now = Conditions(truth.temperature.ambient_c if start_c is None else start_c)
-        """The motor's and the load's angle, and what else the gear depends on."""
         self._gear = Gear(truth)
-        self.output_deg = self._gear.output_deg(self.now)
+        self.output_deg = self._gear.turned_deg(self.now)
         self.now.load_deg = self.encoder_deg = self.output_deg
         self.motor_deg_s = self.load_deg_s = self._encoder_rate = 0.0
         self.loss_j = 0.0
-        """Friction work at the motor shaft since it was last set to zero."""
 
-    def advance(self, torque_nm: float, brake_nm: float) -> None:
+    def step(self, torque_nm: float, brake_nm: float) -> None:
         """One substep under a motor torque; the brake adds to the Coulomb friction."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
@@ -77,14 +96,14 @@ class Plant:
 
         # Load, seen from the gear's output.
         if moved or not self._gear.by_motor_only:
-            self.output_deg = new_output = self._gear.output_deg(now)
+            self.output_deg = new_output = self._gear.turned_deg(now)
             rate = (new_output - output) / dt
         else:
             new_output, rate = output, 0.0
-        a, b, c, d = self._flexspline
+        spline = self._flexspline
         slip = load_speed - rate
-        new_load = new_output + b * slip - a * lag
-        new_load_speed = (rate + d * slip - c * lag) * self._load_drag
+        new_load = new_output + spline.distance_by_rate * slip - spline.distance_by_distance * lag
+        new_load_speed = (rate + spline.rate_by_rate * slip - spline.rate_by_distance * lag) * self._load_drag
         if self._load_friction:
             new_load, new_load_speed = self._rub(load, new_load, new_load_speed, self._load_friction)
         now.torque_nm = self._stiffness * (new_output - new_load)
@@ -95,6 +114,10 @@ class Plant:
     @property
     def outer_torque_nm(self) -> float:
         """Torque of gravity on the load, as a sensor at its flange tells; positive forward."""
+        return self.weight_nm(self.now.load_deg)
+
+    def weight_nm(self, load_deg: float) -> float:
+        """Torque of gravity on the load at an angle; positive forward."""
         return 0.0
 
     def scale_friction(self, factor: float) -> None:
@@ -127,15 +150,15 @@ class Plant:
 
     def _turn_encoder(self, load: float, new_load: float) -> None:
         """The load encoder's part of a substep, seen from the load."""
-        if self._coupling is None:
+        if not self._coupled:
             self.encoder_deg = new_load
             return
-        a, b, c, d = self._coupling
+        step = self._coupling
         rate = (new_load - load) / self._dt
         ahead = self.encoder_deg - load
         slip = self._encoder_rate - rate
-        self.encoder_deg = new_load + a * ahead + b * slip
-        self._encoder_rate = rate + c * ahead + d * slip
+        self.encoder_deg = new_load + step.distance_by_distance * ahead + step.distance_by_rate * slip
+        self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
     def _rub(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
         """Coulomb friction at the load: takes a speed away, and holds a load that it can hold."""

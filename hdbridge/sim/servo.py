@@ -8,25 +8,47 @@ from __future__ import annotations
 
 import math
 
-from hdbridge.sim.oscillator import exact_step
+from hdbridge.sim.oscillator import Transition, transition
+from hdbridge.sim.state import state
 from hdbridge.sim.truth import Truth
 
 RAD_PER_DEG = math.pi / 180.0
+AT_REST_DEG_S = 0.05
+"""Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
 
 
+@state
 class Servo:
     """State of the loops. The demand and the motor's angle come in degrees of the motor."""
 
-    AT_REST_DEG_S = 0.05
-    """Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
-
-    __slots__ = (
-        "_acceleration_gain", "_dead_band", "_decay", "_direction", "_dt", "_filter", "_friction",
-        "_hunting_band", "_integral", "_integral_rate", "_last_reference", "_load_ahead", "_load_gain",
-        "_load_model", "_load_speed", "_measured", "_position_gain", "_reference", "_reference_speed",
-        "_step_deg", "_steps_per_deg", "_velocity_feedforward", "_velocity_gain", "_viscous", "limit_nm",
-        "measured_deg_s",
-    )  # fmt: skip
+    limit_nm: float
+    """Highest torque in either direction."""
+    measured_deg_s: float
+    _acceleration_gain: float
+    _dead_band: float
+    _decay: float
+    _direction: float
+    _dt: float
+    _filter: float
+    _friction: float
+    _hunting_band: float
+    _integral: float
+    _integral_rate: float
+    _last_reference: float
+    _load_ahead: float
+    _load_gain: float
+    _load_known: bool
+    _load_model: Transition
+    _load_speed: float
+    _measured: float
+    _position_gain: float
+    _reference: float
+    _reference_speed: float
+    _step_deg: float
+    _steps_per_deg: float
+    _velocity_feedforward: float
+    _velocity_gain: float
+    _viscous: float
 
     def __init__(self, truth: Truth) -> None:
         servo, encoder = truth.servo, truth.motor.encoder
@@ -40,7 +62,8 @@ class Servo:
         self._velocity_feedforward = servo.velocity_feedforward
         self._acceleration_gain = servo.inertia_feedforward_kg_m2 * RAD_PER_DEG / dt
         load = servo.load_feedforward
-        self._load_model = exact_step(math.tau * load.frequency_hz, load.damping_ratio, dt) if load else None
+        self._load_known = load is not None
+        self._load_model = transition(load, dt)
         self._load_gain = load.inertia_kg_m2 * RAD_PER_DEG / dt if load else 0.0
         self._viscous = servo.viscous_feedforward_nm_s_per_rad * RAD_PER_DEG
         self._friction = servo.friction_feedforward_nm
@@ -49,7 +72,6 @@ class Servo:
         self._dead_band = (servo.integral_dead_band + 0.5) * self._step_deg
         self._hunting_band = (servo.hunting_band + 0.5) * self._step_deg
         self.limit_nm = truth.motor.rated_torque_nm * servo.torque_limit_percent / 100.0
-        """Highest torque in either direction."""
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
@@ -63,7 +85,7 @@ class Servo:
         self._direction = 0.0
         return self._measured
 
-    def torque_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
+    def answer_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
         """The torque for one substep, in which the demand moves evenly from ``demand_deg`` on."""
         dt = self._dt
         measured = math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg
@@ -88,7 +110,7 @@ class Servo:
         wanted_speed = (reference - self._last_reference) / dt
         self._last_reference = reference
         speed_error = self._velocity_feedforward * wanted_speed + self._position_gain * error - measured_speed
-        rests = -self.AT_REST_DEG_S < new_speed < self.AT_REST_DEG_S
+        rests = -AT_REST_DEG_S < new_speed < AT_REST_DEG_S
         integral = self._integral
         if not rests and new_speed * self._direction <= 0.0:
             integral = self._turn(1.0 if new_speed > 0.0 else -1.0)
@@ -102,7 +124,7 @@ class Servo:
             + self._viscous * new_speed
             + self._friction * self._direction
         )
-        if self._load_model is not None:
+        if self._load_known:
             torque += self._load_torque((self._reference - reference) / dt)
         limit = self.limit_nm
         if torque > limit:
@@ -117,12 +139,12 @@ class Servo:
 
     def _load_torque(self, reference_speed: float) -> float:
         """What a load on a spring needs, on average over the substep, to come along with the reference."""
-        assert self._load_model is not None
-        a, b, c, d = self._load_model
-        ahead, speed = self._load_ahead, self._load_speed
+        step, ahead, speed = self._load_model, self._load_ahead, self._load_speed
         slip = speed - reference_speed
-        self._load_ahead = a * ahead + b * slip
-        self._load_speed = new_speed = reference_speed + c * ahead + d * slip
+        self._load_ahead = step.distance_by_distance * ahead + step.distance_by_rate * slip
+        self._load_speed = new_speed = (
+            reference_speed + step.rate_by_distance * ahead + step.rate_by_rate * slip
+        )
         return self._load_gain * (new_speed - speed)
 
     def _turn(self, direction: float) -> float:

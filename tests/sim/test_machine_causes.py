@@ -87,7 +87,7 @@ def test_a_hanging_load_winds_the_spring_up_through_its_stages(torque_nm: float)
 def test_the_stages_of_the_spring_join() -> None:
     spring = Spring(16_000.0, TrueStiffening(**STAGES), 0.0)
     steps = np.linspace(-0.1, 0.1, 20_001)
-    torques = np.array([spring.torque_nm(each) for each in steps])
+    torques = np.array([spring.pull_nm(each) for each in steps])
     slopes = np.diff(torques) / np.diff(steps)
     assert np.all(slopes > 0.0)
     assert np.max(np.abs(np.diff(torques))) < 1.01 * 1e-5 * np.max(slopes)
@@ -129,14 +129,14 @@ def test_a_load_that_swings_on_its_spring_keeps_its_energy() -> None:
     def energy_j() -> float:
         wind_up = plant.output_deg - plant.now.load_deg
         grid = np.linspace(0.0, abs(wind_up), 400)
-        stored = float(np.trapezoid([spring.torque_nm(each) for each in grid], grid)) * math.pi / 180.0
+        stored = float(np.trapezoid([spring.pull_nm(each) for each in grid], grid)) * math.pi / 180.0
         height = 20.0 * (1.0 - math.cos(math.radians(plant.now.load_deg - 0.3)))
         return 0.5 * inertia * math.radians(plant.load_deg_s) ** 2 + stored + height
 
     before = energy_j()
     energies = []
     for _ in range(4000):
-        plant.advance(0.0, 1000.0)  # the motor is held by its brake
+        plant.step(0.0, 1000.0)  # the motor is held by its brake
         energies.append(energy_j())
     assert 0.97 * before < min(energies)
     assert max(energies) < 1.03 * before
@@ -156,7 +156,7 @@ def test_drag_only_takes_energy_away() -> None:
     for _ in range(20):
         swing = 0.0
         for _ in range(100):
-            plant.advance(0.0, 1000.0)
+            plant.step(0.0, 1000.0)
             swing = max(swing, abs(plant.output_deg - plant.now.load_deg))
         peaks.append(swing)
     assert peaks == sorted(peaks, reverse=True)
@@ -219,7 +219,7 @@ def test_an_axis_with_nothing_on_its_load_moves_alike_in_both_plants() -> None:
     plants = (Plant(truth), LoadedPlant(truth))
     for step in range(3000):
         for plant in plants:
-            plant.advance(0.08 * math.sin(step * 0.01), 0.0)
+            plant.step(0.08 * math.sin(step * 0.01), 0.0)
     assert plants[0].now.motor_deg == pytest.approx(plants[1].now.motor_deg, rel=1e-9)
     assert plants[0].encoder_deg == pytest.approx(plants[1].encoder_deg, rel=1e-9)
     assert not LoadedPlant.needed(truth)

@@ -38,7 +38,7 @@ def test_a_coasting_axis_only_loses_energy() -> None:
     plant.motor_deg_s = 1000.0
     energy = energy_j(plant, truth)
     while energy > 1e-12:
-        plant.advance(0.0, 0.0)
+        plant.step(0.0, 0.0)
         after = energy_j(plant, truth)
         assert after <= energy * (1.0 + 1e-9) or after < 1e-7
         energy = after
@@ -55,7 +55,7 @@ def test_without_losses_energy_and_momentum_stay(substep_ms: float) -> None:
     energy = energy_j(plant, truth)
     energies = []
     for _ in range(round(500.0 / substep_ms)):
-        plant.advance(0.0, 0.0)
+        plant.step(0.0, 0.0)
         energies.append(energy_j(plant, truth))
     # Motor and load are stepped in turn, which feeds the resonance a little: in half a second a few
     # percent at most, where the gear's real damping takes nearly all of it in a twentieth of a second.
@@ -72,7 +72,7 @@ def test_friction_alone_brakes_as_newton_says() -> None:
     plant.motor_deg_s, plant.load_deg_s = 1000.0, 20.0
     inertia = truth.motor.inertia_kg_m2 + truth.load_.inertia_kg_m2 / 50.0**2
     for _ in range(2000):
-        plant.advance(0.0, 0.0)
+        plant.step(0.0, 0.0)
     expected_rad = inertia * math.radians(1000.0) ** 2 / 2.0 / truth.motor.coulomb_nm
     assert plant.now.motor_deg == pytest.approx(math.degrees(expected_rad), rel=0.02)
 
@@ -83,7 +83,7 @@ def test_the_load_rings_at_its_frequency_and_fades_as_damped() -> None:
     plant.load_deg_s = 1e-3
     peaks, last, rising = [], 0.0, True
     for step in range(300):
-        plant.advance(0.0, 100.0)
+        plant.step(0.0, 100.0)
         here = plant.now.load_deg
         if rising and here < last:
             peaks.append((step * truth.substep_s, last))
@@ -97,10 +97,10 @@ def test_the_load_rings_at_its_frequency_and_fades_as_damped() -> None:
 def test_a_torque_within_the_friction_moves_nothing_and_one_beyond_it_does() -> None:
     plant = Plant(plain())
     for _ in range(1000):
-        plant.advance(0.0299, 0.0)
+        plant.step(0.0299, 0.0)
     assert plant.now.motor_deg == 0.0
     for _ in range(10):
-        plant.advance(0.0301, 0.0)
+        plant.step(0.0301, 0.0)
     assert plant.now.motor_deg > 0.0
 
 
@@ -108,7 +108,7 @@ def test_friction_at_the_load_leaves_wind_up_at_rest() -> None:
     for coulomb_nm in (0.0, 2.0):
         plant = Plant(plain(load__coulomb_nm=coulomb_nm))
         for torque in [0.04] * 400 + [0.0] * 2000:
-            plant.advance(torque, 0.0)
+            plant.step(torque, 0.0)
         wind_up_nm = abs(plant.now.torque_nm)
         assert plant.load_deg_s == pytest.approx(0.0, abs=1e-9)
         if coulomb_nm:
@@ -121,10 +121,10 @@ def test_the_load_encoder_comes_to_the_load_through_its_coupling() -> None:
     plant = Plant(plain())
     apart = 0.0
     for torque in [0.06] * 200 + [-0.06] * 100:
-        plant.advance(torque, 0.0)
+        plant.step(torque, 0.0)
         apart = max(apart, abs(plant.encoder_deg - plant.now.load_deg))
     for _ in range(400):
-        plant.advance(0.0, 1.0)
+        plant.step(0.0, 1.0)
     assert apart * 3600.0 > 0.1
     assert plant.encoder_deg == pytest.approx(plant.now.load_deg, abs=1e-6)
 

@@ -1,0 +1,266 @@
+"""The compiled loops say what those in Python say, bit for bit, whatever the truth file says."""
+
+from __future__ import annotations
+
+import copy
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.sim import fast
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.loops import Loops
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+compiled = pytest.importorskip("hdbridge.sim.compiled")
+
+ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
+DATA = Truth.load(ARTICLE).model_dump(by_alias=True)
+PLACES: dict[str, Any] = {
+    name: getattr(Machine, name)
+    for name in (
+        "motor_counts",
+        "load_counts",
+        "velocity_counts_s",
+        "torque_nm",
+        "temperature_c",
+        "load_torque_nm",
+        "true_motor_deg",
+        "true_load_deg",
+        "true_output_deg",
+    )
+}
+
+
+@pytest.fixture(autouse=True)
+def may_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(fast.SWITCH, "1")
+    monkeypatch.setattr(fast.waiting, "left", 0)
+
+
+def truth(changes: dict[str, Any]) -> Truth:
+    """The article's axis with keys like ``load__gravity`` changed."""
+    data = copy.deepcopy(DATA)
+    for path, value in changes.items():
+        *parts, last = path.split("__")
+        place = data
+        for part in parts:
+            place = place[part]
+        place[last] = value
+    return Truth.model_validate(data)
+
+
+def numbers(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_subnormal=False)
+
+
+ORDERS = st.lists(
+    st.builds(
+        lambda order, amplitude, phase: {
+            "order": order,
+            "amplitude_arcsec": amplitude,
+            "phase_deg": phase,
+        },
+        st.integers(1, 12),
+        numbers(0.0, 15.0),
+        numbers(-180.0, 180.0),
+    ),
+    max_size=4,
+    unique_by=lambda each: each["order"],
+)
+LAWS = st.one_of(
+    st.none(),
+    st.fixed_dictionaries(
+        {
+            "law": st.just("rolling_friction"),
+            "offset_arcsec": numbers(1.0, 60.0),
+            "width_deg": numbers(1.0, 40.0),
+            "exponent": st.one_of(st.just(2.0), numbers(1.1, 3.0)),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            "law": st.just("maxwell_slip"),
+            "elements": st.lists(
+                st.fixed_dictionaries({"limit_arcsec": numbers(1.0, 30.0), "yield_deg": numbers(0.5, 30.0)}),
+                min_size=1,
+                max_size=6,
+            ),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            "law": st.just("bouc_wen"),
+            "offset_arcsec": numbers(1.0, 60.0),
+            "yield_deg": numbers(1.0, 30.0),
+            "exponent": numbers(1.0, 3.0),
+            "beta": numbers(0.5, 1.0),
+        }
+    ),
+    st.fixed_dictionaries(
+        {
+            "law": st.just("dahl"),
+            "offset_arcsec": numbers(1.0, 60.0),
+            "yield_deg": numbers(1.0, 30.0),
+            "exponent": st.one_of(st.just(1.0), numbers(0.5, 2.0)),
+        }
+    ),
+)
+SOMETIMES = {
+    "gear__motor_orders": ORDERS,
+    "gear__flexspline_orders": ORDERS,
+    "gear__load_orders": ORDERS,
+    "gear__hysteresis": LAWS,
+    "gear__second_hysteresis": LAWS,
+    "gear__ratio": numbers(30.0, 160.0),
+    "gear__torque_growth_per_nm": numbers(0.0, 0.01),
+    "gear__flank": st.just({"shift_deg": 2.0, "travel_deg": 9.0}),
+    "gear__rate_dependence": st.just({"growth_per_decade": 0.2, "from_deg_s": 3.0}),
+    "gear__wear": st.just({"arcsec_per_1000_turns": 900.0, "exponent": 0.7}),
+    "gear__ageing": st.just(
+        {
+            "duration_s": 3.0,
+            "hysteresis_growth": 0.3,
+            "motor_orders": [{"order": 3, "amplitude_arcsec": 4.0, "phase_deg": 10.0}],
+        }
+    ),
+    "gear__creep": st.just([{"time_constant_s": 0.3, "amplitude_arcsec": 4.0, "arcsec_per_nm": 0.2}]),
+    "gear__jumps": st.just([{"time_s": 0.2, "teeth": 1}, {"time_s": 0.5, "teeth": -1}]),
+    "gear__damage": st.just([{"at_deg": 0.5, "width_deg": 2.0, "height_arcsec": 12.0}]),
+    "gear__roller": st.just({"order": 1.37, "amplitude_arcsec": 3.0, "sharpness": 2.2}),
+    "gear__stiffening": st.just(
+        {
+            "first_torque_nm": 2.0,
+            "second_stiffness_nm_per_rad": 19_000.0,
+            "second_torque_nm": 5.0,
+            "third_stiffness_nm_per_rad": 23_000.0,
+        }
+    ),
+    "gear__backlash_arcsec": numbers(0.0, 20.0),
+    "load__inertia_kg_m2": numbers(0.12, 0.5),
+    "load__coulomb_nm": numbers(0.0, 1.0),
+    "load__viscous_nm_s_per_rad": numbers(0.0, 4.0),
+    "load__stribeck": st.just({"breakaway_nm": 1.4, "speed_rad_s": 0.03}),
+    "load__thinning": st.just({"speed_rad_s": 0.1, "exponent": 0.6}),
+    "load__gravity": st.just({"mass_kg": 1.0, "arm_m": 0.2, "down_deg": 30.0, "tilt_deg": 5.0}),
+    "load__vibration": st.just([{"frequency_hz": 11.0, "torque_nm": 0.3, "phase_deg": 20.0}]),
+    "load__presliding": st.just([{"limit_nm": 0.4, "travel_deg": 0.1}, {"limit_nm": 0.2, "travel_deg": 0.3}]),
+    "load__encoder__coupling": st.one_of(
+        st.none(), st.just({"frequency_hz": 150.0, "damping_ratio": 0.1, "play_arcsec": 3.0})
+    ),
+    "load__encoder__late_ms": numbers(0.0, 6.0),
+    "load__encoder__noise_arcsec": numbers(0.0, 1.0),
+    "load__encoder__cable": st.just({"taut_from_deg": 0.1, "arcsec_per_deg": 4.0, "drag": 0.3}),
+    "load__encoder__sensor_warming": st.just({"arcsec_at_10_deg_s": 20.0, "time_constant_s": 0.5}),
+    "motor__encoder__late_ms": numbers(0.0, 6.0),
+    "motor__encoder__disc": st.just({"eccentricity_um": 1.5, "radius_mm": 20.0, "ovality_um": 0.4}),
+    "motor__encoder__losses": st.just([{"time_s": 0.3, "counts": 3}]),
+    "motor__coulomb_nm": numbers(0.0, 0.06),
+    "servo__dead_time_ms": numbers(0.0, 3.0),
+    "servo__load_feedforward": st.none(),
+    "servo__torque_limit_percent": numbers(20.0, 300.0),
+    "temperature__copper_loss_w": numbers(0.0, 50.0),
+    "temperature__zero_drift_arcsec_per_k": numbers(-3.0, 3.0),
+    "temperature__zero_time_constant_s": numbers(0.0, 5.0),
+    "temperature__friction_growth_per_k": numbers(-0.02, 0.02),
+    "temperature__tooth_growth_per_k": numbers(-0.02, 0.02),
+}
+
+
+@st.composite
+def truths(draw: st.DrawFn) -> Truth:
+    chosen = draw(st.lists(st.sampled_from(sorted(SOMETIMES)), unique=True, max_size=14))
+    return truth({name: draw(SOMETIMES[name]) for name in chosen})
+
+
+def led(machine: Machine, seed: int, cycles: int = 150) -> list[tuple[Any, ...]]:
+    """What it says in moves, holds and with its power off."""
+    lot = random.Random(seed)
+    rows, place, speed = [], 0.0, 0.0
+    for cycle in range(cycles):
+        if cycle % 61 == 50:
+            machine.coast(lot.randrange(9), lot.random() < 0.5)
+            place, speed = float(machine.motor_counts), 0.0
+        if cycle % 23 == 0:
+            speed = lot.choice((0.0, lot.uniform(-25.0, 25.0), lot.uniform(-1.0, 1.0)))
+        machine.torque_limit_permille = lot.choice((3000.0, 800.0))
+        machine.follow(place, place + speed, lot.choice((8, 8, 3)))
+        place += speed
+        rows.append(tuple(each.fget(machine) for each in PLACES.values()))
+    return rows
+
+
+@settings(max_examples=60)
+@given(truths(), st.integers(0, 1000))
+def test_compiled_and_python_agree_bit_for_bit(known: Truth, seed: int) -> None:
+    ours, theirs = Machine(known, seed), Machine(known, seed, may_compile=True)
+    assert led(ours, seed) == led(theirs, seed)
+    assert isinstance(ours._loops, Loops)
+    assert isinstance(theirs._loops, compiled.CompiledLoops)
+
+
+def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    axis, known = AxisConfig.load(ARTICLE / "axis.yaml"), Truth.load(ARTICLE)
+
+    def record() -> dict[str, np.ndarray]:
+        with (
+            simulated_bench(known, axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
+            Drive(bus, axis, clock) as drive,
+        ):
+            drive.boot()
+            columns = Bench(drive).run(Stepping(count=3)).record.columns
+            loops.append(node.firmware.motion.machine._loops)  # type: ignore[attr-defined]
+            return dict(columns)
+
+    loops: list[object] = []
+    monkeypatch.setattr(fast.waiting, "left", 10**9)
+    before = record()
+    monkeypatch.setattr(fast.waiting, "left", 100)
+    after = record()
+    assert [type(each) for each in loops] == [Loops, compiled.CompiledLoops]
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_what_cannot_be_compiled_stays_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    seat = truth({"gear__seat": {"slip_arcsec": 5.0, "travel_deg": 200.0}})
+    with pytest.raises(compiled.Uncompilable, match="Seat"):
+        compiled.CompiledLoops(Loops(seat))
+    loops = Loops(seat)
+    assert fast.compiled_loops(loops) is loops
+    monkeypatch.setenv(fast.SWITCH, "0")
+    assert led(Machine(seat, 1, may_compile=True), 1, 20) == led(Machine(seat, 1), 1, 20)
+    loops = Loops(truth({}))
+    assert fast.compiled_loops(loops) is loops
+
+
+def test_a_machine_on_which_they_do_not_agree_stays_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Wrong(compiled.CompiledLoops):  # type: ignore[misc]
+        def follow(self, *arguments: Any) -> Any:
+            first, *rest = super().follow(*arguments)
+            return (np.nextafter(first, 1e9), *rest)
+
+    loops = Loops(truth({}))
+    monkeypatch.setattr(fast, "_agreeing", {})
+    monkeypatch.setattr(compiled, "CompiledLoops", Wrong)
+    assert fast.compiled_loops(loops) is loops
+
+
+def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
+    known = {cls for kinds in compiled.KINDS.values() for cls in kinds.classes}
+    for protocol, kinds in compiled.KINDS.items():
+        (method,) = [
+            name for name in vars(protocol) if not name.startswith("_") and callable(getattr(protocol, name))
+        ]
+        assert all(hasattr(cls, method) for cls in kinds.classes)
+    assert known <= set(compiled.STATES)
