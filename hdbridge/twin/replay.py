@@ -126,7 +126,7 @@ def run(
 
     ``fineness`` is how many counts of the truth's motor encoder make one of the commands'.
     """
-    machine = Machine(truth, seed)
+    machine = Machine(truth, seed, may_compile=True)
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     n = len(commands.counts) - commands.lead
     motor, load, torque, warmth, outer = (np.empty(n) for _ in range(5))
