@@ -5,8 +5,8 @@
 those of `hdbridge` itself.
 """
 
-from hdbridge.testing.history import Event, TrueState
+from hdbridge.testing.history import Event, Frame, TrueState
 from hdbridge.testing.simulateddrive import DriveTime, SimulatedDrive, simulated_drive
 from hdbridge.testing.watched import Fault
 
-__all__ = ["DriveTime", "Event", "Fault", "SimulatedDrive", "TrueState", "simulated_drive"]
+__all__ = ["DriveTime", "Event", "Fault", "Frame", "SimulatedDrive", "TrueState", "simulated_drive"]

@@ -14,7 +14,7 @@ import can
 from hdbridge.clock import Clock
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.testing.faulttable import FAULTS, Reach, find
-from hdbridge.testing.history import Event, TrueState
+from hdbridge.testing.history import Event, Frame, TrueState
 from hdbridge.testing.line import Line, open_line
 from hdbridge.testing.settings import LOCKSTEP, Settings
 from hdbridge.testing.watched import Fault, WatchedDrive, When, words
@@ -133,6 +133,12 @@ class SimulatedDrive:
         """The codes of the EMCY messages that the drive has sent, without those that end an error."""
         codes = (int(each.text[:4], 16) for each in self.log if each.kind == "emcy")
         return tuple(code for code in codes if code)
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The frames that the drive has sent and seen; the newest 1,000."""
+        with self._node.lock:
+            return tuple(self._node.history.frames)
 
     def note(self, text: str) -> None:
         """Put a line of the test's own into the log."""

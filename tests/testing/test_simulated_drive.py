@@ -89,6 +89,17 @@ def test_the_log_has_what_happened_in_order(drive, program):
     assert times == sorted(times)
 
 
+def test_the_frames_that_the_drive_saw_and_sent(drive, program):
+    program.cycle()
+    seen = [(each.message.arbitration_id, each.sent) for each in drive.frames]
+    assert [each for each in seen if each[0] != 0x701][-4:] == [
+        (0x080, False),
+        (0x181, True),
+        (0x281, True),
+        (0x201, False),
+    ]
+
+
 def test_nothing_grows_without_bound():
     kept = history.History()
     assert [each.maxlen for each in vars(kept).values() if isinstance(each, deque)] == [
