@@ -155,7 +155,12 @@ def gather(
         remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
     known = expected(motion) if expected is not None else 0.0
     sigma = noise_arcsec(
-        full.error_arcsec - known, still, facts.motor_count, facts.load_count, facts.commanded
+        full.error_arcsec - known,
+        still,
+        facts.motor_count,
+        facts.load_count,
+        facts.commanded,
+        record.starts,
     )
     full = replace(full, sigma_arcsec=sigma)
     runs = _runs(count, record.starts)
