@@ -21,7 +21,6 @@ from hdbridge.effects.base import (
     Memoryless,
     Moment,
     Motion,
-    Moves,
     Observations,
     Shape,
     Sought,
@@ -58,7 +57,7 @@ class Vibration(Effect):
         False, "its phase drifts and cannot be foreseen, and it is mostly faster than the axis can follow"
     )
     shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, moves=Moves.NEARBY, is_frequency=True),
+        Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),
     )
     repeats: ClassVar[bool] = True
     sought: ClassVar[Sought | None] = Sought.TONE
