@@ -45,7 +45,6 @@ OVERLAPPING = (
     {"velocity_windup", "channel_skew", "rate_dependence"},
     {"channel_skew", "inertial_windup"},
     {"zero_drift", "count_loss"},
-    {"local_defect", "load_order"},
     {"backlash", "wear"},
     {"wear", "amplitude_drift"},
 )
