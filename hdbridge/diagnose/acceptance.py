@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from hdbridge.effects import (
     Backlash,
     CountLoss,
-    Creep,
     FloatArray,
     LocalDefect,
     RatioError,
@@ -39,10 +38,6 @@ SHARE_LEFT = 1e-5
 TURN_DEG = 60.0
 """Motor angle after a reversal within which an elastic loop is felt."""
 LEAST_GAP_ARCSEC = 2.0
-SETTLED_S = 0.5
-LEAST_CREEP_ARCSEC = 0.25
-"""A gear that creeps does so for seconds: what is over so soon after a stop, or is smaller then, is the
-settling of load and servo, or the end of a loop that depends on speed."""
 BEND = 0.6
 """A ramp of which the slope in some third of the travel differs by more than this share is none."""
 
@@ -124,11 +119,6 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
         robust = min(robust, robust_chi_square(estimator, fitted, place, rows=far))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason="seen only where the axis reverses")
-    if isinstance(effect, Creep):
-        late = standing_s(estimator)[estimator.index] > SETTLED_S
-        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=late))
-        if robust < needed or _span(estimator, fitted, place, late) < LEAST_CREEP_ARCSEC:
-            return Gate(robust, needed, passed=False, reason="over as soon as the axis has come to rest")
     if isinstance(effect, RatioError) and _bends(estimator, fitted, place):
         return Gate(robust, needed, passed=False, reason="not the same slope everywhere")
     if isinstance(effect, Backlash) and estimator.data.reversals < 2:
@@ -164,16 +154,6 @@ def _bends(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
     slopes = slope + np.cumsum(step[:3])
     return bool(np.ptp(slopes) > BEND * np.max(np.abs(slopes)) and float(moment @ bend) > ROBUST)
-
-
-def _span(estimator: Estimator, fitted: Fitted, place: int, rows: NDArray[np.bool_]) -> float:
-    """Half the span of an effect over some of the usable points, arcsec."""
-    effect = fitted.hypothesis.effects[place]
-    if not np.any(rows):
-        return 0.0
-    values = (estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients())[rows]
-    low, high = np.quantile(values, [0.002, 0.998])
-    return 0.5 * float(high - low)
 
 
 def standing_s(estimator: Estimator) -> FloatArray:
