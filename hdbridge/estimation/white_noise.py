@@ -25,8 +25,8 @@ ORDINATES = 150
 LOWEST = 0.125
 """Share of the sampling rate below which a spectrum may be that of something slow."""
 QUARTILE = 0.25
-"""White noise is below 0.29 of its mean power at so many frequencies; lines are above it, and may fill a third
-of the spectrum before this level has risen by a quarter."""
+"""White noise has less than 0.29 of its mean power at so many frequencies. Lines have more, and where they
+fill a third of the spectrum the deviation is found a quarter too large."""
 
 
 def noise_arcsec(
@@ -55,17 +55,15 @@ def noise_arcsec(
 
 
 def between_lines(values: FloatArray, rows: NDArray[np.bool_], starts: Sequence[int] = (0,)) -> float:
-    """Standard deviation of the white noise of ``values`` in some rows, by the level between the lines of their
-    spectra; infinite where too few rows are together.
+    """Standard deviation of the white noise of ``values`` in some rows, by the level between the lines of
+    their spectra; infinite where too few rows are together.
 
     Third differences take away what is slow; their spectrum is divided by that of white noise.
     """
     edge = np.zeros(len(rows) + 1, dtype=bool)
     edge[1:-1] = np.diff(rows)
     edge[[*starts, 0, len(rows)]] = True
-    runs = [
-        values[first:last] for first, last in pairwise(np.flatnonzero(edge).tolist()) if rows[first]
-    ]
+    runs = [values[first:last] for first, last in pairwise(np.flatnonzero(edge).tolist()) if rows[first]]
     for size in SEGMENTS:
         segments = [run[at : at + size] for run in runs for at in range(0, len(run) - size + 1, size)]
         if len(segments) * (size // 2 + 1 - round(LOWEST * size)) < ORDINATES:

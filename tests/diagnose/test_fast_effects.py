@@ -1,0 +1,96 @@
+"""What is fast is no noise: the floor beside it, its frequency, and what is over soon after a stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.estimation.white_noise import between_lines, noise_arcsec
+from hdbridge.model import TransmissionModel
+from hdbridge.records.record import Record
+
+NOISE_ARCSEC = 0.35
+"""Of the plant: white noise, and the rounding of its load encoder."""
+
+
+def diagnosed(plant: ModuleType, effects: dict[str, Any], seed: int, rate_hz: float = 16.0) -> Diagnosis:
+    plan = plant.Plan(rate_hz=rate_hz, scale=0.1, load_turns=1.05, steps=8)
+    record = plant.record(plant.Truth(effects=effects), plan, seed)
+    return diagnose(Record(record), TransmissionModel.from_text(plant.model_text(seed + 5)))
+
+
+def names(found: Diagnosis) -> list[str]:
+    return [each.cause for each in found.findings]
+
+
+def often_enough(right: int, of: int, rate: float) -> bool:
+    """Whether so many right ones are no evidence against a rate, at 1 %."""
+    return float(binom.cdf(right, of, rate)) > 0.01
+
+
+@pytest.mark.parametrize("hz", [3.0, 8.0, 15.0, 22.0])
+def test_a_vibration_is_no_noise(hz: float) -> None:
+    time_s = np.arange(6000) / 50.0
+    noise = 0.3 * np.random.default_rng(int(hz)).standard_normal(len(time_s))
+    shaken = noise + 5.0 * np.cos(2.0 * np.pi * hz * time_s)
+    still = time_s < 40.0
+    assert noise_arcsec(shaken, still, 0.0, 0.0, True) == pytest.approx(0.3, rel=0.25)
+
+
+def test_white_noise_is_found_in_short_stretches_and_something_slow_is_none_of_it() -> None:
+    rng = np.random.default_rng(4)
+    rows = np.arange(20_000) % 50 < 40
+    slow = 40.0 * np.sin(np.arange(len(rows)) / 300.0)
+    assert between_lines(rng.standard_normal(len(rows)) + slow, rows) == pytest.approx(1.0, rel=0.1)
+
+
+def test_too_little_of_it_has_no_spectrum() -> None:
+    assert between_lines(np.zeros(60), np.ones(60, dtype=bool)) == np.inf
+
+
+def test_a_vibration_leaves_nothing_at_a_rate_that_shows_it_whole(plant: ModuleType) -> None:
+    found = diagnosed(plant, {"vibration": {"size": 5.0, "hz": 10.43}}, seed=31, rate_hz=50.0)
+    assert names(found) == ["vibration"]
+    assert found.noise_floor_arcsec == pytest.approx(NOISE_ARCSEC, rel=0.15)
+    assert found.extended.rms_arcsec == pytest.approx(NOISE_ARCSEC, rel=0.15)
+
+
+def creeping(seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    tau_s, build_up = (
+        float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))),
+        float(rng.choice([0.03, 0.3, 1.0])),
+    )
+    return {"creep": {"size": float(rng.uniform(3.0, 6.0)), "tau": tau_s, "build": build_up}}
+
+
+def damaged(seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    size = float(rng.uniform(4.0, 7.0))
+    return {
+        "load_order": {"orders": [(1, 1.4 * size, float(rng.uniform(0, 360))), (2, 0.7 * size, 80.0)]},
+        "local_defect": {"size": size, "at": float(rng.uniform(30, 330)), "width": 2.0},
+    }
+
+
+def test_creep_that_is_over_half_a_second_after_a_stop_is_named(plant: ModuleType) -> None:
+    assert names(diagnosed(plant, {"creep": {"size": 4.0, "tau": 0.5, "build": 1.0}}, seed=43)) == ["creep"]
+
+
+def test_a_damaged_tooth_is_named_beside_an_order_of_the_load(plant: ModuleType) -> None:
+    assert names(diagnosed(plant, damaged(51), seed=51)) == ["load_order", "local_defect"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("draw", [creeping, damaged])
+def test_what_is_hidden_is_named_and_nothing_else(
+    plant: ModuleType, draw: Callable[[int], dict[str, Any]]
+) -> None:
+    right = sum(set(names(diagnosed(plant, draw(seed), seed))) == set(draw(seed)) for seed in range(601, 613))
+    assert often_enough(right, 12, 0.95)
