@@ -38,11 +38,12 @@ class Fault:
     """When it began, in the drive's time; None while it waits for its moment."""
     ended_s: float | None = None
     """When it ended or was called off; None before."""
-    _end: Callable[[Fault], None] = field(default=lambda _: None, repr=False)
+    _finish: Callable[[Fault], None] = field(default=lambda _: None, repr=False)
+    _undo: End | None = field(default=None, repr=False)
 
     def end(self) -> None:
         """End it now; one that has not begun is called off. To end it again is no error."""
-        self._end(self)
+        self._finish(self)
 
     def __enter__(self) -> Self:
         return self
@@ -97,7 +98,6 @@ class WatchedDrive(SimulatedDrive):
         self.last_tpdos: dict[int, bytes] = {}
         """The data last sent, by identifier."""
         self._plans: list[_Plan] = []
-        self._ends: dict[int, End] = {}
         self._begin_s = clock.now()
         super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate)
         self._last_state, self._last_nmt = self.firmware.state, self.nmt
@@ -126,11 +126,11 @@ class WatchedDrive(SimulatedDrive):
                 return
             fault.begun_s = self.time_s
             self.note("fault", str(fault))
-            self._ends[id(fault)] = begin()
+            fault._undo = begin()
             if for_s is not None:
                 self._plans.append(_Plan(lambda: self._finish(fault), at_s=self._clock.now() + for_s))
 
-        fault._end = self._finish
+        fault._finish = self._finish
         with self.lock:
             if when.beyond_deg is not None:
                 below = self.machine.true_load_deg < when.beyond_deg
@@ -144,10 +144,9 @@ class WatchedDrive(SimulatedDrive):
             if fault.ended_s is not None:
                 return
             fault.ended_s = self.time_s
-            end = self._ends.pop(id(fault), None)
-            if end is not None:
-                end()
-            self.note("fault", f"{fault.name} {'ends' if end else 'is called off'}")
+            if fault._undo is not None:
+                fault._undo()
+            self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is called off'}")
 
     def tell_instead(self, index: int, subindex: int, value: int) -> End:
         """Say another value of an object than it has, by SDO and in TPDOs."""
