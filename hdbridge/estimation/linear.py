@@ -7,28 +7,28 @@ from scipy.linalg.lapack import dposv
 
 from hdbridge.effects import FloatArray
 
-RIDGE = 1e-11
-"""Share of each column's square that is added to it, so that what is singular has a small solution."""
-
 NOTHING = 1e-20
 """Information below this is none."""
 SEEN = 1e-9
 """Share of the largest eigenvalue of scaled columns below which a direction is not in the data."""
+SUSPECT = 1e-6
+"""Square of a Cholesky factor's diagonal below which the smallest eigenvalue is looked at."""
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of a positive semi-definite system, columns scaled to one; small where it is singular."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    spread = scale if right.ndim == 1 else scale[:, np.newaxis]
+    """Solution of a positive semi-definite system, columns scaled to one; what is not seen stays at zero."""
     if not len(matrix):
         return np.zeros_like(right)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    spread = scale if right.ndim == 1 else scale[:, np.newaxis]
     scaled = matrix / np.outer(scale, scale)
-    ridge = RIDGE
-    while True:
-        _, solved, failed = dposv(scaled + ridge * np.eye(len(scaled)), right / spread, lower=1)
-        if not failed:
-            return np.asarray(solved / spread).reshape(right.shape)
-        ridge *= 100.0  # rounding has made it indefinite
+    factor, solved, failed = dposv(scaled, right / spread, lower=1)
+    if failed or np.min(np.diag(factor)) ** 2 < SUSPECT:
+        values, vectors = np.linalg.eigh(scaled)
+        kept = values > SEEN * max(float(values[-1]), 1e-300)
+        inner = vectors[:, kept].T @ (right / spread)
+        solved = vectors[:, kept] @ (inner / (values[kept] if right.ndim == 1 else values[kept, np.newaxis]))
+    return np.asarray(solved / spread).reshape(right.shape)
 
 
 def inverse_symmetric(matrix: FloatArray) -> FloatArray:
