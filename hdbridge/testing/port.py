@@ -166,7 +166,8 @@ class _LockstepEnd(LockstepBus):
     def __init__(self, channel: str, clock: VirtualClock, check: Callable[[], bool]) -> None:
         super().__init__(channel, clock)
         self._check = check
-        self._thread: int | None = None
+        self._thread = threading.get_ident()
+        self._shared = False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._check_thread()
@@ -182,13 +183,12 @@ class _LockstepEnd(LockstepBus):
         return message if ready else None
 
     def _check_thread(self) -> None:
-        here = threading.get_ident()
-        if self._thread is None:
-            self._thread = here
-        if self._thread != here:
+        # Told to every thread from then on: what a can.Notifier's thread raises is easily overlooked.
+        self._shared |= threading.get_ident() != self._thread
+        if self._shared:
             raise can.CanOperationError(
-                "a lockstep is for a program of one thread, and a second one uses the bus (a can.Notifier, "
-                "the package canopen); choose the bus 'virtual', which runs in real time"
+                "a lockstep is for a program of one thread, and a second one uses this bus (a can.Notifier, the "
+                "package canopen); choose the bus 'virtual', which runs in real time"
             )
 
 

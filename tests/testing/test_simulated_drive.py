@@ -140,6 +140,8 @@ def test_a_second_thread_in_lockstep_is_refused_with_the_remedy(drive):
     thread.start()
     thread.join()
     assert "choose the bus 'virtual'" in complaints[0]
+    with pytest.raises(can.CanOperationError, match="one thread"):
+        bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
 
 
 def test_a_bus_is_only_there_with_its_drive():
