@@ -187,8 +187,8 @@ class _LockstepEnd(LockstepBus):
         self._shared |= threading.get_ident() != self._thread
         if self._shared:
             raise can.CanOperationError(
-                "a lockstep is for a program of one thread, and a second one uses this bus (a can.Notifier, the "
-                "package canopen); choose the bus 'virtual', which runs in real time"
+                "a lockstep is for a program of one thread, and a second one uses this bus (a can.Notifier, "
+                "the package canopen); choose the bus 'virtual', which runs in real time"
             )
 
 
