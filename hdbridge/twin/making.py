@@ -1,0 +1,69 @@
+"""A twin from recordings: the fit, what was wrong before, what cannot be told apart, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.recording import Recording, versions_here
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import Comparison, compare
+from hdbridge.twin.fitting import Fitted, fit
+from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, noise_floor, prepare
+from hdbridge.twin.naming import alike, name_causes, unexplained
+from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.replays import Replays
+from hdbridge.twin.result import HELD_OUT, Twin
+
+NAMING_S = 60.0
+"""Causes are named on pieces that take the axis about so long."""
+
+
+def fit_twin(
+    recordings: Sequence[Recording],
+    axis: AxisConfig,
+    start: Truth,
+    progress: Callable[[float], None] = lambda _: None,
+    workers: int | None = None,
+) -> Twin:
+    """The twin of an axis, from recordings that have the commanded motor angle.
+
+    ``start`` is what is assumed of it: the translated axis file and model, or an older twin. Replays run in
+    ``workers`` processes. InputError where a recording has no command or is of another gear.
+    """
+    whole = Recording.joined(list(recordings))
+    fitted = fit(whole, axis, start, lambda share: progress(0.9 * share), workers)
+    data = coarse(prepare(whole, axis, start), NAMING_S)
+    with Replays(data, workers) as replays:
+        sets = alike(fitted)
+        findings = name_causes(replays, start, fitted, sets)
+        (left,) = replays([fitted.truth])
+        rest = unexplained(data, left, noise_floor(data))
+    truth = with_knowledge(fitted)
+    before, after = (_compared(whole, axis, each) for each in (start, truth))
+    progress(1.0)
+    return Twin(truth, findings, sets, rest, before, after)
+
+
+def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
+    """A recording against one simulation, by kind of leg and for those held out."""
+    held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
+    simulated = replay_directly(whole, axis, truth)
+    return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
+
+
+def with_knowledge(fitted: Fitted) -> Truth:
+    """The fitted truth with its intervals and what a later check needs, as its file has it."""
+    intervals = fitted.intervals()
+    about: dict[str, Any] = {
+        "parameters": [each.name for each in fitted.parameters],
+        "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
+        "noise": {name: float(f"{fitted.scales[name]:.6g}") for name in CHANNELS},
+    }
+    return fitted.truth.model_copy(
+        update={
+            "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
+            "provenance": {**fitted.truth.provenance, "versions": versions_here(), "fit": about},
+        }
+    )

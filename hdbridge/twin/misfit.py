@@ -1,0 +1,274 @@
+"""What a recording shows and a replay does not, channel by channel: the residuals that a fit makes small.
+
+The replay is smooth: encoders and torque unrounded, no noise, and loops that close on a finer encoder, so
+that the residuals are smooth in the plant's parameters. What rounding and noise do is in the scale of each
+channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import FloatArray
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
+from hdbridge.twin.replay import Commands, commands_of, legs_of, run
+from hdbridge.units import ARCSEC_PER_DEG
+
+FINENESS = 64
+"""The loops' encoder is so much finer in a smooth replay."""
+CHANNELS = (FOLLOWING, TORQUE, LOAD)
+UNKNOWN_DEG = 60.0
+"""Motor travel after which the elastic state no longer depends on what went before the recording."""
+RINGING_S = 0.25
+"""So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
+LONGEST_LEG_S = 2.0
+"""A longer leg counts as several: residuals further apart than this have nothing to do with each other."""
+COARSE_S = 15.0
+"""The first steps of a fit are made on pieces that take the axis about so long."""
+HELD_OUT = 4
+MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One part of a recording, prepared for replays."""
+
+    commands: Commands
+    measured: Mapping[str, FloatArray]
+    """By channel: following error in degrees of the motor, torque in Nm, load angle in arcsec."""
+    counts: Mapping[str, FloatArray]
+    """By channel, for each row 1 where it counts and else 0."""
+    leg: FloatArray
+    """Number of the leg of each row, from zero."""
+    kind: tuple[str, ...]
+    """Kind of each of its legs."""
+    out: FloatArray
+    """For each row 1 where its leg is held out, else 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Recordings, prepared for replays through a truth like ``base``."""
+
+    axis: AxisConfig
+    base: Truth
+    pieces: tuple[Piece, ...]
+
+    @property
+    def leg(self) -> FloatArray:
+        """Number of the leg of each row, through all pieces."""
+        firsts = np.cumsum([0, *(len(each.kind) for each in self.pieces)])[:-1]
+        return np.concatenate([first + each.leg for first, each in zip(firsts, self.pieces, strict=True)])
+
+    @property
+    def out(self) -> FloatArray:
+        """For each row 1 where its leg is held out, else 0."""
+        return np.concatenate([each.out for each in self.pieces])
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each leg."""
+        return tuple(kind for each in self.pieces for kind in each.kind)
+
+    @property
+    def duration_s(self) -> float:
+        """How long one replay takes on the axis."""
+        return sum(len(each.commands.counts) * each.commands.cycle_s for each in self.pieces)
+
+
+def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
+    """The legs that a fit does not see: each `HELD_OUT`-th of its kind."""
+    seen: dict[str, int] = {}
+    out = []
+    for leg in legs_of(recording):
+        seen[leg.kind] = seen.get(leg.kind, 0) + 1
+        if seen[leg.kind] % HELD_OUT == 0:
+            out.append(leg)
+    return tuple(out)
+
+
+def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
+    """The recording's parts; InputError where it has no command or is of another ratio."""
+    recording.record.check_ratio(axis.gear.ratio)
+    legs, held = legs_of(recording), held_out_legs(recording)
+    pieces = []
+    for part in recording.record.parts():
+        commands = commands_of(part, axis, base)
+        numbers, kinds = _legs(part, [(each.kind, each.start_s, each.end_s) for each in legs])
+        out = np.zeros(len(part))
+        for each in held:
+            out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
+        pieces.append(_piece(part, commands, numbers, kinds, out))
+    return Data(axis, base, tuple(pieces))
+
+
+def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
+    """Pieces that take the axis about ``wanted_s``: as many kinds of motion as there is time for."""
+    left = sorted(data.pieces, key=lambda each: len(each.commands.counts))
+    taken: list[Piece] = []
+    duration_s, kinds = 0.0, set[str]()
+    for again in range(2):
+        for piece in left:
+            length_s = len(piece.commands.counts) * piece.commands.cycle_s
+            new = not kinds.issuperset(piece.kind)
+            if any(piece is each for each in taken) or (taken and duration_s + length_s > wanted_s):
+                continue
+            if new or again:
+                taken.append(piece)
+                duration_s += length_s
+                kinds.update(piece.kind)
+    return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
+
+
+def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
+    """What a smooth replay shows, by piece and channel, as `Piece.measured` has it."""
+    fine, fineness = smooth(truth)
+    shown = []
+    for piece in data.pieces:
+        commands = piece.commands
+        traces = run(commands, data.axis, fine, fineness=fineness, smooth=True)
+        wanted = _demand_deg(commands, data.axis)
+        shown.append(
+            {
+                FOLLOWING: wanted - traces.motor_deg,
+                TORQUE: traces.torque_nm,
+                LOAD: traces.load_deg * ARCSEC_PER_DEG,
+            }
+        )
+    return shown
+
+
+def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
+    """Measured minus simulated, by channel, over all rows; zero where a row does not count.
+
+    The load's angle has no common zero: each piece's mean difference is taken off.
+    """
+    found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
+    for piece, shown in zip(data.pieces, traces_of(data, truth), strict=True):
+        for name in CHANNELS:
+            weight = piece.counts[name]
+            off = piece.measured[name] - shown[name]
+            if name == LOAD and weight.any():
+                off = off - np.median(off[weight > 0.0])
+            found[name].append(off * weight)
+    return {name: np.concatenate(each) for name, each in found.items()}
+
+
+def counted(data: Data) -> dict[str, FloatArray]:
+    """By channel, for each row 1 where it counts and else 0."""
+    return {name: np.concatenate([each.counts[name] for each in data.pieces]) for name in CHANNELS}
+
+
+def noise_floor(data: Data) -> dict[str, float]:
+    """Least scale of each channel: its rounding, and what its encoder's rounding makes of the torque."""
+    axis, truth = data.axis, data.base
+    step_deg = 360.0 / axis.motor_encoder.counts_per_turn
+    rated_nm = axis.drive.rated_torque_nm
+    encoder = truth.motor.encoder
+    fine_rad = 2.0 * np.pi / (encoder.counts_per_turn * encoder.interpolation)
+    shaken = truth.servo.velocity_gain_nm_s_per_rad * fine_rad / truth.substep_s
+    load = truth.load_.encoder
+    return {
+        FOLLOWING: step_deg / 12.0**0.5,
+        TORQUE: float(np.hypot(1e-3 * rated_nm, shaken)) / 12.0**0.5,
+        LOAD: float(np.hypot(axis.load_encoder.resolution_arcsec / 12.0**0.5, load.noise_arcsec)),
+    }
+
+
+def scales(data: Data, found: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Scale of each channel from its residuals, robustly; no less than its noise."""
+    floor, counts = noise_floor(data), counted(data)
+    given = {}
+    for name in CHANNELS:
+        inside = found[name][counts[name] > 0.0]
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(inside))) if len(inside) else 0.0
+        given[name] = max(floor[name], spread)
+    return given
+
+
+def smooth(truth: Truth) -> tuple[Truth, int]:
+    """The truth with finer encoders and no noise, and how many of its motor counts make one before."""
+    motor, load, servo = truth.motor.encoder, truth.load_.encoder, truth.servo
+    fineness = max(1, min(FINENESS, (2**31 - 1) // motor.counts_per_turn))
+    load_fineness = max(1, min(FINENESS, (2**31 - 1) // load.counts_per_turn))
+    encoder = motor.model_copy(
+        update={
+            "counts_per_turn": motor.counts_per_turn * fineness,
+            "zero_counts": motor.zero_counts * fineness,
+        }
+    )
+    at_load = load.model_copy(
+        update={
+            "counts_per_turn": load.counts_per_turn * load_fineness,
+            "zero_counts": load.zero_counts * load_fineness,
+            "noise_arcsec": 0.0,
+        }
+    )
+    # The bands are in steps of the loops' encoder.
+    loops = servo.model_copy(
+        update={
+            "integral_dead_band": (servo.integral_dead_band + 0.5) * fineness - 0.5,
+            "hunting_band": (servo.hunting_band + 0.5) * fineness - 0.5,
+        }
+    )
+    return truth.model_copy(
+        update={
+            "motor": truth.motor.model_copy(update={"encoder": encoder}),
+            "load_": truth.load_.model_copy(update={"encoder": at_load}),
+            "servo": loops,
+        }
+    ), fineness
+
+
+def _piece(
+    part: Record, commands: Commands, leg: FloatArray, kinds: tuple[str, ...], out: FloatArray
+) -> Piece:
+    target = part.motor_target_deg
+    assert target is not None  # commands_of has refused it
+    moved = np.abs(np.diff(target, prepend=target[0]))
+    known = np.cumsum(np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0])))
+    last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
+    stuck = part.time_s - last_moved_s > RINGING_S
+    everywhere = np.ones(len(part))
+    torque = part.columns.get("motor_torque_nm")
+    measured = {
+        FOLLOWING: target - part.motor_position_deg,
+        TORQUE: torque if torque is not None else np.zeros(len(part)),
+        LOAD: part.load_position_deg * ARCSEC_PER_DEG,
+    }
+    counts = {
+        FOLLOWING: everywhere,
+        TORQUE: np.where(stuck, 0.0, 1.0) if torque is not None else 0.0 * everywhere,
+        LOAD: np.where(known > UNKNOWN_DEG, 1.0, 0.0),
+    }
+    return Piece(commands, measured, counts, leg, kinds, out)
+
+
+def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:
+    """Number of the leg of each row, from zero, and the legs' kinds; rows between legs belong to the last."""
+    starts: list[tuple[float, str]] = []
+    for kind, start_s, end_s in legs:
+        if end_s < part.time_s[0] or start_s > part.time_s[-1]:
+            continue
+        pieces = max(1, int((end_s - start_s) // LONGEST_LEG_S))
+        starts += [(start_s + each * (end_s - start_s) / pieces, kind) for each in range(pieces)]
+    if not starts:
+        starts = [(float(part.time_s[0]), "motion")]
+    starts.sort(key=lambda each: each[0])
+    places = np.searchsorted([start for start, _ in starts], part.time_s, side="right") - 1
+    return np.maximum(places, 0).astype(np.float64), tuple(kind for _, kind in starts)
+
+
+def _demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
+    """The commanded motor angle at each row."""
+    counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
+    encoder = axis.motor_encoder
+    deg = encoder.direction * counts * 360.0 / encoder.counts_per_turn
+    return np.interp(commands.row_cycles, np.arange(len(counts)), deg)

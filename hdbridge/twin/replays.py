@@ -1,0 +1,55 @@
+"""Many replays side by side, in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, Self
+
+from hdbridge.effects import FloatArray
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import Data, residuals
+
+WORTH_S = 2.0
+"""Replays that take the axis no longer than this are made here: a process costs as much as some of them."""
+
+_data: Data | None = None
+"""A worker's own recordings."""
+
+
+class Replays:
+    """Replays of the same recordings; a context manager, because of its processes."""
+
+    def __init__(self, data: Data, workers: int | None = None) -> None:
+        self.data = data
+        wanted = workers if workers is not None else min(os.cpu_count() or 1, 8)
+        self._pool: ProcessPoolExecutor | None = None
+        if wanted > 1 and data.duration_s > WORTH_S:
+            # Not forked: this process may have threads, and locks that they hold.
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(wanted, context, _begin, (data,))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
+        """The residuals of each truth, in order."""
+        if self._pool is None:
+            return [residuals(self.data, each) for each in truths]
+        return list(self._pool.map(_residuals, truths))
+
+
+def _begin(data: Data) -> None:
+    global _data  # noqa: PLW0603 - a process's own, set once where it begins
+    _data = data
+
+
+def _residuals(truth: Truth) -> dict[str, FloatArray]:
+    assert _data is not None
+    return residuals(_data, truth)

@@ -1,0 +1,99 @@
+"""A twin is fitted to what an axis does, and says what has changed since."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.recording import Recording
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.check import check
+from hdbridge.twin.fitting import solve
+from hdbridge.twin.making import with_knowledge
+from hdbridge.twin.misfit import CHANNELS, noise_floor, prepare, residuals
+from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
+from hdbridge.twin.regressions import read_off
+from hdbridge.twin.replays import Replays
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS = AxisConfig.load(DEMO)
+TRUTH = Truth.load(DEMO)
+NAMES = ("Coulomb friction", "load inertia", "servo dead time")
+
+
+@cache
+def recorded(seed: int = 0, **changes: float) -> Recording:
+    """Three long steps each way on the demo axis, with some of its values changed (by their names)."""
+    values = {name.replace("_", " "): value for name, value in changes.items()}
+    truth = with_values(TRUTH, values) if values else TRUTH
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, seed) as (bus, clock, _),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        return Bench(drive).run(Stepping(3, step_deg=150.0))
+
+
+@cache
+def twin() -> Truth:
+    """The demo axis as a fit knows it that began at its truth."""
+    parameters = tuple(BY_NAME[name] for name in NAMES)
+    with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
+        prior = np.array(coordinates(TRUTH, parameters))
+        return with_knowledge(solve(replays, TRUTH, parameters, prior, 2))
+
+
+def test_a_replay_of_the_true_axis_leaves_rounding_and_noise() -> None:
+    data = prepare(recorded(), AXIS, TRUTH)
+    left, floor = residuals(data, TRUTH), noise_floor(data)
+    for name in CHANNELS:
+        inside = left[name][left[name] != 0.0]
+        assert np.median(np.abs(inside)) < 2.0 * floor[name], name
+
+
+def test_regressions_read_inertia_friction_and_lag_off_the_recording() -> None:
+    found = read_off(prepare(recorded(), AXIS, TRUTH))
+    whole = TRUTH.motor.inertia_kg_m2 + TRUTH.load_.inertia_kg_m2 / TRUTH.gear.ratio**2
+    assert found.inertia_kg_m2 == pytest.approx(whole, rel=0.2)
+    assert found.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.2)
+    assert found.lag_s == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
+
+
+def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
+    parameters = tuple(BY_NAME[name] for name in NAMES)
+    wrong = with_values(TRUTH, {"Coulomb friction": 0.045, "load inertia": 0.18, "servo dead time": 0.6})
+    with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
+        prior = np.array(coordinates(wrong, parameters))
+        fitted = solve(replays, wrong, parameters, prior, 8)
+    for each in parameters:
+        true, found = value_in(TRUTH, each), value_in(fitted.truth, each)
+        assert found == pytest.approx(true, rel=0.03, abs=0.05), each.name
+
+
+def test_a_check_is_silent_where_nothing_has_changed() -> None:
+    told = check(recorded(seed=1), AXIS, twin(), workers=1)
+    assert told.changes == ()
+    assert told.sentence == "Nothing has changed since the twin was made."
+
+
+def test_a_check_names_what_has_changed() -> None:
+    changed = recorded(seed=2, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
+    told = check(changed, AXIS, twin(), workers=1)
+    assert [each.cause for each in told.changes] == ["load inertia"]
+    (inertia,) = told.changes[0].parameters
+    assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
+    assert "load inertia" in told.sentence
+
+
+def test_a_check_needs_a_twin_that_was_fitted() -> None:
+    with pytest.raises(InputError, match=r"provenance\.fit"):
+        check(recorded(), AXIS, TRUTH)

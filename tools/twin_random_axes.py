@@ -1,0 +1,294 @@
+"""Twin axes drawn at random on the simulated drive, and hold the twins against what the axes are.
+
+    .venv/bin/python tools/twin_random_axes.py --axes 8 --checks
+
+Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to 3
+ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. It is benched over
+frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.defaults`), and judged on
+another motion that the fit has not seen. Printed for each axis: the differences on that motion, how many of
+the 95 % intervals hold the truth, and what the check says after one thing, two, or nothing in the plant has
+changed.
+
+The gear's own transmission error is given, as a calibration gives it (tools/calibrate_random_axes.py measures
+that): this tool is about the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+
+import numpy as np
+import yaml
+from scipy.stats import beta
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.procedures.plan import Plan
+from hdbridge.records.recording import Recording
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.check import check
+from hdbridge.twin.comparison import compare
+from hdbridge.twin.defaults import default_truth
+from hdbridge.twin.making import fit_twin
+from hdbridge.twin.parameters import BY_NAME, value_in, with_values
+from hdbridge.twin.replay import replay
+
+DEMO = Path(__file__).parents[1] / "profiles" / "demo"
+LAWS = ("rolling_friction", "maxwell_slip", "bouc_wen", "dahl")
+ANOTHER = """
+schema: hdbridge.plan/1
+name: another
+precondition_deg: 60
+reference_s: 0.3
+acceleration_deg_s2: 10000000
+procedures:
+  - {procedure: stepping, count: 6, step_deg: 97}
+  - {procedure: sweep, motor_turns: 3, motor_turns_per_s: 2}
+  - {procedure: sines, amplitudes_deg: [20], frequency_hz: 6, periods: 8}
+"""
+CHANGES: dict[str, tuple[str, Callable[[Truth], dict[str, float]]]] = {
+    "friction doubled": ("friction", lambda t: {"Coulomb friction": 2.0 * t.motor.coulomb_nm}),
+    "load inertia x 1.5": ("load inertia", lambda t: {"load inertia": 1.5 * t.load_.inertia_kg_m2}),
+    "servo detuned": ("servo gains", lambda t: {"position gain": 0.6 * t.servo.position_gain_per_s}),
+    "1 ms of delay": ("servo dead time", lambda t: {"servo dead time": t.servo.dead_time_ms + 1.0}),
+    "spring 30 % softer": (
+        "gear stiffness",
+        lambda t: {"gear stiffness": 0.7 * t.gear.stiffness_nm_per_rad},
+    ),
+    "warmer gear": ("warmth", lambda t: {"temperature": t.temperature.ambient_c + 15.0}),
+}
+"""By name: the cause that is to be named, and what becomes of the plant."""
+
+
+@dataclass
+class Outcome:
+    seed: int
+    about: str
+    channels: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """By channel, on the other motion: the difference as a share of the measured signal, and in its noise."""
+    held: int = 0
+    intervals: int = 0
+    missed: list[str] = field(default_factory=list)
+    fit_s: float = 0.0
+    checks: list[tuple[str, set[str], set[str]]] = field(default_factory=list)
+    """What was changed, the causes that are to be named, and those that were."""
+
+
+def draw(seed: int) -> tuple[AxisConfig, Truth]:
+    """A random axis."""
+    rng = np.random.default_rng(seed)
+
+    def some() -> float:
+        """Half to double."""
+        return float(np.exp(rng.uniform(math.log(0.5), math.log(2.0))))
+
+    ratio = float(rng.integers(60, 321)) / 2.0
+    data = yaml.safe_load((DEMO / "axis.yaml").read_text())
+    data["name"] = f"random-{seed}"
+    data["gear"] = {"ratio": ratio}
+    for name in ("velocity_deg_s", "acceleration_deg_s2", "jerk_deg_s3"):
+        data["limits"][name] *= 50.0 / ratio
+    axis = AxisConfig.from_text(yaml.safe_dump(data), DEMO / "axis.yaml")
+    truth = default_truth(axis).model_dump(by_alias=True, exclude_none=True)
+    motor, servo, gear, load = truth["motor"], truth["servo"], truth["gear"], truth["load"]
+    for name in ("inertia_kg_m2", "coulomb_nm", "viscous_nm_s_per_rad"):
+        motor[name] *= some()
+    for name in (
+        "position_gain_per_s", "velocity_gain_nm_s_per_rad", "integral_time_ms", "command_filter_ms",
+        "inertia_feedforward_kg_m2", "viscous_feedforward_nm_s_per_rad", "friction_feedforward_nm",
+    ):  # fmt: skip
+        servo[name] *= some()
+    servo["load_feedforward"]["inertia_kg_m2"] *= some()
+    servo["dead_time_ms"] = float(rng.uniform(0.0, 3.0))
+    load["inertia_kg_m2"] *= some()
+    turn = math.tau * float(np.exp(rng.uniform(math.log(15.0), math.log(80.0))))
+    gear["stiffness_nm_per_rad"] = load["inertia_kg_m2"] * turn**2
+    gear["damping_nm_s_per_rad"] = 2.0 * float(rng.uniform(0.03, 0.2)) * load["inertia_kg_m2"] * turn
+    load["encoder"]["noise_arcsec"] = float(rng.uniform(0.3, 2.0))
+    gear["hysteresis"] = _law(LAWS[seed % len(LAWS)], rng)
+    gear["motor_orders"] = [
+        {
+            "order": int(order),
+            "amplitude_arcsec": float(np.exp(rng.uniform(math.log(0.8), math.log(14.0)))),
+            "phase_deg": float(rng.uniform(-180.0, 180.0)),
+        }
+        for order in sorted(rng.choice(np.arange(1, 11), 5, replace=False))
+    ]
+    truth.setdefault("temperature", {})["friction_growth_per_k"] = -0.015
+    return axis, Truth.model_validate(truth)
+
+
+def _law(law: str, rng: np.random.Generator) -> dict[str, Any]:
+    offset, width = float(rng.uniform(15.0, 80.0)), float(rng.uniform(5.0, 40.0))
+    if law == "maxwell_slip":
+        shares = ((0.4, 0.2), (0.35, 0.5), (0.25, 1.0))
+        return {
+            "law": law,
+            "elements": [{"limit_arcsec": offset * a, "yield_deg": width * b} for a, b in shares],
+        }
+    if law == "rolling_friction":
+        exponent = float(rng.uniform(1.2, 2.6))
+        return {"law": law, "offset_arcsec": offset, "width_deg": width, "exponent": exponent}
+    return {"law": law, "offset_arcsec": offset, "yield_deg": width / 3.0}
+
+
+def usual(axis: AxisConfig, truth: Truth) -> Truth:
+    """Where the fit begins: usual values, with the gear's transmission error as a calibration gives it."""
+    start = default_truth(axis)
+    known = {"motor_orders": truth.gear.motor_orders, "hysteresis": truth.gear.hysteresis}
+    return start.model_copy(
+        update={
+            "gear": start.gear.model_copy(update=known),
+            "temperature": start.temperature.model_copy(
+                update={"friction_growth_per_k": truth.temperature.friction_growth_per_k}
+            ),
+        }
+    )
+
+
+def without_noise(truth: Truth) -> Truth:
+    """So that a difference is not that of two draws of noise."""
+    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
+    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+
+
+def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
+    """A plan on the bench, over frames, task by task."""
+    parts = []
+    with (
+        simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        place = Bench(drive)
+        for task in plan.tasks(place.view).tasks:
+            run = place.run(task.procedure)
+            parts.append(Recording(run.record, run.segments, run.axis, run.ratio))
+    return Recording.joined(parts)
+
+
+def one(seed: int, *, checks: bool, workers: int) -> Outcome:
+    """Draw, bench, twin, judge."""
+    axis, truth = draw(seed)
+    plan, another = Plan.load("dynamics"), Plan.model_validate(yaml.safe_load(ANOTHER))
+    recording, other = bench(axis, truth, plan, seed), bench(axis, truth, another, seed + 1000)
+    began_s = time.perf_counter()
+    twin = fit_twin([recording], axis, usual(axis, truth), workers=workers)
+    law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
+    about = (
+        f"N {truth.gear.ratio:5.1f} {truth.load_frequency_hz:4.1f} Hz "
+        f"{truth.servo.dead_time_ms:3.1f} ms {law:16s}"
+    )
+    found = Outcome(seed, about, fit_s=time.perf_counter() - began_s)
+    again = replay(other, axis, without_noise(twin.truth), seed + 2000)
+    told = compare(other.record, again, other.segments, axis.gear.ratio)
+    for name in ("following_error", "motor_torque", "load_error", "settling_time"):
+        row = told.row(name)
+        if row is not None:
+            found.channels[name] = (row.share, row.in_noise)
+    for name, each in BY_NAME.items():
+        interval = twin.intervals.get(".".join(each.path))
+        true = value_in(truth, each)
+        if interval is not None and true is not None:
+            found.intervals += 1
+            held = interval[0] <= true <= interval[1]
+            found.held += held
+            if not held:
+                found.missed.append(f"{name} {true:.3g} not in {interval[0]:.3g}..{interval[1]:.3g}")
+    if checks:
+        for what, causes, changed in changed_plants(truth, seed):
+            again = bench(axis, changed, plan, seed + 3000)
+            answer = check(again, axis, twin.truth, workers=workers)
+            found.checks.append((what, causes, {each.cause for each in answer.changes}))
+    return found
+
+
+def changed_plants(truth: Truth, seed: int) -> Iterator[tuple[str, set[str], Truth]]:
+    """Nothing changed, each change alone, and one pair."""
+    yield "nothing", set(), truth
+    names = list(CHANGES)
+    for name in names:
+        cause, values = CHANGES[name]
+        yield name, {cause}, with_values(truth, values(truth))
+    pair = names[seed % 5], names[(seed + 1 + seed // 5) % 5]
+    if pair[0] != pair[1]:
+        both = {key: value for name in pair for key, value in CHANGES[name][1](truth).items()}
+        yield " + ".join(pair), {CHANGES[name][0] for name in pair}, with_values(truth, both)
+
+
+def line(each: Outcome) -> str:
+    """One axis."""
+    parts = [
+        f"{name.split('_')[0]} {share:.3f} {noise:.2f}" for name, (share, noise) in each.channels.items()
+    ]
+    told = " | ".join(parts)
+    return f"{each.seed:4d} {each.about} | {told} | {each.held}/{each.intervals} | {each.fit_s:.0f} s"
+
+
+def bounds(hits: int, n: int) -> str:
+    """A count with its 95 % interval (Clopper-Pearson)."""
+    if not n:
+        return "none tried"
+    low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
+    return f"{hits} of {n} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--axes", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--checks", action="store_true", help="change the plants, and check the twins")
+    options = parser.parse_args()
+    print(
+        "on another motion: difference / measured, difference / noise; intervals that hold; time of the fit"
+    )
+    found = []
+    for seed in range(options.first, options.first + options.axes):
+        each = one(seed, checks=options.checks, workers=options.workers)
+        found.append(each)
+        print(line(each), flush=True)
+        for miss in each.missed:
+            print(f"       {miss}")
+        for what, causes, named in each.checks:
+            verdict = "ok" if causes == named else "WRONG" if named else "silent"
+            print(f"       {what}: {', '.join(sorted(named)) or 'nothing'} [{verdict}]", flush=True)
+    for name in ("following_error", "motor_torque"):
+        good = [o.channels[name][0] <= 0.10 or o.channels[name][1] <= 1.3 for o in found]
+        print(f"{name} within 10 % or 1.3 x noise: {bounds(sum(good), len(good))}")
+    settled = [o.channels["settling_time"][0] <= 0.10 for o in found if "settling_time" in o.channels]
+    print(f"settling time within 10 %: {bounds(sum(settled), len(settled))}")
+    near = [o.channels["load_error"][1] <= 1.3 for o in found]
+    print(f"load error within 1.3 x noise: {bounds(sum(near), len(near))}")
+    held, intervals = sum(o.held for o in found), sum(o.intervals for o in found)
+    print(f"intervals that hold the truth: {bounds(held, intervals)}")
+    cases = [case for o in found for case in o.checks]
+    for what, some in (
+        ("one change named, and nothing else", [c for c in cases if len(c[1]) == 1]),
+        ("nothing changed, silent", [c for c in cases if not c[1]]),
+        ("two changes named, and nothing else", [c for c in cases if len(c[1]) == 2]),
+    ):
+        if some:
+            print(f"{what}: {bounds(sum(c[1] == c[2] for c in some), len(some))}")
+            print(
+                f"    what changed is among the named: {bounds(sum(c[1] <= c[2] for c in some), len(some))}"
+            )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
