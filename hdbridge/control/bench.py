@@ -329,7 +329,8 @@ class Bench:
             self._compensation.hold,
             image.target_counts_for,
         )
-        motor_deg, load_deg, torque_nm = image.motor_deg, image.load_deg, self._sensed.torque_nm
+        axis, torque_nm = image.axis, self._sensed.torque_nm
+        motor_deg, load_deg = axis.motor_encoder.degrees, axis.load_encoder.degrees
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
         observe, ratio = self._observer.moment, self.view.ratio
         compensation, sensed = self._compensation, self._sensed

@@ -48,12 +48,13 @@ class VirtualClock:
     """A ``hdbridge.clock.Clock`` that moves when somebody waits on it, and lets the nodes run on the way."""
 
     def __init__(self, start_s: float = 0.0) -> None:
-        self._now_s = start_s
+        self.now_s = start_s
+        """Virtual seconds."""
         self.nodes: list[Node] = []
 
     def now(self) -> float:
         """Virtual seconds."""
-        return self._now_s
+        return self.now_s
 
     def sleep_until(self, deadline_s: float) -> None:
         """Advance to ``deadline_s``, through every event of a node that comes before it."""
@@ -71,11 +72,11 @@ class VirtualClock:
             if due_s < event_s:  # noqa: PLR1730 - min() costs three times as much, several times a cycle
                 event_s = due_s
         if event_s > deadline_s:
-            self._now_s = max(self._now_s, deadline_s)
+            self.now_s = max(self.now_s, deadline_s)
             return False
-        self._now_s = max(self._now_s, event_s)
+        self.now_s = max(self.now_s, event_s)
         for node in self.nodes:
-            node.poll(self._now_s)
+            node.poll(self.now_s)
         return True
 
 
@@ -99,6 +100,7 @@ class _PolledBus(VirtualBus):
         with channels_lock:
             place = self.channel.index(self.queue)
             self.channel[place] = self.queue = _PolledQueue()
+        self._waiting = self.queue.queue
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if type(msg) is not DataFrame and not _is_plain(msg):
@@ -114,7 +116,7 @@ class _PolledBus(VirtualBus):
                 waiting.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        waiting = self.queue.queue
+        waiting = self._waiting
         while waiting:
             message: can.Message = waiting.popleft()
             if self._filters is None or self._matches_filters(message):
@@ -140,8 +142,9 @@ class LockstepBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send, and let every node take it in and answer."""
         self._inner.send(msg, timeout)
-        now_s = self._clock.now()
-        for node in self._clock.nodes:
+        clock = self._clock
+        now_s = clock.now_s
+        for node in clock.nodes:
             node.poll(now_s)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -149,14 +152,16 @@ class LockstepBus(can.BusABC):
 
         Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame where no time-out is given.
         """
-        deadline_s = self._clock.now() + (LONGEST_WAIT_S if timeout is None else timeout)
-        while True:
+        message = self._take()
+        if message is not None:
+            return message
+        clock = self._clock
+        deadline_s = clock.now_s + (LONGEST_WAIT_S if timeout is None else timeout)
+        while clock.step(deadline_s):
             message = self._take()
             if message is not None:
                 return message
-            if not self._clock.step(deadline_s):
-                break
-        for node in self._clock.nodes:  # somebody else on the channel may have sent to them
+        for node in clock.nodes:  # somebody else on the channel may have sent to them
             node.poll(deadline_s)
         message = self._take()
         if message is None and timeout is None:
@@ -164,11 +169,12 @@ class LockstepBus(can.BusABC):
         return message
 
     def _take(self) -> can.Message | None:
+        """The next frame that has come already."""
         waiting = self._waiting
         while waiting:
             message: can.Message = waiting.popleft()
             if self._filters is None or self._matches_filters(message):
-                message.timestamp = self._clock.now()
+                message.timestamp = self._clock.now_s
                 return message
         return None
 

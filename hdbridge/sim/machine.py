@@ -42,12 +42,15 @@ class Machine:
         self._noise_now_deg = 0.0
         self._rated_nm = truth.motor.rated_torque_nm
         self._limit_nm = self._rated_limit_nm = loops.servo.limit_nm
+        self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
+        self._sense_permille = 1000.0 * motor.direction
         self._elapsed_s = 0.0
         self._motor_errors, self._load_errors = fixed_errors(motor), fixed_errors(load)
         self._motor_losses = Losses(motor.losses) if motor.losses else None
         self._load_losses = Losses(load.losses) if load.losses else None
         self._warmth = warmth_factor(truth, truth.temperature.friction_growth_per_k)
         heat = truth.temperature
+        self._warmed_s = self._warmer = 0.0
         self._weather = bool(heat.ambient_k_per_hour or heat.ambient_swing_k)
         self._temperature_c = heat.ambient_c if heat.start_c is None else heat.start_c
         self._friction = self._warmth.at(self._temperature_c) if self._warmth is not None else 1.0
@@ -121,18 +124,18 @@ class Machine:
     @property
     def torque_permille(self) -> int:
         """The motor's torque, in thousandths of the rated one, in the sense of the motor encoder."""
-        sense = self.truth.motor.encoder.direction
-        return round(1000.0 * sense * self._torque_nm / self._rated_nm)
+        return self._torque_permille
 
     @property
     def torque_limit_permille(self) -> float:
         """Highest torque, in thousandths of the rated one; set it up to what the truth file allows."""
-        return 1000.0 * self._limit_nm / self._rated_nm
+        return self._limit_permille
 
     @torque_limit_permille.setter
     def torque_limit_permille(self, permille: float) -> None:
         wanted_nm = max(0.0, permille) / 1000.0 * self._rated_nm
         self._limit_nm = min(wanted_nm, self._rated_limit_nm)
+        self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
 
     @property
     def temperature_c(self) -> float:
@@ -186,6 +189,7 @@ class Machine:
             self._torque_squares,
             self._friction_j,
         ) = seen
+        self._torque_permille = round(self._sense_permille * self._torque_nm / self._rated_nm)
 
     def _lost_deg(self) -> float:
         """What the motor encoder has lost."""
@@ -197,7 +201,9 @@ class Machine:
         """The motor encoder at an angle, before it is rounded."""
         if self._motor_errors:
             motor_deg += sum(each.error_deg(motor_deg) for each in self._motor_errors)
-        return (motor_deg + self._lost_deg()) * self._motor_counts_per_deg + self._motor_zero
+        if self._motor_losses is not None:
+            motor_deg += self._lost_deg()
+        return motor_deg * self._motor_counts_per_deg + self._motor_zero
 
     def _finish(self, elapsed_s: float) -> None:
         """What is slow against a control cycle: the temperature, and a new sample of the noise."""
@@ -213,7 +219,9 @@ class Machine:
         if self._weather:
             goal_c += heat.ambient_k_per_hour * self._elapsed_s / 3600.0
             goal_c += heat.ambient_swing_k * math.sin(math.tau * self._elapsed_s / heat.ambient_period_s)
-        nearer = -math.expm1(-elapsed_s / heat.time_constant_s)
-        self._temperature_c += (goal_c - self._temperature_c) * nearer
+        if elapsed_s != self._warmed_s:
+            self._warmed_s = elapsed_s
+            self._warmer = -math.expm1(-elapsed_s / heat.time_constant_s)
+        self._temperature_c += (goal_c - self._temperature_c) * self._warmer
         if self._warmth is not None:
             self._friction = self._warmth.at(self._temperature_c)

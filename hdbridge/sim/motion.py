@@ -91,17 +91,19 @@ class Motion:
         An axis that already is beyond a software limit may stay where it is and come back; it is not
         dragged inside.
         """
-        here = self.user(self.demand_counts)
-        distance = wrap_int32(target - here)
+        sign = self.sign
+        here = sign * round(self.demand_counts) + self.home_counts
+        distance = ((target - here + _HALF) & _MASK) - _HALF
         low, high = self._min.number(), self._max.number()
         if low < high and (low > -_HALF or high < _HALF - 1):
-            here32 = wrap_int32(here)
+            here32 = ((here + _HALF) & _MASK) - _HALF
             reach = here32 + distance
-            allowed = min(max(reach, min(low, here32)), max(high, here32))
-            if allowed != reach:
-                self.limited = True
-                distance = allowed - here32
-        return self.sign * (here + distance - self.home_counts)
+            if not low <= reach <= high:
+                allowed = min(max(reach, min(low, here32)), max(high, here32))
+                if allowed != reach:
+                    self.limited = True
+                    distance = allowed - here32
+        return sign * (here + distance - self.home_counts)
 
     def max_speed_counts_s(self) -> float:
         """Object 6080h in counts/s."""

@@ -246,8 +246,13 @@ class SimulatedDrive:
             return
         if pdo.event_timer_s:
             pdo.deadline_s = now_s + pdo.event_timer_s
-            self._rpdo_due_s = min(each.deadline_s for each in self._rpdo_by_id.values())
-            self._due_s = self._next_due_s()
+            before_s = self._rpdo_due_s
+            due_s = pdo.deadline_s
+            if len(self._rpdo_by_id) > 1:
+                due_s = min([each.deadline_s for each in self._rpdo_by_id.values()])
+            self._rpdo_due_s = due_s
+            if before_s <= self._due_s or due_s < self._due_s:  # else something else comes first
+                self._due_s = self._next_due_s()
         if len(data) > pdo.length:
             self.emergency.occur(ErrorCode.PDO_TOO_LONG)
         elif self.emergency.any_active:

@@ -192,6 +192,8 @@ class ReceivePdo(Pdo):
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self._writers: tuple[Callable[[int], None], ...] = ()
+        self.length = 0
+        """Bytes that are mapped."""
         self.pending: bytes | None = None
         self.deadline_s = float("inf")
         super().__init__(dictionary, 0x1400 + number - 1, 0x1600 + number - 1, changed)
@@ -201,17 +203,13 @@ class ReceivePdo(Pdo):
 
     def _link(self, entries: list[Entry]) -> None:
         self._writers = tuple(entry.writer() for entry in entries)
+        self.length = self._codec.size
         self.restart()
 
     def restart(self) -> None:
         """Forget what came, and disarm the deadline."""
         self.pending = None
         self.deadline_s = float("inf")
-
-    @property
-    def length(self) -> int:
-        """Bytes that are mapped."""
-        return self._codec.size
 
     def apply(self, data: bytes) -> None:
         """Write ``data``, ``length`` bytes or more, to the mapped entries; refused values are dropped."""
