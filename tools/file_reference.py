@@ -1,5 +1,5 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-and that of faults (docs/daemon.md) from the table that judges them.
+that of faults (docs/daemon.md) from the table that judges them, that of docs/twin.md from the translation.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   say whether they are up to date (exit status 1 if not)
@@ -21,6 +21,7 @@ from pydantic_core import PydanticUndefined
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import MachineFile
 from hdbridge.drive.supervision import TABLE, Reaction
+from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.model.file import ModelFile
 from hdbridge.model.store import LogFile
@@ -34,9 +35,10 @@ from hdbridge.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
+from hdbridge.twin.translation import TABLE as TRANSLATED
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = (DOCS / "files.md", DOCS / "calibration.md", DOCS / "daemon.md")
+PAGES = (DOCS / "files.md", DOCS / "calibration.md", DOCS / "daemon.md", DOCS / "twin.md")
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -92,6 +94,15 @@ def fault_table() -> str:
     return "\n".join(lines) + "\n"
 
 
+def translation_table() -> str:
+    """Where each effect of the catalogue goes in a truth file."""
+    lines = ["| effect | | place in the truth file |", "|---|---|---|"]
+    for name, effect in CATALOGUE.items():
+        places = re.sub(r"[a-z_]+\.[a-z_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
+        lines.append(f"| `{name}` | {effect.about.title} | {places} |")
+    return "\n".join(lines) + "\n"
+
+
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
     "machine": lambda: key_table(MachineFile),
@@ -102,6 +113,7 @@ BLOCKS: Mapping[str, Any] = {
     "faults": fault_table,
     "plan": lambda: key_table(Plan),
     "procedures": procedure_table,
+    "translation": translation_table,
 }
 
 

@@ -10,19 +10,47 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
+from hdbridge.axis import AxisConfig
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.model import TransmissionModel
 from hdbridge.observations.driving import driving_angle
 from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Recording
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import Comparison, compare
+from hdbridge.twin.making import fit_twin
+from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.result import Twin
+from hdbridge.twin.translation import translate
 
 NOTHING = TransmissionModel(100.0, ())
 ARCSEC_PER_N = 0.01
+SIGNALS = ("load_error", "following_error", "motor_torque")
+JOINT = """\
+schema: hdbridge.axis/1
+name: joint
+bus: {interface: virtual, channel: joint}
+drive:
+  node_id: 1
+  eds: hdbridge-402.eds
+  identity: {vendor_id: 0, product_code: 0}
+  cycle_ms: 10
+  following_error_deg: 60
+  rated_torque_nm: 0.2
+motor_encoder: {counts_per_turn: 524288}
+load_encoder: {counts_per_turn: 1048576}
+gear: {ratio: 100}
+limits: {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 60,
+         acceleration_deg_s2: 300, jerk_deg_s3: 6000, torque_percent: 300}
+"""
+"""An axis file for the robot's joints: steps of the encoders as the records have them, the rest assumed."""
 
 
 def main() -> None:
@@ -36,6 +64,7 @@ def main() -> None:
         print(f"{name}, joint {joint}, all recordings")
         _print(diagnose(concatenate(records), NOTHING, independent_zeros=True))
         _leave_one_out(records)
+    _twins(folder)
     _laws(folder)
     for name in ("sine", "earthquake"):
         time, displacement, force = _damper(folder, name)
@@ -46,6 +75,60 @@ def main() -> None:
             law = Hysteresis(offset_arcsec=95.0, width_deg=16.0 * scale, exponent=2.2)
             print(f"damper, {name}, {scale:g} deg/mm")
             _print(diagnose(record, TransmissionModel(50.0, (law,))))
+
+
+def joint_axis() -> AxisConfig:
+    """The axis that stands for either joint."""
+    return AxisConfig.from_text(JOINT, Path("joint.yaml"))
+
+
+def joint_recordings(folder: Path, joint: int) -> list[Recording]:
+    """A joint's four recordings with their commands; the torque, told at the output, as the motor's."""
+    recordings = []
+    for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
+        record = Record.read_csv(path)
+        torque = record.columns["motor_torque_nm"] / NOTHING.ratio
+        columns = {**record.columns, "motor_torque_nm": torque}
+        recordings.append(Recording(Record(columns, record.source), ratio=NOTHING.ratio))
+    return recordings
+
+
+def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dict[str, Comparison]]:
+    """A twin of all recordings but one, and how usual values, model and twin compare with that one."""
+    axis = joint_axis()
+    others = [each for number, each in enumerate(recordings) if number != out]
+    found = diagnose(others, NOTHING, independent_zeros=True)
+    start = translate(axis, found.model).truth
+    twin = fit_twin(others, axis, start)
+    truths = {"usual values": translate(axis).truth, "with the model": start, "twin": twin.truth}
+    return twin, {name: held_against(recordings[out], truth) for name, truth in truths.items()}
+
+
+def held_against(recording: Recording, truth: Truth) -> Comparison:
+    """A recording and its replay."""
+    simulated = replay_directly(recording, joint_axis(), truth)
+    return compare(recording.record, simulated, (), NOTHING.ratio)
+
+
+def _twins(folder: Path) -> None:
+    """What a twin of three recordings gets right and wrong in the fourth."""
+    for joint in (4, 5):
+        recordings = joint_recordings(folder, joint)
+        left: dict[tuple[str, str], list[float]] = {}
+        for out in range(len(recordings)):
+            twin, compared = twin_of_others(recordings, out)
+            print(f"twin of joint {joint} without recording {out + 1}")
+            for name, each in compared.items():
+                rows = [row for signal in SIGNALS if (row := each.row(signal)) is not None]
+                for row in rows:
+                    left.setdefault((row.channel, "measured"), []).append(row.measured)
+                    left.setdefault((row.channel, name), []).append(row.difference)
+            for finding in twin.findings:
+                print(f"  {finding.text}")
+            for alike in twin.alike:
+                print(f"  not told apart: {', '.join(alike.names)}")
+        for (signal, name), values in left.items():
+            print(f"  {signal}, {name}: {np.sqrt(np.mean(np.square(values))):.4g}")
 
 
 def _print(found: Diagnosis) -> None:

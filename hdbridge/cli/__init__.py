@@ -48,7 +48,8 @@ PANELS: Final = {
         "diagnose": "Compare records with a model; name what the model lacks, or say what cannot be told.",
         "improve": "Say what the active model lacks, extend it, step with both, and keep the better one as "
         "pending.",
-        "twin": "Compare the simulated drive of a profile with recordings of its axis, channel by channel.",
+        "twin": "Teach the simulated drive an axis from recordings; say what it got wrong, and keep the "
+        "twin as pending.",
         "model": "The models of an axis: the active one, one that waits, and every one that there was.",
     },
     "Day and night": {

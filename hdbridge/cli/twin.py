@@ -17,6 +17,7 @@ from hdbridge.cli.options import (
     console,
     notes,
     print_table,
+    progress_bar,
     write_json,
     write_result,
 )
@@ -26,7 +27,9 @@ from hdbridge.files.profile import Profile
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.records.recording import Recording
-    from hdbridge.report.twin import TwinReport
+    from hdbridge.report.twin import Learned, Named, TwinReport
+    from hdbridge.sim.truth import Truth
+    from hdbridge.twin.result import Twin
     from hdbridge.twin.translation import Translation
 
 
@@ -41,6 +44,12 @@ def command(
         list[Path],
         typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in their order."),
     ],
+    check: Annotated[
+        bool, typer.Option("--check", help="Only say what has changed since the profile's twin was made.")
+    ] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Only compare the simulation as it is with the recordings.")
+    ] = False,
     truth: TruthOption = None,
     afresh: Annotated[
         bool,
@@ -49,29 +58,159 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Compare the simulated drive of a profile with recordings of its axis, channel by channel.
+    """Teach the simulated drive an axis from recordings; say what it got wrong, and keep the twin as pending.
 
     The recordings' commands run through the simulated drive once more. It is what the profile's twin or truth
-    file says, and errs as the active model says.
+    file says, else what is usual, and errs as the active model says. Friction, inertia, spring, loops and
+    delays are fitted until it does as the axis did. `--simulate` uses the twin after
+    `hdbridge model commit PROFILE --twin`.
     """
-    from hdbridge.report.page import render
-    from hdbridge.report.twin import TwinReport, twin_page
-    from hdbridge.twin.comparison import compare
-    from hdbridge.twin.replay import legs_of, replay_directly
-
     files = Profile.find(profile)
+    if check and (compare or afresh or truth is not None):
+        raise InputError(
+            "--check holds the recordings against the profile's twin: leave out the other options"
+        )
     axis, recording = _loaded(files, recordings)
+    if check:
+        _check(files, axis, recording, json_file, html_file)
+        return
     begun = _beginning(files, axis, truth, afresh=afresh)
-    notes.print("the recording's commands run through the simulated drive ...")
-    simulated = replay_directly(recording, axis, begun.truth)
-    before = compare(recording.record, simulated, legs_of(recording), axis.gear.ratio)
-    report = TwinReport(
-        axis.name, before, translated=begun.rows, facts=_facts(files, recording, recordings, truth, afresh)
-    )
+    facts = _facts(files, recording, recordings, truth, afresh)
+    if compare:
+        report = _compared(axis, recording, begun, facts)
+    else:
+        report = _learned(files, axis, recording, recordings, begun, facts)
+    _give(report, json_file, html_file)
+
+
+def _give(report: TwinReport, json_file: Path | None, html_file: Path | None) -> None:
+    """Files first: who reads the tables may have had enough of them (`| head`)."""
+    from hdbridge.report.page import render
+    from hdbridge.report.twin import twin_page
+
     write_json(json_file, as_dict(report))
     if html_file is not None:
         write_result(html_file, render(twin_page(report)))
     print_report(report)
+
+
+def _compared(
+    axis: AxisConfig, recording: Recording, begun: Translation, facts: list[tuple[str, str]]
+) -> TwinReport:
+    from hdbridge.report.twin import TwinReport
+    from hdbridge.twin.comparison import compare
+    from hdbridge.twin.replay import legs_of, replay_directly
+
+    notes.print("the recording's commands run through the simulated drive ...")
+    simulated = replay_directly(recording, axis, begun.truth)
+    found = compare(recording.record, simulated, legs_of(recording), axis.gear.ratio)
+    return TwinReport(axis.name, found, translated=begun.rows, facts=facts)
+
+
+def _learned(
+    files: Profile,
+    axis: AxisConfig,
+    recording: Recording,
+    paths: list[Path],
+    begun: Translation,
+    facts: list[tuple[str, str]],
+) -> TwinReport:
+    """Fit, and keep the twin as pending where it is better on legs that the fit has not seen."""
+    from datetime import datetime
+
+    from hdbridge.model.store import measuring
+    from hdbridge.report.page import Command, Status
+    from hdbridge.report.twin import TwinReport
+    from hdbridge.twin.kept import TWINS, KeptTwin
+    from hdbridge.twin.making import fit_twin
+    from hdbridge.twin.verdict import better
+
+    with measuring(files.axis), progress_bar() as bar:
+        task = bar.add_task("fit", total=1.0)
+        twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
+        gain = better(twin.before, twin.after)
+        if gain.better:
+            kept = KeptTwin(twin.truth).told(recordings=[str(each) for each in paths])
+            reason = f"learned from {', '.join(each.name for each in paths)}"
+            TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
+    commit = Command(f"hdbridge model commit {files.folder} --twin", "makes it what --simulate uses")
+    return TwinReport(
+        axis.name,
+        twin.before,
+        twin.after,
+        learned=_values(begun.truth, twin.truth),
+        named=_named(twin),
+        translated=begun.rows,
+        facts=facts,
+        verdict=f"the twin is {'kept as pending' if gain.better else 'not kept'}: {gain.text}",
+        commands=(commit,) if gain.better else (),
+        status=Status.PENDING if gain.better else Status.REFUSED,
+    )
+
+
+def _values(before: Truth, after: Truth) -> list[Learned]:
+    """What was fitted, as it was assumed and as it is."""
+    from hdbridge.report.twin import Learned
+    from hdbridge.twin.parameters import PARAMETERS, value_in
+
+    rows = []
+    for each in PARAMETERS:
+        now, interval = value_in(after, each), after.intervals.get(".".join(each.path))
+        if now is not None and interval is not None:
+            rows.append(Learned(each.name, each.unit, value_in(before, each), now, interval))
+    return rows
+
+
+def _named(twin: Twin) -> list[Named]:
+    """Causes, sets that the motion cannot tell apart, and what is left."""
+    from hdbridge.report.twin import Named
+
+    named = [Named(each.cause, each.text.removeprefix(f"{each.cause}: ")) for each in twin.findings]
+    named += [
+        Named("not told apart", f"{', '.join(each.names)}; {'; '.join(each.moves)} would tell")
+        for each in twin.alike
+    ]
+    named += [
+        Named(
+            "unexplained",
+            f"{each.channel} is left with {each.times_noise:.3g} times its noise, most of it in legs of the "
+            f"kind {each.kind}",
+        )
+        for each in twin.unexplained
+    ]
+    return named
+
+
+def _check(
+    files: Profile, axis: AxisConfig, recording: Recording, json_file: Path | None, html_file: Path | None
+) -> None:
+    """Say in one sentence what has changed since the profile's twin was made."""
+    from hdbridge.twin.check import check
+    from hdbridge.twin.kept import KeptTwin
+
+    if html_file is not None:
+        raise InputError("--check has no page: leave out --html, or compare with the twin by --compare")
+    twin = KeptTwin.load(files.twin) if files.twin.is_file() else None
+    if twin is None:
+        raise InputError(
+            f"{files.folder}: there is no active twin to check; make one with 'hdbridge twin', and commit it "
+            f"with 'hdbridge model commit {files.folder} --twin'"
+        )
+    twin.check_bound_to(axis, recording.drive)
+    with progress_bar() as bar:
+        task = bar.add_task("check", total=1.0)
+        found = check(recording, axis, twin.truth, lambda share: bar.update(task, completed=share))
+    write_json(
+        json_file,
+        {
+            "schema": "hdbridge.twin-check/1",
+            "axis": axis.name,
+            "twin": str(files.twin),
+            "sentence": found.sentence,
+            "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
+        },
+    )
+    console.print(found.sentence, markup=False, soft_wrap=True)
 
 
 def _loaded(files: Profile, recordings: list[Path]) -> tuple[AxisConfig, Recording]:
@@ -160,9 +299,9 @@ def print_report(report: TwinReport) -> None:
     from hdbridge.report.twin import title_of, verdict
     from hdbridge.twin.comparison import ALL
 
-    for each in report.translated:
-        if each.counterpart is None:
-            notes.print(f"{each.effect} is not simulated: {each.note}", markup=False, soft_wrap=True)
+    for effect in report.translated:
+        if effect.counterpart is None:
+            notes.print(f"{effect.effect} is not simulated: {effect.note}", markup=False, soft_wrap=True)
     console.print(escape(verdict(report)), soft_wrap=True)
     table = Table("")
     columns = ["measured", "simulated", *(["before"] if report.after else []), "difference", "of the noise"]
@@ -180,3 +319,7 @@ def print_report(report: TwinReport) -> None:
     print_table(table)
     for named in report.named:
         console.print(f"{named.cause}: {named.text}", markup=False, soft_wrap=True)
+    if report.verdict:
+        console.print(report.verdict, markup=False, soft_wrap=True, style="bold")
+    for each in report.commands:
+        console.print(f"  {each.line}   # {each.purpose}", markup=False, soft_wrap=True)

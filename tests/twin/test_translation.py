@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effect_examples import EXAMPLES
 from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
@@ -334,14 +337,17 @@ def test_what_the_plant_cannot_do_is_said() -> None:
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_an_effect_of_typical_size_makes_a_plant(name: str) -> None:
-    model = TransmissionModel(N, BASIC)
-    effect = CATALOGUE[name].candidate(N, BASIC)
-    others = tuple(each for each in model.effects if each.name not in {name, effect.replaces})
+@given(st.data())
+@settings(max_examples=10, deadline=None)
+def test_any_effect_makes_a_plant_that_moves(name: str, data: st.DataObject) -> None:
+    effect = data.draw(EXAMPLES[name])
+    others = tuple(each for each in BASIC if each.name not in {name, effect.replaces})
     translation = translate(AXIS, TransmissionModel(N, (*others, effect)))
     row = next(row for row in translation.rows if row.effect == name)
-    assert row.counterpart or name == "wear", "its typical loop widens, which the plant's teeth do not"
-    Machine(translation.truth, 0).coast(4, braked=False)
+    assert row.counterpart or row.note
+    machine = Machine(translation.truth, 0)
+    machine.follow(0.0, -200.0, 8)
+    assert abs(machine.true_load_deg) < 1.0
 
 
 def test_what_the_model_does_not_speak_of_stays_as_it_was_given() -> None:

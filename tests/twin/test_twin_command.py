@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,11 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import compare
+from hdbridge.twin.kept import KeptTwin
+from hdbridge.twin.naming import Finding, Moved, Unexplained
+from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.result import Twin
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 
@@ -53,7 +59,9 @@ def figures(told: dict[str, Any], which: str) -> dict[str, dict[str, Any]]:
 
 
 def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path, recording: Path) -> None:
-    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
+    done = run_here(
+        profile, "twin", profile, recording, "--compare", "--json", "told.json", "--html", "page.html"
+    )
     assert done.returncode == 0, done.stderr
     told = json.loads((profile / "told.json").read_text())
     assert told["schema"] == "hdbridge.twin/1"
@@ -67,13 +75,13 @@ def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path
 
 
 def test_an_active_model_says_how_the_simulation_errs(profile: Path, recording: Path) -> None:
-    run_here(profile, "twin", profile, recording, "--json", "without.json")
+    run_here(profile, "twin", profile, recording, "--compare", "--json", "without.json")
     orders = tuple(MotorOrder(order=k, amplitude_arcsec=30.0, phase_deg=0.0) for k in (2, 5))
     loop = Hysteresis(offset_arcsec=31.5, width_deg=26.0, exponent=1.72)
     TransmissionModel(50.0, (Synchronous(orders=orders), loop)).bound_to(AxisConfig.load(profile)).save(
         profile / "model.yaml"
     )
-    run_here(profile, "twin", profile, recording, "--json", "with.json")
+    run_here(profile, "twin", profile, recording, "--compare", "--json", "with.json")
     without, wrong = (
         figures(json.loads((profile / name).read_text()), "before")["load_error"]["difference"]
         for name in ("without.json", "with.json")
@@ -90,6 +98,8 @@ def test_an_active_model_says_how_the_simulation_errs(profile: Path, recording: 
     ("options", "complaint"),
     [
         (("--afresh", "--truth", "truth.yaml"), "leave out --truth"),
+        (("--check", "--afresh"), "leave out the other options"),
+        (("--check",), "there is no active twin to check"),
         (("--html", "recording.csv", "nowhere"), "no such file"),
     ],
 )
@@ -112,3 +122,73 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
     done = run_here(profile, "twin", profile, tmp_path / "bare.csv")
     assert done.returncode == 2
     assert "no column motor_target_deg" in done.stderr
+
+
+def fitted(truth: Truth) -> Callable[..., Twin]:
+    """In place of a fit, which takes minutes: this is what it comes to."""
+
+    def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
+        (recording,) = recordings
+        before, after = (
+            compare(recording.record, replay_directly(recording, axis, each), recording.segments, 50.0)
+            for each in (start, truth)
+        )
+        moved = Moved("Coulomb friction", "Nm", start.motor.coulomb_nm, truth.motor.coulomb_nm, 0.033, 0.035)
+        finding = Finding("friction", (moved,), ("motor torque",), 99.0, (5.0, 1.0))
+        known = truth.model_copy(update={"intervals": {"motor.coulomb_nm": (0.033, 0.035)}})
+        return Twin(known, (finding,), (), (Unexplained("motor torque", 2.5, "step"),), before, after)
+
+    return fit_twin
+
+
+def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
+    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO)))
+    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
+    assert done.returncode == 0, done.stderr
+    assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in done.stdout
+    assert "unexplained: motor torque is left with 2.5 times its noise" in done.stdout
+    assert f"hdbridge model commit {profile} --twin" in done.stdout
+    pending = KeptTwin.load(profile / "pending-twin.yaml")
+    assert pending.truth.motor.coulomb_nm == 0.034
+    assert pending.provenance["recordings"] == [str(recording)]
+    assert pending.provenance["axis"] == "demo"
+    told = json.loads((profile / "told.json").read_text())
+    assert figures(told, "after")["motor_torque"]["difference"] < 0.005
+    (friction,) = told["parameters"]
+    assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
+    page = (profile / "page.html").read_text()
+    assert "What was wrong with the simulation" in page
+    assert "model commit" in page
+
+
+def test_a_twin_that_is_no_better_is_not_kept(
+    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(profile)))
+    done = run_here(profile, "twin", profile, recording)
+    assert done.returncode == 0, done.stderr
+    assert "not kept" in done.stdout
+    assert not (profile / "pending-twin.yaml").exists()
+
+
+@pytest.mark.slow
+def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path, recording: Path) -> None:
+    """The whole way, with the fit itself: minutes."""
+    done = run_here(profile, "twin", profile, recording)
+    assert done.returncode == 0, done.stderr
+    learned = KeptTwin.load(profile / "pending-twin.yaml").truth
+    lower, upper = learned.intervals["motor.coulomb_nm"]
+    assert lower < 0.036
+    assert upper > 0.032
+    assert learned.motor.coulomb_nm == pytest.approx(0.034, rel=0.1)
+    run_here(profile, "model", "commit", profile, "--twin")
+    same = run_here(profile, "twin", profile, recording, "--check")
+    assert same.stdout.strip() == "Nothing has changed since the twin was made."
+    stiffer = Truth.load(DEMO).model_dump(by_alias=True)
+    stiffer["motor"]["coulomb_nm"] = 0.068
+    record = record_of(Truth.model_validate(stiffer), moves)
+    Recording(record, axis="demo", ratio=50.0).save(profile / "later")
+    changed = run_here(profile, "twin", profile, profile / "later", "--check")
+    assert "friction" in changed.stdout
