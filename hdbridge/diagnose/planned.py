@@ -10,6 +10,7 @@ from hdbridge.diagnose.identifiability import identifiability
 from hdbridge.effects import Motion, Start
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.observed import gather
+from hdbridge.estimation.terms import Effort
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits, Procedure, Sample
 from hdbridge.procedures.plan import Plan
@@ -47,7 +48,7 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
     )
     data = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
     estimator = Estimator(data)
-    fitted = estimator.fit(Hypothesis(model.effects, start), steps=2)
+    fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
     found = identifiability(estimator, fitted, model.effects)
     return {
         "schema": "hdbridge.plan-diagnosis/1",

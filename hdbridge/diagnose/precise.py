@@ -16,7 +16,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG, OrderSeries
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.terms import FOUND
+from hdbridge.estimation.terms import FOUND, Effort
 
 SPEEDS_DIFFER: Final = 0.1
 """Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
@@ -36,7 +36,7 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
         plain = estimator.fit(fitted.hypothesis)
         found = estimator.fit(plain.hypothesis, moves=FOUND)
         if any(each.violations() for each in found.hypothesis.effects):
-            return estimator.fit(plain.hypothesis, 1, FOUND)
+            return estimator.fit(plain.hypothesis, FOUND, Effort(steps=1))
         return found
     finally:
         estimator.nuisance = searched

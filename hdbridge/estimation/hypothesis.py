@@ -31,11 +31,8 @@ from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
 from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms
 
-STEPS = 8
-CONVERGED = 0.5
-"""A step that gains less than this in chi square is the last."""
-ROUGHLY = 2e-5
-"""... or less than this share of it: where much is left, exactness is of no use."""
+ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
+"""A search compares hypotheses whose chi squares are tens and more apart."""
 KEPT_FITS = 8
 KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large."""
@@ -195,17 +192,17 @@ class Estimator:
         angle = self.data.full.motion.motor_deg
         return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
 
-    def fit(self, hypothesis: Hypothesis, steps: int = STEPS, moves: frozenset[Moves] = LOCAL) -> Fitted:
+    def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
         """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says."""
         counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
-            hypothesis, steps, moves, self.nuisance.shape[1],
+            hypothesis, moves, effort, self.nuisance.shape[1],
             self.load_angles if counted else 0, self.loop_sign, self.prior,
         )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
-        fitted = self._solved(hypothesis, Effort(steps, CONVERGED, ROUGHLY), moves, self.prior(hypothesis))
+        fitted = self._solved(hypothesis, effort, moves, self.prior(hypothesis))
         self._fits[key] = fitted
         if len(self._fits) > KEPT_FITS:
             self._fits.popitem(last=False)

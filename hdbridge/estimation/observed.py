@@ -115,6 +115,10 @@ class Observed:
     remarks: tuple[str, ...]
     """What the record lacks, in words."""
 
+    def over(self, runs: IntArray) -> Observed:
+        """The same samples averaged over other runs, given by their first samples."""
+        return replace(self, points=_averaged(self.full, runs), runs=runs)
+
     def mean(self, values: FloatArray) -> FloatArray:
         """Means of a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
         return means(values, self.runs)

@@ -1,0 +1,98 @@
+"""Calibration and diagnosis find the same where they fit the same terms to the same record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from support import plant
+
+from hdbridge.effects import Effect, FloatArray, Hysteresis, Start, Synchronous
+from hdbridge.effects.orders import MotorOrder
+from hdbridge.estimation import observed, samples
+from hdbridge.estimation.blocks import Blocks, make_blocks
+from hdbridge.estimation.design import Design
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.noise import NoiseModel, Precision
+from hdbridge.estimation.nuisances import nuisances_of
+from hdbridge.estimation.segment import Kind, Segment
+from hdbridge.estimation.terms import Effort
+from hdbridge.identify.problem import Problem
+from hdbridge.records.record import Record
+
+RATIO = plant.RATIO
+NOISE_ARCSEC = 0.4
+GIVEN: tuple[Effect, ...] = (
+    Synchronous(
+        orders=tuple(
+            MotorOrder(order=number, amplitude_arcsec=amplitude, phase_deg=phase)
+            for number, amplitude, phase in plant.ORDERS
+        )
+    ),
+    Hysteresis(offset_arcsec=36.0, width_deg=24.0, exponent=1.8),
+)
+
+
+class Seen(NamedTuple):
+    calibration: samples.Samples
+    diagnosis: observed.Observed
+
+
+@pytest.fixture(scope="module", params=["with the command", "without"])
+def seen(request: pytest.FixtureRequest) -> Seen:
+    commanded = request.param == "with the command"
+    columns = plant.record(plant.Truth(), plant.Plan(scale=0.4), 5, command=commanded)
+    record = Record(columns)
+    target = record.motor_target_deg
+    segment = Segment(
+        record.time_s,
+        record.motor_position_deg if target is None else target,
+        record.load_position_deg,
+        Kind.SWEEP,
+        position_deg=None if target is None else record.motor_position_deg,
+        commanded=target is not None,
+    )
+    return Seen(samples.gather([segment], RATIO, slow_deg_s=1e9), observed.gather(record, RATIO))
+
+
+def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
+    """The same white noise, motion and blocks handed in: orders, loop and standard errors to 1e-6."""
+    table = seen.calibration
+    design = Design.of(table, make_blocks(table), [Start.VIRGIN])
+    blocks = design.blocks
+    problem = Problem(design, GIVEN, nuisances_of(design, (), GIVEN))
+    exactly = Effort(steps=60, converged=1e-10)
+    one = problem.fitted(Precision(NoiseModel(NOISE_ARCSEC, NOISE_ARCSEC), _white(blocks)), exactly)
+
+    full = replace(
+        seen.diagnosis.full,
+        motion=table.chains[0].motion,
+        error_arcsec=table.error_arcsec,
+        usable=table.usable,
+        sigma_arcsec=np.full(len(table), NOISE_ARCSEC),
+    )
+    edges = np.flatnonzero(np.diff(table.usable, prepend=not table.usable[0]))
+    runs = np.union1d(blocks.index[blocks.first], edges)
+    estimator = Estimator(replace(seen.diagnosis, full=full).over(runs))
+    estimator.loop_sign = 1.0
+    assert len(estimator.index) == len(blocks)
+    other = estimator.fit(Hypothesis(GIVEN, Start.VIRGIN), effort=exactly)
+
+    assert other.chi_square == pytest.approx(one.chi_square, rel=1e-6)
+    for left, right in zip(one.effects, other.hypothesis.effects, strict=True):
+        assert right.coefficients() == pytest.approx(left.coefficients(), rel=1e-6, abs=1e-6)
+        for shape in left.shape:
+            assert getattr(right, shape.name) == pytest.approx(getattr(left, shape.name), rel=1e-6)
+    assert [each.name for each in other.parameters[1:]] == [each.name for each in one.columns[1:]]
+    assert _errors(other.tangent.T @ other.tangent) == pytest.approx(_errors(one.information), rel=1e-6)
+
+
+def _white(blocks: Blocks) -> Blocks:
+    """Blocks whose noise is that of their samples alone."""
+    return replace(blocks, locked_arcsec=np.zeros(len(blocks)))
+
+
+def _errors(information: FloatArray) -> FloatArray:
+    return np.sqrt(np.diag(np.linalg.inv(information)))
