@@ -3,12 +3,14 @@
 One run measures, side by side: the whole bench (master, compensation, bus, simulated drive and plant), the
 same with load torque and temperature on the bus and compliance in the model, and the plant alone, moved along
 the same targets. Ratios are axis time over wall time, and over this process's
-CPU time, which does not count what other programs take of the machine.
+CPU time, which does not count what other programs take of the machine. Where numba is installed the loops and
+mechanics are compiled, which is done before anything is timed; ``--python`` keeps them in Python.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -21,6 +23,7 @@ from hdbridge.effects import Compliance, extended
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
+from hdbridge.sim import fast
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
@@ -36,11 +39,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How much faster than the axis itself the bench is.")
     parser.add_argument("--count", type=int, default=40, help="steps each way")
     parser.add_argument("--blocks", type=int, default=3, help="repetitions; the median is printed")
+    parser.add_argument("--python", action="store_true", help="keep the loops and mechanics in Python")
     options = parser.parse_args()
     folder = bundled_profile("article")
     axis, model = AxisConfig.load(folder / "axis.yaml"), TransmissionModel.load(folder / "model.yaml")
     truth = Truth.load(folder / "truth.yaml")
     period_s = axis.drive.cycle_s
+    if options.python:
+        os.environ[fast.SWITCH] = "0"
+    fast.waiting.left = 0
+    Machine(truth, 0, may_compile=True).follow(0.0, 0.0, 1)
     told = {
         "load_torque": LoadTorque(
             source=ChannelSource(index=0x2101, type="int32"), newton_metres_per_count=0.001
@@ -68,7 +76,7 @@ def main() -> None:
                 run = bench.run(Stepping(count=options.count))
                 note(name, began, clock.now() - axis_began)
         targets = (run.record.columns["motor_target_deg"] * axis.motor_encoder.counts_per_turn / 360).tolist()
-        machine = Machine(truth, block)
+        machine = Machine(truth, block, may_compile=True)
         substeps = round(period_s / machine.dt_s)
         began = clocks()
         for last, target in pairwise(targets):
