@@ -94,7 +94,7 @@ class CompiledLoops:
 
     def __init__(self, loops: Loops) -> None:
         """Raises `Uncompilable`."""
-        if numba.config.USING_SVML:
+        if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
         plant: Any = type(loops.plant)
         self._record = np.zeros(1, _layout_of(plant, _room(loops)))
