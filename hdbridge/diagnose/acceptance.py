@@ -80,6 +80,11 @@ def robust_chi_square(
         rest, columns, target, time = rest[rows], columns[rows], target[rows], time[rows]
         if np.count_nonzero(rows) < 20:
             return 0.0
+    held, asked = fitted.prior_rows()
+    held = held[:, others]
+    rest = np.vstack([rest, np.hstack([held, np.zeros((len(held), rest.shape[1] - held.shape[1]))])])
+    columns = np.vstack([columns, np.zeros((len(held), columns.shape[1]))])
+    target = np.concatenate([target, asked])
     basis = orthonormal(rest)
     left = columns - basis @ (basis.T @ columns)
     share = np.sum(left**2, axis=0) / np.maximum(np.sum(columns**2, axis=0), 1e-300)
@@ -94,6 +99,7 @@ def robust_chi_square(
     scores = left * residual[:, np.newaxis]
     for longest in BLOCKS_S:
         number = blocks(time, min(longest, estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS))
+        number = np.concatenate([number, number[-1] + 1 + np.arange(len(held))])
         sums = np.stack([np.bincount(number, each) for each in scores.T], axis=1)
         # The noise itself is a floor: a residual may be quieter than it by luck.
         variance = sums.T @ sums + 0.25 * gram

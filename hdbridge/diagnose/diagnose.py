@@ -38,6 +38,7 @@ from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
+from hdbridge.estimation.calibration import calibrated
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.observed import gather
 from hdbridge.model import TransmissionModel
@@ -100,6 +101,9 @@ def diagnose(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
     estimator = Estimator(data)
+    estimator.calibrated = calibrated(
+        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN)
+    )
     search = Search(estimator, model.effects)
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)

@@ -25,7 +25,7 @@ def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | No
 
     None where the record is too short to leave anything out.
     """
-    return _gain(estimator, (without.tangent, without.residual), (fitted.tangent, fitted.residual))
+    return _gain(estimator, _as_fitted(without), _as_fitted(fitted))
 
 
 def held_out_change(
@@ -38,19 +38,26 @@ def held_out_change(
     """
     kept = np.setdiff1d(np.arange(fitted.count()), columns)
     given = fitted.residual + estimator.weight * change_arcsec
-    return _gain(estimator, (fitted.tangent[:, kept], given), (fitted.tangent, fitted.residual))
+    before = (fitted.tangent[:, kept], given, fitted.information[kept], fitted.pull[kept])
+    return _gain(estimator, before, _as_fitted(fitted))
 
 
-def _gain(
-    estimator: Estimator, before: tuple[FloatArray, FloatArray], after: tuple[FloatArray, FloatArray]
-) -> Gain | None:
+_Linear = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Weighted tangent and residual of a fit, and what was known beforehand with what it pulls."""
+
+
+def _as_fitted(fitted: Fitted) -> _Linear:
+    return fitted.tangent, fitted.residual, fitted.information, fitted.pull
+
+
+def _gain(estimator: Estimator, before: _Linear, after: _Linear) -> Gain | None:
     """From weighted tangents and residuals, each of a best fit or near it."""
     stretch = stretches(estimator)
     samples = np.bincount(stretch).astype(np.float64)
     largest = float(np.max(np.bincount(stretch % FOLDS)))
     if len(samples) < FOLDS or len(stretch) - largest < after[0].shape[1]:
         return None
-    squares = [_errors(estimator, tangent, residual, stretch) for tangent, residual in (before, after)]
+    squares = [_errors(estimator, each, stretch) for each in (before, after)]
     return Gain(OVER, FOLDS, samples, squares[0], squares[1])
 
 
@@ -62,10 +69,9 @@ def stretches(estimator: Estimator) -> NDArray[np.intp]:
     return np.asarray(np.unique(number, return_inverse=True)[1])
 
 
-def _errors(
-    estimator: Estimator, tangent: FloatArray, residual: FloatArray, stretch: NDArray[np.intp]
-) -> FloatArray:
+def _errors(estimator: Estimator, linear: _Linear, stretch: NDArray[np.intp]) -> FloatArray:
     """Sum of squares of each stretch, arcsec squared, with its fold left out of the fit."""
+    tangent, residual, information, pull = linear
     fold = stretch % FOLDS
     grams, moments = [], []
     for number in range(FOLDS):
@@ -73,7 +79,7 @@ def _errors(
         part = tangent[rows]
         grams.append(part.T @ part)
         moments.append(part.T @ residual[rows])
-    total, moment = np.sum(grams, axis=0), np.sum(moments, axis=0)
+    total, moment = np.sum(grams, axis=0) + np.diag(information), np.sum(moments, axis=0) + pull
     scale = np.sqrt(np.maximum(np.diag(total), 1e-300))
     result = np.zeros(int(stretch[-1]) + 1)
     for number in range(FOLDS):

@@ -55,7 +55,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     number of clusters as Carter, Schnepel and Steigerwald 2017).
     """
     tangent, residual = fitted.tangent, fitted.residual
-    gram = tangent.T @ tangent
+    gram = tangent.T @ tangent + np.diag(fitted.information)
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
     kept = values > 1e-9 * float(values[-1])
@@ -63,11 +63,13 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     inverse[np.diag(gram) <= 0.0] = 0.0
     inverse[:, np.diag(gram) <= 0.0] = 0.0
     best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
-    scores = tangent * residual[:, np.newaxis]
+    scores = tangent * residual[:, np.newaxis] + fitted.pull / len(residual)  # about their mean
+
+    of_prior = inverse @ np.diag(np.maximum(fitted.information, 0.0)) @ inverse
 
     def at_least(number: IntArray, normal: bool) -> FloatArray:
         sums, count = _sums(scores, number), int(number[-1]) + 1
-        spread = inverse @ (sums.T @ sums) @ inverse * (count / (count - 1))
+        spread = inverse @ (sums.T @ sums) @ inverse * (count / (count - 1)) + of_prior
         if not normal:
             share = _sums((tangent @ inverse) ** 2, number)
             carried = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)

@@ -315,7 +315,7 @@ class Search:
 
         One of more parameters gains more only once its shapes are fitted.
         """
-        present = {each.name for each in fitted.hypothesis.effects[self.base :]} - REPEATED
+        present = {each.name for each in fitted.hypothesis.effects} - REPEATED
         scores = [
             each
             for each in self._scores(fitted)

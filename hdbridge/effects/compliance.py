@@ -65,8 +65,8 @@ class Compliance(Linear):
         "model)",
     )
     shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("torque1_nm", 0.1, 500.0, logarithmic=True),
-        Shape("torque2_nm", 0.2, 1000.0, logarithmic=True),
+        Shape("torque1_nm", 0.1, 1e5, logarithmic=True),
+        Shape("torque2_nm", 0.2, 1e5, logarithmic=True),
     )
     linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
     typical: ClassVar[Mapping[str, Any]] = {

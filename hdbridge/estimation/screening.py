@@ -58,9 +58,8 @@ class Screen:
     def scores(self, fitted: Fitted) -> list[Score]:
         """Each candidate's, in their order."""
         basis, matrix = fitted.basis, self._matrix
-        residual = fitted.residual - basis @ (basis.T @ fitted.residual)
         shadow = basis.T @ matrix
-        moment = matrix.T @ residual
+        moment = matrix.T @ fitted.residual - shadow.T @ fitted.slack
         return [
             _score(candidate, gram, shadow[:, part], moment[part])
             for candidate, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
@@ -69,9 +68,9 @@ class Screen:
 
 def score_of(candidate: Candidate, columns: FloatArray, fitted: Fitted) -> Score:
     """The score of one candidate from its weighted columns."""
-    basis = fitted.basis
-    residual = fitted.residual - basis @ (basis.T @ fitted.residual)
-    return _score(candidate, columns.T @ columns, basis.T @ columns, columns.T @ residual)
+    shadow = fitted.basis.T @ columns
+    moment = columns.T @ fitted.residual - shadow.T @ fitted.slack
+    return _score(candidate, columns.T @ columns, shadow, moment)
 
 
 def _score(candidate: Candidate, gram: FloatArray, shadow: FloatArray, moment: FloatArray) -> Score:

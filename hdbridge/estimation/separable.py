@@ -139,9 +139,16 @@ class Solution:
 
     def free(self) -> int:
         """Parameters that do anything in the data."""
-        seen = int(np.count_nonzero(self._point.inside & (np.diag(self._point.gram) > 0.0)))
+        linear = (self._point.inside & (np.diag(self._point.gram) > 0.0))[self._order]
         idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
-        return seen + sum(each.shape and each.effect not in idle for each in self.columns)
+        # Of a spring that the record does not load far enough, neither a zone nor where it begins is seen.
+        partly = {each.effect for each, seen in zip(self.columns, linear, strict=False) if not seen}
+        shapes = [
+            each.effect not in partly or bool(np.any(self.jacobian[:, at]))
+            for at, each in enumerate(self.columns)
+            if each.shape and each.effect not in idle
+        ]
+        return int(np.count_nonzero(linear)) + sum(shapes)
 
 
 class Separable:

@@ -1,0 +1,125 @@
+"""What a model knows of an axis, as a prior of a fit: each part of it is as calibrated, or has changed.
+
+A part is what changes together: a loop, one order, a spring. As calibrated, its parameters are normally
+distributed about those of the model file, as wide as the 95 % intervals there, or by `SHARE` where it has
+none. A part that the data pull further away than a change costs has changed and is free. So what the data
+cannot distinguish from a new cause stays with the model, and a loop that is another one is still found.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects.orders import OrderSeries
+from hdbridge.estimation.shapes import shape_value
+from hdbridge.estimation.terms import Prior
+
+SHARE: Final = 0.04
+"""Standard deviation of a calibrated coefficient, as a share of it: what some kelvin and weeks change."""
+SHAPE_SHARE: Final = 0.06
+"""The same of a shape, which shows less: of a width, or of how far an exponent is above one."""
+PEAK_ARCSEC: Final = 0.1
+"""... and of a coefficient at least so much at its peak in this record."""
+NORMAL_95: Final = 1.96
+CHANGE: Final = 30.0
+"""Chi square that a changed part costs, as much as a new cause,"""
+CHANGE_OF_EACH: Final = 11.5
+"""... and for each of its parameters."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedPart:
+    """Parameters of one effect that change together, as calibrated."""
+
+    place: int
+    """Of the effect among the model's."""
+    parameters: Mapping[str, tuple[float, float]]
+    """Mean and standard deviation, by number of the coefficient or name of the shape; of the logarithm of a
+    logarithmic shape.
+    """
+
+    @property
+    def change_cost(self) -> float:
+        """Chi square that the part's change costs."""
+        return CHANGE + CHANGE_OF_EACH * len(self.parameters)
+
+    def strain(self, effects: Sequence[Effect]) -> float:
+        """Chi square by which the part is away from its calibration."""
+        effect = effects[self.place]
+        coefficients = effect.coefficients()
+        shapes = {each.name: each for each in effect.shape}
+        total = 0.0
+        for name, (mean, deviation) in self.parameters.items():
+            value = float(coefficients[int(name)]) if name.isdecimal() else shape_value(effect, name)
+            if name in shapes and shapes[name].logarithmic:
+                value = math.log(value)
+            total += ((value - mean) / deviation) ** 2
+        return total
+
+
+def calibrated(
+    effects: Sequence[Effect],
+    half_widths: Mapping[str, Mapping[str, Any]],
+    columns: Callable[[Effect], FloatArray],
+) -> tuple[CalibratedPart, ...]:
+    """The parts of a model with its 95 % half widths; ``columns``: an effect's in the record, (m, p)."""
+    return tuple(
+        CalibratedPart(place, parameters)
+        for place, effect in enumerate(effects)
+        for parameters in _parts(effect, half_widths.get(effect.name, {}), columns(effect))
+    )
+
+
+def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:
+    """What is known of the parameters of some parts."""
+    return {
+        (part.place, name): Prior(mean, deviation**-2)
+        for part in parts
+        for name, (mean, deviation) in part.parameters.items()
+    }
+
+
+def _parts(
+    effect: Effect, halves: Mapping[str, Any], columns: FloatArray
+) -> Iterator[dict[str, tuple[float, float]]]:
+    peaks = np.max(np.abs(columns), axis=0, initial=0.0)
+    # What the record does not see stays as it is.
+    least = np.where(peaks > 0.0, PEAK_ARCSEC / np.maximum(peaks, 1e-12), 0.0)
+    values = effect.coefficients()
+    if isinstance(effect, OrderSeries):
+        known = {each["order"]: each for each in halves.get("orders", ())}
+        for i, order in enumerate(effect.orders):
+            wide = _of_order(order.amplitude_arcsec, known.get(order.order))
+            pair = (2 * i, 2 * i + 1)
+            yield {str(at): (float(values[at]), math.hypot(wide, float(least[at]))) for at in pair}
+        return
+    names = getattr(effect, "linear", ("offset_arcsec",) * len(values))
+    result: dict[str, tuple[float, float]] = {}
+    for at, (name, value) in enumerate(zip(names, values.tolist(), strict=True)):
+        wide = _width(halves.get(name), SHARE * abs(value))
+        result[str(at)] = value, max(math.hypot(wide, float(least[at])), 1e-9)
+    for shape in effect.shape:
+        value = shape_value(effect, shape.name)
+        size = value - 1.0 if shape.name == "exponent" else value
+        wide = max(_width(halves.get(shape.name), SHAPE_SHARE * abs(size)), 1e-3 * abs(size), 1e-9)
+        result[shape.name] = (math.log(value), wide / value) if shape.logarithmic else (value, wide)
+    if result:
+        yield result
+
+
+def _width(half: object, otherwise: float) -> float:
+    return float(half) / NORMAL_95 if isinstance(half, int | float) else otherwise
+
+
+def _of_order(amplitude_arcsec: float, halves: Mapping[str, Any] | None) -> float:
+    """Of cosine and sine alike, from the half widths of amplitude and phase."""
+    if halves is None:
+        return SHARE * amplitude_arcsec
+    turn = math.radians(float(halves.get("phase_deg", 0.0))) * amplitude_arcsec
+    return math.hypot(float(halves.get("amplitude_arcsec", 0.0)), turn) / math.sqrt(2.0) / NORMAL_95
