@@ -19,7 +19,12 @@ def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of a positive semi-definite system, columns scaled to one; what is not seen stays at zero."""
     if not len(matrix):
         return np.zeros_like(right)
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    seen = np.diag(matrix) > 0.0
+    if not np.all(seen):  # rounding on the scale of nothing could be anything
+        result = np.zeros_like(right)
+        result[seen] = solve_symmetric(matrix[np.ix_(seen, seen)], right[seen])
+        return result
+    scale = np.sqrt(np.diag(matrix))
     spread = scale if right.ndim == 1 else scale[:, np.newaxis]
     scaled = matrix / np.outer(scale, scale)
     factor, solved, failed = dposv(scaled, right / spread, lower=1)

@@ -76,6 +76,25 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     assert after < 0.4 * before
 
 
+@pytest.mark.parametrize("folder", ["cobot", "cobot-command"])
+@pytest.mark.parametrize(
+    ("joint", "cause", "least_arcsec"), [(4, "channel_skew", 14.0), (5, "compliance", 10.0)]
+)
+def test_half_the_samples_with_or_without_the_command_name_the_same(
+    folder: str, joint: int, cause: str, least_arcsec: float
+) -> None:
+    whole = [Record.read_csv(each) for each in measured(f"{folder}/joint{joint}-*.csv")]
+    halves = [
+        Record({name: values[::2] for name, values in each.columns.items()}, each.source) for each in whole
+    ]
+    found = diagnose(concatenate(halves), NOTHING, independent_zeros=True)
+    sizes = {each.cause: each.peak_arcsec for each in found.findings}
+    assert "motor_order" in sizes
+    assert sizes[cause] > least_arcsec
+    assert not set(sizes) & UNLIKELY
+    assert found.extended.rms_arcsec < 0.45 * found.baseline.rms_arcsec
+
+
 def test_zeros_that_differ_are_told_and_nothing_is_named_for_them(
     joints: dict[int, list[Record]], tmp_path: Path
 ) -> None:
