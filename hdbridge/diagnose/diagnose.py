@@ -161,6 +161,8 @@ class _Judge:
         usual = {each.cause for each in judged.findings if _ordinary(each)}
         findings = [each for each in judged.findings if each.cause not in usual]
         considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
+        known = {each.cause for each in findings} | {each.split(":")[0] for each in considered}
+        considered += [f"{cause}: {why}" for cause, why in self.search.refusals.items() if cause not in known]
         findings = self._with_unexplained(findings, left)
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         given, refitted = (

@@ -145,8 +145,10 @@ def vibrations(
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
     frequency = np.arange(len(power)) / (size * data.period_s)
-    # Less than two periods of it are a bend, not a frequency.
-    power[frequency < max(LOWEST_HZ, 2.0 / (length * data.period_s))] = 0.0
+    # Less than two periods of it are a bend, not a frequency. Moves that are alike bend alike: only what lies
+    # about one zero counts together.
+    unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
+    power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
     for each in present:
         if isinstance(each, Vibration):

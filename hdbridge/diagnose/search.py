@@ -102,6 +102,8 @@ class Search:
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self._refused: set[object] = set()
+        self.refusals: dict[str, str] = {}
+        """Causes that a gate stopped during the search, with its reason in words."""
         self._left_out: str | None = None
         law = next((each for each in self._base if isinstance(each, LOOPS)), None)
         if law is not None:
@@ -282,7 +284,9 @@ class Search:
             return True
         # What is over at once, or seen only where the axis reverses, is another cause's, which would not
         # be found with it in the fit.
-        if not gate(self.estimator, trial, place).passed:
+        judged = gate(self.estimator, trial, place)
+        if not judged.passed:
+            self.refusals[candidate.cause] = judged.reason
             return False
         return isinstance(effect, Creep) or all_steps_seen(self.estimator, trial, place)
 

@@ -104,7 +104,7 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
         if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
             return True
-    return bool(left.arcsec > PLAIN_ARCSEC + counts + 2.0 * left.standing_arcsec)
+    return bool(left.arcsec > np.linalg.norm((PLAIN_ARCSEC, counts, left.standing_arcsec)))
 
 
 def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:

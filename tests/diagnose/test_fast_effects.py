@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import binom
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.estimation.white_noise import between_lines, noise_arcsec
 from hdbridge.model import TransmissionModel
-from hdbridge.records.record import Record
+from hdbridge.records.record import Record, concatenate
 
 NOISE_ARCSEC = 0.35
 """Of the plant: white noise, and the rounding of its load encoder."""
@@ -85,6 +86,43 @@ def test_creep_that_is_over_half_a_second_after_a_stop_is_named(plant: ModuleTyp
 
 def test_a_damaged_tooth_is_named_beside_an_order_of_the_load(plant: ModuleType) -> None:
     assert names(diagnosed(plant, damaged(51), seed=51)) == ["load_order", "local_defect"]
+
+
+def test_more_than_an_arcsec_that_depends_on_nothing_is_unexplained(plant: ModuleType) -> None:
+    """It wanders while the axis moves, by 1.7 arcsec; a count of the motor is 0.9 arcsec rms in addition."""
+    record = plant.record(plant.Truth(), plant.Plan(rate_hz=16.0, scale=0.1, load_turns=1.05, steps=8), 71)
+    time_s = record["time_s"]
+    decay = float(np.exp(time_s[0] - time_s[1]))
+    white = np.sqrt(1.0 - decay**2) * np.random.default_rng(7).standard_normal(len(time_s))
+    moves = np.gradient(record["motor_target_deg"]) != 0.0
+    record["load_position_deg"] += 1.7 * moves * lfilter([1.0], [1.0, -decay], white) / 3600.0
+    del record["motor_target_deg"]
+    found = diagnose(Record(record), TransmissionModel.from_text(plant.model_text(76)))
+    assert "unexplained" in names(found)
+
+
+def one_way(seed: int) -> Record:
+    """Four moves of a second that are alike, with two orders' ripple, a term in speed and something slow."""
+    rng = np.random.default_rng(seed)
+    part = np.arange(100) / 100.0
+    turns, phase, drag = rng.uniform(1.2, 2.5), rng.uniform(0.0, 6.0), rng.uniform(0.01, 0.03)
+    moves = []
+    for number in range(4):
+        motor = 100.0 + 360.0 * turns * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+        error = 20.0 * np.cos(np.radians(2.0 * motor) + phase) - drag * np.gradient(motor, 0.01)
+        slow = lfilter([0.6], [1.0, -0.95], rng.standard_normal(300))[200:]
+        load = motor / 100.0 + (error + 40.0 * number + slow + rng.standard_normal(100)) / 3600.0
+        moves.append(Record({"time_s": part, "motor_position_deg": motor, "load_position_deg": load}))
+    return concatenate(moves)
+
+
+def test_a_term_in_speed_is_no_vibration_because_moves_are_alike() -> None:
+    found = [
+        names(diagnose(one_way(seed), TransmissionModel(100.0, ()), independent_zeros=True))
+        for seed in range(20, 26)
+    ]
+    assert often_enough(sum(bool({"channel_skew", "velocity_windup"} & set(each)) for each in found), 6, 0.95)
+    assert often_enough(sum("vibration" not in each for each in found), 6, 0.95)
 
 
 @pytest.mark.slow
