@@ -1,8 +1,9 @@
 """Second thoughts on what a search has picked: swap, merge, prune.
 
 A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. A merge
-does so with two findings that are kin: one cause that explains what they do is more likely than both. Wear is
-fitted from several widths. Pruning takes out what no longer earns its keep among the others.
+does so with two findings that overlap: one cause that explains what they do is more likely than both. What
+remembers the path is fitted anew from each of its shapes. Pruning takes out what no longer earns its keep
+among the others.
 """
 
 from __future__ import annotations
@@ -10,9 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-import numpy as np
-
-from hdbridge.diagnose.candidates import candidates
+from hdbridge.diagnose.overlap import overlap
 from hdbridge.diagnose.search import (
     ENTER,
     FEW,
@@ -22,40 +21,11 @@ from hdbridge.diagnose.search import (
     Trail,
     cost,
 )
-from hdbridge.effects import AmplitudeDrift, Wear
 from hdbridge.estimation.hypothesis import Fitted
 
-DIRECTIONAL = frozenset(
-    {
-        "backlash",
-        "wear",
-        "amplitude_drift",
-        "rate_dependence",
-        "velocity_windup",
-        "channel_skew",
-        "inertial_windup",
-        "creep",
-    }
-)
-"""Causes that lie between the two directions of motion, or where one goes over to the other: what the form of
-one gets wrong lies there too, and looks like another of them."""
-DIRECTIONAL_SHARE = 0.05
-"""... so that the second needs this share of the first one's data."""
-OVERLAPPING = (
-    {"velocity_windup", "channel_skew", "rate_dependence"},
-    {"channel_skew", "inertial_windup"},
-    {"zero_drift", "count_loss"},
-    {"backlash", "wear"},
-    {"wear", "amplitude_drift"},
-)
-"""Causes that are nearer to each other than that."""
-OVERLAP_SHARE = 0.15
 EXACTLY = 1.1
 """Chi square per point that is more than noise. Where kin together leave noise and without the smaller one
 there is more, both are there."""
-SIDELINE_SHARE = 0.03
-"""A vibration of less than this share of another one's evidence is that one: no source keeps its frequency
-and amplitude exactly, and the gear's loop answers it with other frequencies."""
 MERGED_SHARE = 0.03
 """One cause in place of two kin may miss this share of what both explain: laws are not exact."""
 LEFTOVER = 2e-5
@@ -67,21 +37,12 @@ def reconsidered(search: Search, trail: Trail) -> Trail:
     fitted = trail.fitted
     if len(fitted.hypothesis.effects) - search.base <= FEW:
         fitted = _swapped(search, fitted)
-    fitted = _pruned(search, _with_wear_anew(search, fitted))
+    fitted = _pruned(search, _loops_anew(search, fitted))
     fitted = _merged(search, fitted)
     fitted, _ = search.with_best_law(fitted)
     fitted = _pruned(search, fitted)
     fitted, law_gain = search.with_best_law(fitted)
     return replace(trail, fitted=fitted, law_gain=law_gain)
-
-
-def overlap(one: str, other: str) -> float:
-    """Share of the other's evidence that a finding needs, because it may look like what that leaves."""
-    if one == other:
-        return {"vibration": SIDELINE_SHARE, "local_defect": OVERLAP_SHARE}.get(one, 0.0)
-    if any({one, other} <= each for each in OVERLAPPING):
-        return OVERLAP_SHARE
-    return DIRECTIONAL_SHARE if {one, other} <= DIRECTIONAL else 0.0
 
 
 def _swapped(search: Search, fitted: Fitted) -> Fitted:
@@ -101,14 +62,18 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _with_wear_anew(search: Search, fitted: Fitted) -> Fitted:
-    """With wear fitted anew from each width that is offered: from a wide one it ends as part of the loop."""
-    for place, effect in enumerate(fitted.hypothesis.effects[search.base :], search.base):
-        if isinstance(effect, Wear):
+def _loops_anew(search: Search, fitted: Fitted) -> Fitted:
+    """With what remembers the path fitted anew from each proposal.
+
+    From a wide one it ends as part of the loop that the model has.
+    """
+    base = fitted.hypothesis.effects[: search.base]
+    for place in range(search.base, len(fitted.hypothesis.effects)):
+        effect = fitted.hypothesis.effects[place]
+        if effect.tracker().memory_deg > 0.0 and effect.shape:
             trials = [
-                search.estimator.fit(fitted.hypothesis.instead(place, each.effect))
-                for each in candidates(search.estimator.data, fitted.hypothesis.effects[: search.base])
-                if isinstance(each.effect, Wear)
+                search.estimator.fit(fitted.hypothesis.instead(place, each))
+                for each in type(effect).proposals(search.estimator.data, base)
             ]
             fitted = min((fitted, *trials), key=cost)
     return fitted
@@ -118,8 +83,8 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
     """Two kin taken out together, and the best one cause put in the place of both."""
     places = range(search.base, len(fitted.hypothesis.effects))
     for one, other in combinations(places, 2):
-        kinds = (_kind(search, fitted, one), _kind(search, fitted, other))
-        if kinds[0] == kinds[1] or not overlap(*kinds):
+        same = fitted.hypothesis.effects[one].name == fitted.hypothesis.effects[other].name
+        if same or not _overlap(search, fitted, one, other):
             continue
         search.forget()
         without = search.estimator.fit(fitted.hypothesis.without(other).without(one))
@@ -144,11 +109,10 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         largest = max(gain for gain, _ in gains.values())
         place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
         gain, without = gains[place]
-        kinds = {each: _kind(search, fitted, each) for each in gains}
         small = search.peak(fitted, place) < FLOOR_ARCSEC
         count = len(fitted.residual)
         share = max(
-            (overlap(kinds[place], kinds[other]) * gains[other][0] for other in gains if other != place),
+            (_overlap(search, fitted, place, other) * gains[other][0] for other in gains if other != place),
             default=0.0,
         )
         if fitted.chi_square < count and without.chi_square > EXACTLY * count:
@@ -159,15 +123,9 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _kind(search: Search, fitted: Fitted, place: int) -> str:
-    """The cause, for its kin; a drift of amplitudes that is one of ripple lies in both directions alike."""
-    effect = fitted.hypothesis.effects[place]
-    if isinstance(effect, AmplitudeDrift):
-        parts = search.estimator.columns(effect, fitted.hypothesis.start) * effect.coefficients()
-        ripple, friction = np.std(parts, axis=0)
-        if ripple > friction:
-            return "ripple"
-    return effect.name
+def _overlap(search: Search, fitted: Fitted, one: int, other: int) -> float:
+    effects, data = fitted.hypothesis.effects, search.estimator.data
+    return overlap(effects[one], effects[other], data.motion, data.ratio)
 
 
 def _toll(fitted: Fitted, place: int) -> float:

@@ -1,4 +1,4 @@
-"""Findings within the model's own parts: the elastic law, its parameters, the first two orders of the motor.
+"""Findings within the model's own parts: the elastic law, its parameters, the orders of the motor.
 
 Calibrations are a few per cent off as a rule, and that is no finding: the change has to be larger than that.
 """
@@ -6,6 +6,7 @@ Calibrations are a few per cent off as a rule, and that is no finding: the chang
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,18 +15,7 @@ from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import EXTRAPOLATED, PENALTY, Trail
-from hdbridge.effects import (
-    DirectionPhase,
-    Effect,
-    FloatArray,
-    HysteresisParameters,
-    Loop,
-    MotorEncoderEccentricity,
-    Synchronous,
-)
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.effects.orders import MotorOrder
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
 
@@ -51,11 +41,11 @@ def findings(
     """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
     result: list[Finding] = []
     for place, (given, now) in enumerate(zip(model.effects, precise.hypothesis.effects, strict=False)):
-        if isinstance(given, Hysteresis | HysteresisMemory):
+        if given.part is Part.LOOP:
             if estimator.data.reversals < 2:
                 continue  # a loop shows only where the axis reverses
             found = _law(estimator, trail, precise, place, given, now, spread)
-        elif isinstance(given, Synchronous):
+        elif given.part is Part.ORDERS:
             found = _orders(estimator, precise, place, given, now, spread)
         else:
             found = None
@@ -80,7 +70,8 @@ def _law(
         return estimator.columns(effect, start) @ effect.coefficients()
 
     if type(given) is not type(now):
-        if trail.law_gain < LAW_GAIN or not isinstance(now, HysteresisMemory):
+        causes = causes_of(given, now)
+        if trail.law_gain < LAW_GAIN or not causes:
             return None
         old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
         apart = (old.residual - fitted.residual) / estimator.weight
@@ -90,11 +81,12 @@ def _law(
         ):
             return None
         gain = held_out(estimator, fitted, old)
+        name = causes[0].name
         return Finding(
-            "hysteresis_memory", 0.95, (), parameters_of(estimator, precise, place, spread),
-            gain, next_experiment("hysteresis_memory", ()),
+            name, 0.95, (), parameters_of(estimator, precise, place, spread),
+            gain, next_experiment(name, ()),
             float(np.quantile(np.abs(apart), 0.998)),
-            robust=trail.law_gain, effect=now,
+            robust=trail.law_gain, effect=causes[0],
         )  # fmt: skip
     before, after = values(given), values(now)
     change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
@@ -106,21 +98,21 @@ def _law(
         and (peak < LOOP_ARCSEC or _away(precise, place, given, now, spread) < CALIBRATIONS)
     ):
         return None
-    loop = Loop(**given.parameters(), memory=isinstance(given, HysteresisMemory))
-    assert isinstance(now, Hysteresis | HysteresisMemory)
-    effect = HysteresisParameters(
-        base=loop, offset_arcsec=now.offset_arcsec, width_deg=now.width_deg, exponent=now.exponent
-    )
-    # A loop that obeys neither law may have memory in part of it, or in none.
-    aliases = ("hysteresis_memory",) if lawless else ()
+    causes = causes_of(given, now)
+    if not causes:
+        return None
+    effect = causes[0]
+    # A loop that obeys no law may follow another one in part.
+    laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
+    aliases = tuple(laws) if lawless else ()
     residual = fitted.residual / estimator.weight
     apart = after - before - float(np.mean(after - before))
     taken = math.sqrt(max(float(np.mean((residual + apart) ** 2 - residual**2)), 0.0))
     moved = values(fitted.hypothesis.effects[place]) - before
     return Finding(
-        "hysteresis_parameters", 0.9, aliases, parameters_of(estimator, precise, place, spread),
+        effect.name, 0.9, aliases, parameters_of(estimator, precise, place, spread),
         held_out_change(estimator, fitted, fitted.places(place), moved),
-        next_experiment("hysteresis_parameters", aliases), max(peak, lawless), taken_arcsec=taken,
+        next_experiment(effect.name, aliases), max(peak, lawless), taken_arcsec=taken,
         robust=float(np.sum((estimator.weight * (after - before - np.mean(after - before))) ** 2)),
         effect=effect, note="the baseline's own loop takes over the new parameters",
     )  # fmt: skip
@@ -161,63 +153,67 @@ def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatA
     return float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
 
 
+def causes_of(given: Effect, now: Effect) -> list[Effect]:
+    """The causes that can have made one of the other, those that say more of it first."""
+    found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
+    return sorted(found, key=lambda each: each.changes is None)
+
+
 def _orders(
-    estimator: Estimator, fitted: Fitted, place: int, given: Synchronous, now: Effect, spread: FloatArray
+    estimator: Estimator, fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray
 ) -> Finding | None:
-    assert isinstance(now, Synchronous)
     columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
-    changed: list[MotorOrder] = []
-    which: list[int] = []
-    parameters: dict[str, Parameter] = {}
-    weight = 0.0
-    # Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift.
-    shift = next(
-        (
-            math.radians(each.shift_deg)
-            for each in fitted.hypothesis.effects
-            if isinstance(each, DirectionPhase)
-        ),
-        0.0,
-    )
-    for number, (old, new) in enumerate(zip(given.orders, now.orders, strict=True)):
-        one, other = _phasor(old), _phasor(new)
-        apart = other - one
-        if shift and abs(other - one * math.cos(old.order * shift)) < max(ORDER_ARCSEC, 0.5 * abs(apart)):
+    changed: list[tuple[Effect, Effect]] = []
+    kept: list[int] = []
+    for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
+        before, after = old.coefficients(), new.coefficients()
+        pair = [columns[each] for each in named.columns]
+        size, own = float(np.linalg.norm(after - before)), float(np.linalg.norm(before))
+        # What is odd in the direction takes some of an order away from the mean of both directions.
+        share = math.prod(each.left_in_mean(_number(new)) for each in fitted.hypothesis.effects)
+        if float(np.linalg.norm(after - share * before)) < max(ORDER_ARCSEC, 0.5 * size):
             continue
-        pair = columns[2 * number : 2 * number + 2]
         deviation = math.sqrt(max(float(np.trace(spread[np.ix_(pair, pair)])), 0.0))
-        if abs(apart) < max(ORDER_ARCSEC, ORDER_SHARE * abs(one), 5.0 * deviation):
+        if size < max(ORDER_ARCSEC, ORDER_SHARE * own, 5.0 * deviation):
             continue
-        phase = math.degrees(math.atan2(apart.imag, apart.real))
-        changed.append(
-            MotorOrder.model_construct(order=old.order, amplitude_arcsec=abs(apart), phase_deg=phase)
-        )
-        parameters |= polar(
-            f"order_{old.order}_", np.array([apart.real, -apart.imag]), spread[np.ix_(pair, pair)]
-        )
-        weight += abs(apart) ** 2
-        which.append(number)
+        changed.append((old, new))
+        kept += pair
     if not changed:
         return None
     change = now.fitted(now.coefficients() - given.coefficients())
     seen = 0.5 * float(np.ptp(estimator.does(change, fitted.hypothesis.start)))
-    if max(each.amplitude_arcsec for each in changed) > EXTRAPOLATED * seen:
+    was, is_now = (_together(each) for each in zip(*changed, strict=True))
+    difference = is_now.fitted(is_now.coefficients() - was.coefficients())
+    causes = causes_of(was, is_now)
+    if not causes or difference.largest_piece_arcsec() > EXTRAPOLATED * seen:
         return None  # on an arc of their turn orders take any size
-    low = {each.order for each in changed} <= {1, 2}
-    size = sum(each.amplitude_arcsec for each in changed)
-    pairs = np.concatenate([columns[2 * number : 2 * number + 2] for number in which])
-    difference = now.model_copy(update={"orders": tuple(changed)})
-    moved = estimator.columns(difference, fitted.hypothesis.start) @ difference.coefficients()
-    cause, aliases = ("motor_encoder_eccentricity", ("motor_order",)) if low else ("motor_order", ())
+    values = difference.coefficients()
+    parameters: dict[str, Parameter] = {}
+    for i, named in enumerate(difference.named_coefficients()):
+        pair = kept[2 * i : 2 * i + 2]
+        parameters |= polar(named.name, values[list(named.columns)], spread[np.ix_(pair, pair)])
+    moved = estimator.columns(difference, fitted.hypothesis.start) @ values
+    cause, aliases = causes[0].name, tuple(each.name for each in causes[1:])
     return Finding(
-        cause, 0.9, aliases, parameters, held_out_change(estimator, fitted, pairs, moved),
-        next_experiment(cause, aliases), size,
-        robust=float(np.sum(estimator.weight**2) * 0.5 * weight),
-        effect=MotorEncoderEccentricity.model_construct(orders=tuple(changed)) if low else None,
+        cause, 0.9, aliases, parameters, held_out_change(estimator, fitted, np.array(kept), moved),
+        next_experiment(cause, aliases), difference.bound_arcsec(),
+        robust=float(np.sum(estimator.weight**2) * 0.5 * float(values @ values)),
+        effect=causes[0],
         note="a change of orders that the model has: its synchronous part takes it over",
     )  # fmt: skip
 
 
-def _phasor(order: MotorOrder) -> complex:
-    angle = math.radians(order.phase_deg)
-    return order.amplitude_arcsec * complex(math.cos(angle), math.sin(angle))
+def _together(pieces: Sequence[Effect]) -> Effect:
+    """One effect of several pieces of it."""
+    whole = pieces[0]
+    for each in pieces[1:]:
+        both = whole.joined(each)
+        assert both is not None, "pieces of one effect join"
+        whole = both
+    return whole
+
+
+def _number(piece: Effect) -> int:
+    """The order of a piece that is one."""
+    waves = piece.waves()
+    return round(waves[0][0]) if waves else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,14 +13,13 @@ from hdbridge.diagnose.backward import reconsidered
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.holdout import held_out
-from hdbridge.diagnose.identifiability import ALWAYS, identifiability
-from hdbridge.diagnose.lookalikes import inertial, late, wound_up
+from hdbridge.diagnose.identifiability import identifiability
+from hdbridge.diagnose.lookalikes import as_calibrated, lookalikes, plausible_only, with_measured
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, Signs, weighed
-from hdbridge.diagnose.reference import as_calibrated
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import ORDINARY_ARCSEC, PENALTY, Search, Trail
+from hdbridge.diagnose.search import PENALTY, Search, Trail
 from hdbridge.diagnose.unexplained import (
     LEFT_ARCSEC,
     SHADOW,
@@ -34,7 +33,7 @@ from hdbridge.diagnose.unexplained import (
     without_doubtful_loops,
 )
 from hdbridge.diagnose.unfitted import unfitted
-from hdbridge.effects import Channel, Effect, FloatArray, Start, unmet
+from hdbridge.effects import CATALOGUE, Channel, FloatArray, Part, Start, aliases_of, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
@@ -47,26 +46,21 @@ from hdbridge.observations.foreign import check_once, check_records, zeros_apart
 from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
-from hdbridge.units import DEG_PER_TURN
 
-LOOPS = frozenset({"hysteresis_memory", "hysteresis_parameters"})
 NAMED = 0.3
 """A name that is so improbable helps nobody; of names below it one in eleven was right in a blind suite."""
 ONE_WAY = 0.6
 """A record without reversals makes no name more probable than this."""
 LEADS = 3.5
 """A name comes before what is unexplained when its peak is so many times its root mean square."""
-LINES = frozenset({"subdivisional_error", "vibration"})
-"""Causes that are one sharp line of a spectrum."""
 LOOP_EXPLAINS = 0.3
 """A loop of another shape accounts for what is left when the travel since the reversal foretells this share
 of it."""
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
-PARTED = 0.2
-"""Share of a period by which two orders have to part to be distinguished, whatever else is not quite right:
-some ten motor turns for order 2 at a ratio of 100."""
-LOW_SHARE = 0.8
-"""Orders 1 and 2 that make up more than this share of the squares may be the motor encoder's own."""
+IN_STEP = 0.85
+"""Share of the squares of a wave that others have to explain to be taken for it, whatever else is not quite
+right: two that part by a fifth of a period explain 0.87 of each other, some ten motor turns for orders 2 of
+motor and flexspline at a ratio of 100."""
 
 
 def diagnose(
@@ -153,8 +147,8 @@ class _Judge:
         fitted, considered = self._named_only(trail.fitted)
         fitted, more = self._without_doubtful(fitted)
         considered += more
-        fitted = inertial(estimator, self.search, late(estimator, self.search, fitted))
-        fitted = wound_up(estimator, fitted, trail.base)
+        fitted = plausible_only(self.search, fitted)
+        fitted = with_measured(estimator, fitted, trail.base)
         fitted = as_calibrated(estimator, fitted, self.model.effects)
         judged = self._likely_only(fitted)
         fitted, left, spread = judged.fitted, judged.left, judged.spread
@@ -272,7 +266,7 @@ class _Judge:
             apart = elsewhere(self.estimator, residual)
             share = {}
             for place, effect in enumerate(fitted.hypothesis.effects[self.trail.base :], self.trail.base):
-                if effect.name in LINES or effect.name in ORDINARY_ARCSEC:
+                if (effect.sought is not None and effect.sought.is_line) or effect.ordinary_arcsec:
                     continue  # what is left has no such line, and casts no shadow there; or any axis has it
                 rows = acts(self.estimator, fitted, place)
                 if np.any(rows & apart):
@@ -330,28 +324,31 @@ class _Judge:
                 aliases.append(name)
             else:
                 margin = min(margin, worse)
-        if effect.name == "motor_order" and _low(effect):
-            aliases += [each for each in ALWAYS["motor_order"] if each not in aliases]
-        aliases += [each for each in self._out_of_step(effect) if each not in aliases]
-        has_torque = Channel.LOAD_TORQUE in self.estimator.motion.available()
-        orders = {each.order for each in getattr(effect, "orders", ())}
-        if effect.name == "load_order" and 1 in orders and not has_torque and "compliance" not in aliases:
-            aliases.append("compliance")
+        aliases += [each for each in self._in_step(fitted, place) if each not in aliases]
+        available = self.estimator.motion.available()
+        for kind, _ in lookalikes(effect, self.estimator.data.ratio):
+            if kind.channels - available and kind.name not in aliases:
+                aliases.append(kind.name)
         return tuple(aliases), margin
 
-    def _out_of_step(self, effect: Effect) -> tuple[str, ...]:
-        """The other of the motor's and the flexspline's orders, where one has hardly parted from the other.
-
-        Over T motor turns orders k of the two part by k T / N of a period.
-        """
-        twin = {"motor_order": "flexspline_order", "flexspline_order": "motor_order"}.get(effect.name)
-        if twin is None:
-            return ()
-        orders = effect.orders  # type: ignore[attr-defined]
-        largest = max(orders, key=lambda each: each.amplitude_arcsec).order
-        data = self.estimator.data
-        parted = largest * data.travel_deg / DEG_PER_TURN / data.ratio
-        return (twin,) if parted < PARTED else ()
+    def _in_step(self, fitted: Fitted, place: int) -> Iterator[str]:
+        """Other kinds of waves that have hardly parted from those of a finding anywhere in the record."""
+        effect = fitted.hypothesis.effects[place]
+        if not effect.waves():
+            return
+        estimator, start = self.estimator, fitted.hypothesis.start
+        does = estimator.columns(effect, start) @ effect.coefficients()
+        does -= np.mean(does)
+        for name in aliases_of(effect.name):
+            kind = CATALOGUE.get(name)
+            proposed = [] if kind is None else [*kind.proposals(estimator.data, ())]
+            near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
+            if not near:
+                continue
+            columns = np.hstack([estimator.columns(each, start) for each in near])
+            left = does - columns @ np.linalg.lstsq(columns, does, rcond=1e-9)[0]
+            if float(left @ left) < (1.0 - IN_STEP) * float(does @ does):
+                yield name
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings)
@@ -360,11 +357,9 @@ class _Judge:
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
         lives = left.lives_in
         if many is not None:
-            lives = {
-                "motor_order": "motor angle",
-                "load_order": "load angle",
-                "flexspline_order": "motor angle",
-            }.get(many[0].cause, left.lives_in)
+            effect = many[0].effect
+            if effect is not None and effect.waves():
+                lives = effect.coordinate(self.estimator.motion, self.estimator.data.ratio).name
             findings = [each for each in findings if each not in many]
         unknown = Finding(
             cause="unexplained",
@@ -381,7 +376,7 @@ class _Judge:
             curve_arcsec=left.curve_arcsec,
             axis=left.lives_in,
         )
-        loops = [each for each in findings if each.cause in LOOPS]
+        loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         foretold = left.explained_arcsec**2 > LOOP_EXPLAINS * left.arcsec**2
         if many is None and loops and "last reversal" in lives and foretold:
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
@@ -456,13 +451,7 @@ class _Judge:
 
 def _ordinary(finding: Finding) -> bool:
     """Whether any axis has as much of it."""
-    return finding.peak_arcsec < ORDINARY_ARCSEC.get(finding.cause, 0.0)
-
-
-def _low(effect: Effect) -> bool:
-    """Whether orders 1 and 2 are most of it, which the motor's encoder may make itself."""
-    squares = {each.order: each.amplitude_arcsec**2 for each in effect.orders}  # type: ignore[attr-defined]
-    return bool(squares.get(1, 0.0) + squares.get(2, 0.0) > LOW_SHARE * sum(squares.values()))
+    return finding.effect is not None and finding.peak_arcsec < finding.effect.ordinary_arcsec
 
 
 def _figures(values: FloatArray, about_zero: bool = False) -> Figures:

@@ -1,67 +1,17 @@
 """The next experiment: the shortest that separates what the data leave open.
 
 Two menus. `next_experiment` and `for_unexplained` say in words what would distinguish a cause from its
-look-alikes, also what only a person can do (move a mass, re-clock an encoder). `machine_plans` are the
-experiments that the axis can do by itself; which of them separates a pair is not written here but predicted
-(`hdbridge.diagnose.planned`).
+look-alikes, as the causes have it, also what only a person can do (move a mass, re-clock an encoder).
+`machine_plans` are the experiments that the axis can do by itself; which of them separates a pair is not
+written here but predicted (`hdbridge.diagnose.planned`).
 """
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from hdbridge.effects import CATALOGUE
+from hdbridge.effects import CATALOGUE, Experiment
 from hdbridge.procedures.plan import Plan
-
-
-class Experiment(NamedTuple):
-    """One entry of the menu."""
-
-    minutes: float
-    words: str
-
-
-_PAIRS: Final[dict[frozenset[str], Experiment]] = {
-    frozenset({"load_order", "compliance"}): Experiment(
-        5,
-        "take the mass off or turn it by 90 deg, sweep one load turn both ways: a wind-up goes with it",
-    ),
-    frozenset({"motor_order", "motor_encoder_eccentricity"}): Experiment(
-        15,
-        "re-clock the motor encoder by 90 deg on its shaft and sweep ten motor turns: its part turns with it",
-    ),
-    frozenset({"ratio_error", "load_order"}): Experiment(
-        6, "sweep two whole load turns both ways: a ramp goes on, a load order comes back"
-    ),
-    frozenset({"zero_drift", "count_loss"}): Experiment(
-        4, "return to one reference pose every half minute: a step has happened, a drift goes on"
-    ),
-    frozenset({"channel_skew", "velocity_windup"}): Experiment(
-        2, "sweep three motor turns both ways at three speeds: skew is a straight line, drag bends"
-    ),
-    frozenset({"channel_skew", "inertial_windup"}): Experiment(
-        2, "sweep at constant speed both ways: a skew stays, inertia is silent"
-    ),
-    frozenset({"backlash", "hysteresis_parameters"}): Experiment(
-        3, "repeat the small reversals with a load torque to one side: it holds a gap closed"
-    ),
-    frozenset({"backlash", "hysteresis_memory"}): Experiment(
-        3, "reversals of 0.1 to 2 deg of the motor, each beyond where the last one turned"
-    ),
-    frozenset({"zero_drift", "creep"}): Experiment(
-        10, "stand still for ten minutes after a move in each direction: creep takes the direction's sign"
-    ),
-    frozenset({"zero_drift", "ratio_error"}): Experiment(
-        3,
-        "sweep a load turn forth and back at twice the speed: a ramp goes with the angle, a drift with time",
-    ),
-    frozenset({"vibration", "motor_order"}): Experiment(
-        2, "stand still for a minute, then sweep at two speeds: a vibration keeps its frequency"
-    ),
-    frozenset({"torque_modulation", "amplitude_drift"}): Experiment(
-        10, "the same motor turns under two torques at one temperature"
-    ),
-}
 
 
 def _sweep(speed: float, **length: float) -> dict[str, Any]:
@@ -132,12 +82,21 @@ def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
     """The shortest experiment that distinguishes the cause from its aliases; without aliases, the one that
     confirms it.
     """
-    known = [_PAIRS[frozenset({cause, each})] for each in aliases if frozenset({cause, each}) in _PAIRS]
+    known = [
+        found
+        for each in aliases
+        for one, other in ((cause, each), (each, cause))
+        if (found := _apart(one, other)) is not None
+    ]
     if known:
         return min(known).words
     if cause in CATALOGUE:
         return CATALOGUE[cause].about.experiment
     return ""
+
+
+def _apart(cause: str, other: str) -> Experiment | None:
+    return CATALOGUE[cause].about.apart.get(other) if cause in CATALOGUE else None
 
 
 def for_unexplained(lives_in: str) -> str:
@@ -178,7 +137,7 @@ def _coordinate(lives_in: str) -> str:
         return "load angle"
     if "reversal" in lives_in:
         return "reversal"
-    if "motor angle" in lives_in:
+    if "motor angle" in lives_in or "wave generator" in lives_in:
         return "motor angle"
     if lives_in in {"speed", "acceleration"} or "stop" in lives_in:
         return "speed"

@@ -4,30 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.candidates import candidates
+from hdbridge.diagnose.lookalikes import lookalikes
 from hdbridge.diagnose.result import Identifiability
 from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, PENALTY
-from hdbridge.effects import (
-    CATALOGUE,
-    Compliance,
-    CountLoss,
-    Effect,
-    FloatArray,
-    LocalDefect,
-    MotorEncoderEccentricity,
-    Step,
-    SubdivisionalError,
-    Vibration,
-    causes,
-)
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.effects.orders import orders_from
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, causes
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.screening import Candidate
+from hdbridge.estimation.screening import candidates
 
 ENOUGH = 8_000
 """Points that are enough to distinguish shapes."""
@@ -39,7 +25,6 @@ WORST_ARCSEC = 30.0
 INFLATION = 2.5
 """By how much correlated noise and unknown shapes raise a limit above that of white noise and a known
 shape."""
-ALWAYS = {"motor_order": ("motor_encoder_eccentricity",), "motor_encoder_eccentricity": ("motor_order",)}
 
 
 def identifiability(
@@ -51,7 +36,7 @@ def identifiability(
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
     basis = _orthonormal(fitted.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
-    for candidate in _specimens(estimator, fitted, base):
+    for candidate in candidates(estimator.data, base, screened=False):
         columns = estimator.columns(candidate.effect, fitted.hypothesis.start)[::stride]
         span = np.quantile(columns, 0.998, axis=0) - np.quantile(columns, 0.002, axis=0)
         seen = span > 1e-12
@@ -78,55 +63,14 @@ def identifiability(
         alike = [
             name for name in names if name != cause and _correlation(spans[cause], spans[name]) > NOT_APART
         ]
-        alike += [name for name in ALWAYS.get(cause, ()) if name not in alike]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
-    if not estimator.data.points.motion.available() & frozenset(Compliance.channels):
-        each = result["load_order"]
-        if "compliance" not in each.aliases:
-            result["load_order"] = Identifiability(
-                each.detectable,
-                each.detection_limit_arcsec,
-                (*each.aliases, "compliance"),
-                each.share_left,
-                each.reason,
-            )
+    for candidate in candidates(estimator.data, ()):
+        # What is not measured may look like what is.
+        each = result[candidate.cause]
+        for kind, _ in lookalikes(candidate.effect, estimator.data.ratio):
+            if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
+                result[candidate.cause] = replace(each, aliases=(*each.aliases, kind.name))
     return result
-
-
-def _specimens(estimator: Estimator, fitted: Fitted, base: Sequence[Effect]) -> list[Candidate]:
-    data = estimator.data
-    time = estimator.time_s
-    ratio = data.ratio
-    load = float(np.median(estimator.motion.motor_deg)) / ratio
-    found = candidates(data, base)
-    middle = float(np.quantile(time, 0.5))
-    lines = round(
-        360.0 / max(float(np.median(np.abs(np.diff(estimator.motion.motor_deg)))) / ratio * 2.7, 0.02)
-    )
-    fast = 0.137 / max(data.period_s, 1e-6)
-    found += [
-        Candidate(each.name, each)
-        for each in (
-            CountLoss(steps=(Step(time_s=middle, size_arcsec=1.0),)),
-            LocalDefect(ratio=ratio, height_arcsec=1.0, centre_deg=load % 360.0, half_width_deg=3.6),
-            Vibration(frequency_hz=min(max(fast, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0),
-            SubdivisionalError(lines_per_turn=max(lines, 1800), orders=orders_from([1])),
-            MotorEncoderEccentricity(orders=orders_from([1, 2])),
-        )
-    ]
-    for effect in fitted.hypothesis.effects[: len(base)]:
-        if isinstance(effect, Hysteresis | HysteresisMemory):
-            found += _loops(effect)
-    return found
-
-
-def _loops(law: Hysteresis | HysteresisMemory) -> list[Candidate]:
-    """The loop itself stands for its parameters, the other law for memory."""
-    other = HysteresisMemory if isinstance(law, Hysteresis) else Hysteresis
-    return [
-        Candidate("hysteresis_memory", other(**law.parameters())),
-        Candidate("hysteresis_parameters", law.model_copy(update={"width_deg": 1.6 * law.width_deg})),
-    ]
 
 
 def _missing(estimator: Estimator, cause: str) -> str:

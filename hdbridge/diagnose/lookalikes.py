@@ -1,114 +1,127 @@
-"""Second looks at names whose twin is commoner: a delayed sample that is the load's own wind-up, a drag that
-is a delayed sample, a load order that is the wind-up under the load's torque.
+"""Second looks at a name whose look-alike is the better one: what cannot be, what follows a measured channel,
+and what another convention tells without a change of the model.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from hdbridge.diagnose.search import FLOOR_ARCSEC, Search
-from hdbridge.effects import (
-    Channel,
-    ChannelSkew,
-    Compliance,
-    InertialWindup,
-    LoadOrders,
-    VelocityWindup,
-)
+from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, Search, cost
+from hdbridge.effects import CATALOGUE, MEASURED, Effect, aliases_of, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.observations.reading import third_deviation
 
-INERTIA_SHARE = 0.15
-"""A skew whose part in speed is less than this of its part in acceleration is none."""
-STRAIGHT = 20.0
-"""A drag whose shear speed is so many times the fastest there was has been seen as a straight line."""
 TWIN = 1e-3
-"""A spring is a first load order's better where it misses less than this share of its data."""
-
+"""What follows a measured channel is the better name where it misses less than this share of the data,"""
 NOISY = 1.5
-"""... and so many times what the noise of its torque channel costs it."""
+"""... and so many times what the noise of that channel costs it."""
+SAME = 10.0
+"""Chi square that another convention may cost: what a fit leaves that has not quite converged."""
 
 
-def inertial(estimator: Estimator, search: Search, fitted: Fitted) -> Fitted:
-    """A skew that has all but no part in speed is an inertial wind-up, or nothing."""
-    for place, effect in enumerate(fitted.hypothesis.effects[search.base :], search.base):
-        if not isinstance(effect, ChannelSkew):
-            continue
-        parts = np.abs(estimator.columns(effect, fitted.hypothesis.start) * effect.coefficients())
-        speed, acceleration = np.quantile(parts, 0.998, axis=0)
-        if speed < INERTIA_SHARE * acceleration:
-            plain = InertialWindup(ratio=effect.ratio, inertia_over_stiffness_s2=1e-5)
-            trial = estimator.fit(fitted.hypothesis.instead(place, plain))
-            small = search.peak(trial, place) < FLOOR_ARCSEC
-            if small or trial.hypothesis.effects[place].violations():
-                return estimator.fit(fitted.hypothesis.without(place))
-            return trial
-    return fitted
-
-
-def late(estimator: Estimator, search: Search, fitted: Fitted) -> Fitted:
-    """A drag that does not bend is a delayed sample.
-
-    The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed part of
-    one, with the sign of the direction.
-    """
-    speed = estimator.motion.motor_speed_deg_s
-    for place, effect in enumerate(fitted.hypothesis.effects[search.base :], search.base):
-        if not isinstance(effect, VelocityWindup) or speed is None:
-            continue
-        if effect.coulomb_arcsec > 0.5 * estimator.data.motor_count_arcsec:
-            continue
-        if effect.shear_deg_s < STRAIGHT * float(np.max(np.abs(speed))):
+def plausible_only(search: Search, fitted: Fitted) -> Fitted:
+    """With the best look-alike in the place of what is implausible as it has come out, or with nothing."""
+    estimator = search.estimator
+    base = fitted.hypothesis.effects[: search.base]
+    for place in range(search.base, len(fitted.hypothesis.effects)):
+        effect = fitted.hypothesis.effects[place]
+        if not effect.implausible(estimator.data):
             continue
         without = estimator.fit(fitted.hypothesis.without(place))
-        if any(isinstance(each, ChannelSkew) for each in fitted.hypothesis.effects):
-            return without
-        skew = ChannelSkew(ratio=estimator.data.ratio, delay_ms=1.0, second_order_ms2=1.0)
-        trial = estimator.fit(fitted.hypothesis.instead(place, skew))
-        if trial.chi_square - fitted.chi_square < TWIN * (without.chi_square - fitted.chi_square):
-            return trial
+        present = {each.name for each in without.hypothesis.effects}
+        trials = [
+            estimator.fit(fitted.hypothesis.instead(place, each))
+            for name in aliases_of(effect.name)
+            if name not in present and CATALOGUE[name].changes is None and CATALOGUE[name].sought is None
+            for each in CATALOGUE[name].proposals(estimator.data, base)
+            if not unmet([each], estimator.motion.available())
+        ]
+        fine = [
+            each
+            for each in trials
+            if search.makes_sense(each.hypothesis.effects[place]) and search.peak(each, place) >= FLOOR_ARCSEC
+        ]
+        best = min(fine, key=cost, default=without)
+        return plausible_only(search, best if cost(best) + ENTER < cost(without) else without)
     return fitted
 
 
-def wound_up(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
-    """A first load order that follows the load's torque is the torque's wind-up.
+def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
+    """What looks like a measured channel's effect, and follows the channel, is that effect.
 
-    An order takes any phase, a spring only that of the torque: where it does as well but for what the noise
-    of the torque channel takes from it, the order would be a coincidence. Together with a spring it makes up
-    for that noise, and takes most of what is the spring's.
+    A wave takes any phase, a wind-up only that of the torque: where it does as well but for what the noise of
+    the channel takes from it, the wave would be a coincidence. Together the wave makes up for that noise, and
+    takes most of what is the other's.
     """
-    if Channel.LOAD_TORQUE not in estimator.motion.available():
-        return fitted
-    spring = next((each for each in fitted.hypothesis.effects[base:] if isinstance(each, Compliance)), None)
-    for place, effect in enumerate(fitted.hypothesis.effects[base:], base):
-        if not isinstance(effect, LoadOrders) or all(each.order != 1 for each in effect.orders):
+    effects = fitted.hypothesis.effects
+    for place in range(base, len(effects)):
+        for kind, piece in lookalikes(effects[place], estimator.data.ratio):
+            others = [each for each in effects[place].pieces() if each != piece]
+            rest = None
+            for each in others:
+                rest = each if rest is None else rest.joined(each)
+            hypothesis = fitted.hypothesis
+            without = hypothesis.without(place) if rest is None else hypothesis.instead(place, rest)
+            present = [i for i, each in enumerate(without.effects) if i >= base and type(each) is kind]
+            if present:
+                trial, neither = estimator.fit(without), without.without(present[0])
+            else:
+                proposed = [
+                    each
+                    for each in kind.proposals(estimator.data, effects[:base])
+                    if not unmet([each], estimator.motion.available())
+                ]
+                if not proposed:
+                    continue
+                trial, neither = estimator.fit(without.plus(proposed[0])), without
+            own = estimator.fit(neither).chi_square - fitted.chi_square
+            worse = trial.chi_square - fitted.chi_square
+            driven = [each for each in trial.hypothesis.effects if type(each) is kind]
+            if any(each.violations() for each in driven):
+                continue
+            if worse < TWIN * own + NOISY * sum(_lost_to_noise(estimator, each) for each in driven):
+                return trial
+    return fitted
+
+
+def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
+    """Kinds that look like a piece of an effect where their channel was not measured, and the piece."""
+    result = []
+    for name in aliases_of(effect.name):
+        look = CATALOGUE[name].unmeasured(ratio) if name in CATALOGUE else None
+        if look is None or look.name != effect.name:
             continue
-        others = tuple(each for each in effect.orders if each.order != 1)
-        without = (
-            fitted.hypothesis.instead(place, effect.model_copy(update={"orders": others}))
-            if others
-            else fitted.hypothesis.without(place)
-        )
-        if spring is not None:
-            trial, neither = estimator.fit(without), without.without(without.effects.index(spring, base))
-        else:
-            linear = Compliance(
-                c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
-                torque1_nm=1e4, torque2_nm=2e4, torque=Channel.LOAD_TORQUE.value,
-            )  # fmt: skip
-            trial, neither = estimator.fit(without.plus(linear)), without
-        own = estimator.fit(neither).chi_square - fitted.chi_square
-        worse = trial.chi_square - fitted.chi_square
-        springs = [each for each in trial.hypothesis.effects if isinstance(each, Compliance)]
-        if any(each.violations() for each in springs):
+        names = look.named_coefficients()
+        result += [(CATALOGUE[name], each) for each in effect.pieces() if each.named_coefficients() == names]
+    return result
+
+
+def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
+    """What can be told by several conventions, by the one that leaves the ``given`` model as it was.
+
+    As it was, where there is none; see `Effect.retold`.
+    """
+    effects = fitted.hypothesis.effects
+    for place in range(len(given), len(effects)):
+        told = effects[place].retold(effects, given, estimator.data)
+        if told is None:
             continue
-        if worse < TWIN * own + NOISY * sum(_lost_to_noise(estimator, each) for each in springs):
+        trial = estimator.fit(replace(fitted.hypothesis, effects=told))
+        if trial.chi_square < fitted.chi_square + SAME and not trial.hypothesis.effects[place].violations():
             return trial
     return fitted
 
 
-def _lost_to_noise(estimator: Estimator, spring: Compliance) -> float:
-    """Chi square that a spring leaves because its torque was measured with noise."""
-    torque = estimator.motion.channel(Channel(spring.torque), spring.name)
-    noise_nm = third_deviation(np.diff(torque, 3))
-    return float(np.sum((estimator.weight * spring.coefficients()[0] * noise_nm) ** 2))
+def _lost_to_noise(estimator: Estimator, effect: Effect) -> float:
+    """Chi square that an effect leaves because its channel was measured with noise."""
+    motion = estimator.motion
+    shifted = {
+        each: motion.measured[each] + third_deviation(np.diff(motion.measured[each], 3))
+        for each in MEASURED
+        if each in effect.needs()
+    }
+    moved = replace(motion, measured={**motion.measured, **shifted})
+    change = (effect.predict(moved) - effect.predict(motion))[estimator.index]
+    return float(np.sum((estimator.weight * change) ** 2))

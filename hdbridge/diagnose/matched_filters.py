@@ -1,8 +1,8 @@
-"""Seekers: causes with a shape that no grid covers, each found over all its values at once.
+"""Matched filters: forms whose place no grid covers, each found over all places at once (`Sought`).
 
-Lost counts: a step at every sample, by cumulative sums. Local defects: a bump at every load angle, by
-convolution over one load turn. Vibration: a Fourier transform over absolute time with the gaps left empty.
-Interpolation errors: a Fourier transform over one load turn at the *predicted* load angle, 2^17 bins.
+A step at every sample, by cumulative sums. A bump at every load angle, by convolution over one load turn. A
+tone: a Fourier transform over absolute time with the gaps left empty. A line of the load's turn: a Fourier
+transform over one turn at the *predicted* load angle, 2^17 bins.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.candidates import HIGHEST_MOTOR_ORDER
-from hdbridge.effects import CountLoss, Effect, FloatArray, LocalDefect, Step, SubdivisionalError, Vibration
-from hdbridge.effects.orders import orders_from
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Sought
+from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.screening import Candidate
+from hdbridge.estimation.shapes import shape_value
 from hdbridge.observations.reading import median_deviation
 from hdbridge.units import DEG_PER_TURN
 
@@ -32,8 +32,38 @@ LINE_OVER_MEAN = 12.0
 """A line is looked at when its power is so many times the mean: noise alone reaches 11 in 65,000 lines."""
 
 
-def count_loss(estimator: Estimator, fitted: Fitted) -> Candidate | None:
-    """The best single step, at any sample; exact, with the hypothesis projected out."""
+def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
+    """Of each kind that is sought, those that promise most on what a fit leaves."""
+    residual, load_deg = fast_residual(estimator, fitted)
+    with_load_angle(estimator, load_deg)
+    present = fitted.hypothesis.effects
+    result: list[Candidate] = []
+    shapes: Iterator[tuple[float, ...]]
+    for kind in CATALOGUE.values():
+        match kind.sought:
+            case Sought.STEP:
+                shapes = step(estimator, fitted)
+            case Sought.BUMP:
+                shapes = bump(estimator, fitted)
+            case Sought.TONE:
+                shapes = tones(estimator, residual, [each for each in present if each.sought is Sought.TONE])
+            case Sought.LINE:
+                lines = load_lines(estimator, residual, load_deg)
+                result += [Candidate(kind.name, each) for at in lines for each in kind.at_lines(at)]
+                continue
+            case _:
+                continue
+        example = kind.candidate(estimator.data.ratio)
+        one = np.ones(len(example.coefficients()))
+        names = [each.name for each in kind.shape]
+        for each in shapes:
+            shape = dict(zip(names, each, strict=True))
+            result.append(Candidate(kind.name, example.fitted(one, shape)))
+    return result
+
+
+def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
+    """The time (s) of the best single step, at any sample; exact, with the hypothesis projected out."""
     weight, basis = estimator.weight, fitted.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
@@ -44,18 +74,17 @@ def count_loss(estimator: Estimator, fitted: Fitted) -> Candidate | None:
     usable = left > 1e-3 * np.minimum(square, square[0] - square + 1e-300)
     usable[:edge] = usable[-edge:] = False
     if not np.any(usable):
-        return None
+        return
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
     data = estimator.data
     assert data.full.motion.time_s is not None
     first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
-    step = Step(time_s=float(data.full.motion.time_s[first]), size_arcsec=1.0)
-    return Candidate("count_loss", CountLoss(steps=(step,)))
+    yield (float(data.full.motion.time_s[first]),)
 
 
-def local_defect(estimator: Estimator, fitted: Fitted) -> Candidate | None:
-    """The best bump; it must lie on several passes, and not cover most of the travel."""
+def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
+    """Centre and half width (degrees of the load) of the best bump; it may not cover most of the travel."""
     ratio = estimator.data.ratio
     load = estimator.motion.motor_deg[estimator.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
@@ -82,30 +111,8 @@ def local_defect(estimator: Estimator, fitted: Fitted) -> Candidate | None:
         at = int(np.argmax(gain))
         if best is None or gain[at] > best[0]:
             best = (float(gain[at]), at * DEG_PER_TURN / DEFECT_BINS, half)
-    if best is None or best[0] <= 0.0:
-        return None
-    effect = LocalDefect(ratio=ratio, height_arcsec=1.0, centre_deg=best[1], half_width_deg=best[2])
-    return Candidate("local_defect", effect)
-
-
-def is_met(effect: LocalDefect, estimator: Estimator) -> bool:
-    """Whether the axis went over the place several times, in both directions or at different speeds.
-
-    Passes that are all alike cannot distinguish a place from a moment of the move.
-    """
-    motion = estimator.motion
-    if motion.motor_speed_deg_s is None or motion.time_s is None:
-        return False
-    turns = (motion.motor_deg / effect.ratio - effect.centre_deg) / DEG_PER_TURN
-    # Between two records the axis may have jumped over it: faster than it ever went.
-    steps, moved = np.diff(motion.time_s), np.abs(np.diff(motion.motor_deg))
-    real = moved <= 3.0 * float(np.max(np.abs(motion.motor_speed_deg_s))) * steps
-    speed = motion.motor_speed_deg_s[np.flatnonzero((np.diff(np.floor(turns)) != 0.0) & real)]
-    fast = np.abs(speed[speed != 0.0])
-    if len(fast) < 3:
-        return False
-    both = bool(np.any(speed > 0.0) and np.any(speed < 0.0)) and estimator.data.reversals >= 2
-    return both or float(np.max(fast)) > 1.5 * float(np.min(fast))
+    if best is not None and best[0] > 0.0:
+        yield best[1:]
 
 
 def _bump(half_deg: float) -> FloatArray:
@@ -127,10 +134,10 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
     return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
 
 
-def vibrations(
+def tones(
     estimator: Estimator, residual: FloatArray, present: Sequence[Effect] = ()
-) -> Iterator[Candidate]:
-    """The highest lines over absolute time, apart from the feet of those ``present``.
+) -> Iterator[tuple[float]]:
+    """Frequencies (Hz) of the highest lines over absolute time, apart from the feet of those ``present``.
 
     A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
     """
@@ -151,14 +158,14 @@ def vibrations(
     power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
     for each in present:
-        if isinstance(each, Vibration):
-            power[np.abs(frequency - each.frequency_hz) < FOOT_LINES / (length * data.period_s)] = 0.0
+        own_hz = shape_value(each, each.shape[0].name)
+        power[np.abs(frequency - own_hz) < FOOT_LINES / (length * data.period_s)] = 0.0
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= 0.0:
             return
         best = frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]
-        yield Candidate("vibration", Vibration(frequency_hz=float(best), amplitude_arcsec=1.0, phase_deg=0.0))
+        yield (float(best),)
         power[max(at - lobe, 0) : at + lobe + 1] = 0.0
 
 
@@ -173,10 +180,8 @@ def _off_centre(height: FloatArray, at: int) -> float:
     return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
 
 
-def interpolation_errors(
-    estimator: Estimator, residual: FloatArray, load_deg: FloatArray
-) -> Iterator[Candidate]:
-    """The highest lines over one load turn, beyond the orders of the mesh."""
+def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray) -> Iterator[int]:
+    """Periods per turn of the highest lines over one load turn, beyond the orders of the mesh."""
     place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio
@@ -186,18 +191,7 @@ def interpolation_errors(
         at = int(np.argmax(power))
         if power[at] <= least:
             return
-        for numbers in ((1,), (1, 2, 4)):
-            yield Candidate(
-                "subdivisional_error",
-                SubdivisionalError(lines_per_turn=at, orders=orders_from(numbers)),
-            )
-        for part in (2, 4):
-            if at % part == 0 and at // part >= LEAST_LINES:
-                few = (1, 2) if part == 2 else (1, 2, 4)
-                yield Candidate(
-                    "subdivisional_error",
-                    SubdivisionalError(lines_per_turn=at // part, orders=orders_from(few)),
-                )
+        yield at
         power[max(at - 3, 0) : at + 4] = 0.0
 
 

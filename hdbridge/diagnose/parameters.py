@@ -11,9 +11,7 @@ from scipy.stats import t as student
 
 from hdbridge.diagnose.acceptance import BLOCKS_S, blocks
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import CountLoss, Creep, Effect, FloatArray, SubdivisionalError, Vibration
-from hdbridge.effects.base import Linear
-from hdbridge.effects.orders import OrderSeries
+from hdbridge.effects import Effect, FloatArray, Moves
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.observed import IntArray
 from hdbridge.estimation.shapes import shape_value
@@ -112,15 +110,16 @@ def parameters_of(
         else:
             low, high = value - half, value + half
         result[parameter.name] = Parameter(value, unit_of(parameter.name), low, high)
-    if isinstance(effect, Vibration) and "frequency_hz" not in result:
-        result["frequency_hz"] = Parameter(
-            effect.frequency_hz, "Hz", effect.frequency_hz, effect.frequency_hz
-        )
-    if isinstance(effect, CountLoss):
-        result = _lost(estimator, fitted, effect, linear, spread)
-    if isinstance(effect, SubdivisionalError):
-        lines = float(effect.lines_per_turn)
-        result["lines_per_turn"] = Parameter(lines, "1", lines, lines)
+    for shape in effect.shape:
+        if shape.is_frequency and shape.name not in result:
+            value = shape_value(effect, shape.name)
+            result[shape.name] = Parameter(value, unit_of(shape.name), value, value)
+        if shape.moves is Moves.NEVER:
+            result = _stepwise(estimator, fitted, effect, result)
+    for name, described in type(effect).model_fields.items():
+        if described.annotation is int:  # found by search, and exact
+            number = float(getattr(effect, name))
+            result[name] = Parameter(number, unit_of(name), number, number)
     return result
 
 
@@ -133,33 +132,18 @@ def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
         value = float(values[i])
         return Parameter(value, unit_of(name), value - half, value + half, is_size=True)
 
-    if isinstance(effect, OrderSeries | SubdivisionalError):
-        result: dict[str, Parameter] = {}
-        for i, order in enumerate(effect.orders):
-            result |= polar(
-                f"order_{order.order}_",
-                values[2 * i : 2 * i + 2],
-                spread[2 * i : 2 * i + 2, 2 * i : 2 * i + 2],
-            )
-        return result
-    if isinstance(effect, Vibration):
-        return polar("", values[:2], spread[:2, :2])
-    if isinstance(effect, Creep):
-        return {f"part_{i + 1}_amplitude_arcsec": plain("amplitude_arcsec", i) for i in range(len(values))}
-    if isinstance(effect, Linear):
-        return {name: plain(name, i) for i, name in enumerate(effect.linear) if deviation[i] > 0.0}
-    names = {
-        "hysteresis": "offset_arcsec",
-        "hysteresis_memory": "offset_arcsec",
-        "direction_phase": "shift_deg",
-    }
-    if effect.name in names and len(values) == 1:
-        return {names[effect.name]: plain(names[effect.name], 0)}
-    return {f"coefficient_{i + 1}_arcsec": plain("arcsec", i) for i in range(len(values))}
+    result: dict[str, Parameter] = {}
+    for each in effect.named_coefficients():
+        own = list(each.columns)
+        if len(own) > 1:
+            result |= polar(each.name, values[own], spread[np.ix_(own, own)])
+        elif deviation[own[0]] > 0.0:
+            result[each.name] = plain(each.name, own[0])
+    return result
 
 
-def _lost(
-    estimator: Estimator, fitted: Fitted, effect: CountLoss, columns: list[int], spread: FloatArray
+def _stepwise(
+    estimator: Estimator, fitted: Fitted, effect: Effect, sizes: Mapping[str, Parameter]
 ) -> dict[str, Parameter]:
     """Sizes and times of steps.
 
@@ -170,22 +154,19 @@ def _lost(
     result: dict[str, Parameter] = {}
     time_s = estimator.time_s
     scatter = math.sqrt(float(np.mean(fitted.residual**2)))
-    for i, (step, column) in enumerate(zip(effect.steps, columns, strict=True)):
-        half = NORMAL_95 * math.sqrt(max(float(spread[column, column]), 0.0))
-        size = step.size_arcsec
-        result[f"step_{i + 1}_size_arcsec"] = Parameter(
-            size, "arcsec", size - half, size + half, is_size=True
-        )
-        first = min(int(np.searchsorted(time_s, step.time_s)), len(time_s) - 1)
+    for piece, named in zip(effect.pieces(), effect.named_coefficients(), strict=True):
+        begin_s, size = shape_value(piece, piece.shape[0].name), float(piece.coefficients()[0])
+        if named.name in sizes:
+            result[named.name] = sizes[named.name]
+        first = min(int(np.searchsorted(time_s, begin_s)), len(time_s) - 1)
         sigmas = max(abs(size) * float(estimator.weight[first]), 1e-9) / max(scatter, 1.0)
         beyond = min(math.ceil(STEP_95 / sigmas**2 - 0.5), len(time_s))
         low, high = (
             float(time_s[max(first - 1 - beyond, 0)]),
             float(time_s[min(first + beyond, len(time_s) - 1)]),
         )
-        result[f"step_{i + 1}_time_s"] = Parameter(
-            step.time_s, "s", min(low, step.time_s), max(high, step.time_s)
-        )
+        name = f"{named.name.removesuffix('size_arcsec')}{piece.shape[0].name}"
+        result[name] = Parameter(begin_s, "s", min(low, begin_s), max(high, begin_s))
     return result
 
 
@@ -224,23 +205,16 @@ def half_widths(effect: Effect, values: Mapping[str, Parameter]) -> dict[str, An
     }
     fields = type(effect).model_fields
     nested: dict[str, Any] = {name: half for name, half in halves.items() if name in fields}
-    if isinstance(effect, OrderSeries | SubdivisionalError):
-        nested["orders"] = [
-            {"order": each.order}
-            | {
-                name: halves[f"order_{each.order}_{name}"]
-                for name in ("amplitude_arcsec", "phase_deg")
-                if f"order_{each.order}_{name}" in halves
-            }
-            for each in effect.orders
-        ]
-    if isinstance(effect, CountLoss):
-        nested["steps"] = [
-            {"size_arcsec": halves.get(f"step_{i + 1}_size_arcsec", 0.0)} for i in range(len(effect.steps))
-        ]
-    if isinstance(effect, Creep):
-        nested["parts"] = [
-            {"amplitude_arcsec": halves.get(f"part_{i + 1}_amplitude_arcsec", 0.0)}
-            for i in range(len(effect.parts))
-        ]
+    for each in effect.named_coefficients():
+        if len(each.path) < 2 or not isinstance(each.path[0], str):
+            continue
+        parts = nested.setdefault(each.path[0], [])
+        given = effect.parameters()[each.path[0]][each.path[1]]
+        part: dict[str, Any] = {name: value for name, value in given.items() if isinstance(value, int)}
+        inner = ("amplitude_arcsec", "phase_deg") if len(each.path) == 2 else (str(each.path[2]),)
+        for name in inner:
+            known = f"{each.name}{name}" if len(each.path) == 2 else each.name
+            if known in halves or len(each.path) > 2:
+                part[name] = halves.get(known, 0.0)
+        parts.append(part)
     return nested

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.effects.orders import RAD_PER_DEG, OrderSeries
+from hdbridge.effects.orders import RAD_PER_DEG
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.terms import FOUND, Effort
 
@@ -49,18 +49,16 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
-    waves = [each for each in fitted.hypothesis.effects if isinstance(each, OrderSeries) and each.orders]
+    waves = [wave for each in fitted.hypothesis.effects for wave in each.waves()]
     if speed is None or not waves:
         return np.empty((len(estimator.index), 0))
     rate = RAD_PER_DEG * speed / _RATE
     columns = np.zeros((len(motion), 2))
-    for series in waves:
-        turns = series.turns_per_motor_turn()
-        for each in series.orders:
-            at = RAD_PER_DEG * (each.order * turns * motion.motor_deg + each.phase_deg)
-            frequency = each.order * turns * rate
-            columns[:, 0] += each.amplitude_arcsec * frequency**2 * np.cos(at)
-            columns[:, 1] += each.amplitude_arcsec * frequency**3 * np.sin(at)
+    for turns, amplitude_arcsec, phase_deg in waves:
+        at = RAD_PER_DEG * (turns * motion.motor_deg + phase_deg)
+        frequency = turns * rate
+        columns[:, 0] += amplitude_arcsec * frequency**2 * np.cos(at)
+        columns[:, 1] += amplitude_arcsec * frequency**3 * np.sin(at)
     return estimator.at_points(columns)
 
 

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.effects import Channel, FloatArray, Motion
-from hdbridge.effects.base import MEASURED
-from hdbridge.effects.path import branches
-from hdbridge.units import DEG_PER_TURN
+from hdbridge.effects import MEASURED, FloatArray
+from hdbridge.effects import coordinate as over
+from hdbridge.effects.coordinate import Coordinate
 
 if TYPE_CHECKING:
     from hdbridge.diagnose.result import Diagnosis, Traces
@@ -27,63 +25,10 @@ BoolArray = NDArray[np.bool_]
 
 LEAST_IN_BIN: Final = 3
 """Points; the mean of fewer is not shown."""
-POINTS_PER_BIN: Final = 8
-LEAST_BINS: Final = 2
-SAME: Final = 1e-6
-"""A quantity that varies by less than this share of itself is one value, rounded."""
-NOTHING: Final = 1e-9
-"""... and so is one that varies by no more than this in its unit."""
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
-SMALLEST_WAY_DEG: Final = 0.01
-SMALLEST_TIME_S: Final = 0.01
-"""Less than this since a reversal counts as this, so that a logarithm can be taken."""
 COARSE: Final = 16
 """Bins of time: wide enough that each has stretches of either half."""
-
-
-class Spacing(Enum):
-    """How the bins over a coordinate lie."""
-
-    EVEN = "even"
-    FILLED = "filled"
-    """With equally many points in each: for what mostly keeps to a few values, like a speed."""
-    LOGARITHMIC = "logarithmic"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Coordinate:
-    """A quantity along a record, at the points of `Traces`."""
-
-    name: str
-    unit: str
-    values: FloatArray
-    both_ways: bool = False
-    """Whether forward and backward are looked at apart."""
-    spacing: Spacing = Spacing.EVEN
-    bins: int = 72
-    """At most; fewer where there are not `POINTS_PER_BIN` points for each."""
-
-    @property
-    def label(self) -> str:
-        """Name and unit, for an axis."""
-        return f"{self.name}, {self.unit}" if self.unit else self.name
-
-    def edges(self) -> FloatArray:
-        """Of the bins, shape (b + 1,), rising; two equal ones where there is but one value."""
-        low, high = float(np.min(self.values)), float(np.max(self.values))
-        bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
-        if self.spacing is Spacing.FILLED:
-            return np.asarray(np.unique(np.quantile(self.values, np.linspace(0.0, 1.0, bins + 1))))
-        if self.spacing is Spacing.LOGARITHMIC and low > 0.0:
-            return np.geomspace(low, high, bins + 1)
-        return np.linspace(low, high, bins + 1)
-
-    def numbers(self) -> IntArray:
-        """The bin of each point, shape (m,)."""
-        edges = self.edges()
-        found = np.searchsorted(edges, self.values, "right") - 1
-        return np.asarray(np.clip(found, 0, max(len(edges) - 2, 0)), dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,59 +116,22 @@ def shares_by_coordinate(diagnosis: Diagnosis) -> dict[str, Any]:
 def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
     """What a record can be looked at over; only what was recorded, and what varies."""
     motion, rows = traces.motion, traces.rows
-    motor = traces.motor_deg
-    load = motor / ratio
-    way, since_s = since_reversal(motion)
     found = [
-        Coordinate("motor angle", "deg", np.mod(motor, DEG_PER_TURN), both_ways=True),
-        Coordinate("load angle", "deg", np.mod(load, DEG_PER_TURN), both_ways=True),
-        Coordinate("position", "deg of the load", load, both_ways=True),
-        Coordinate("direction", "", traces.direction, bins=2),
-        Coordinate("speed", "motor deg/s", traces.speed_deg_s, spacing=Spacing.FILLED, bins=40),
-        Coordinate("time", "s", traces.time_s, bins=100),
-        _logarithmic("motor angle since the last reversal", "deg", way[rows], SMALLEST_WAY_DEG),
-        _logarithmic("time since the last reversal", "s", since_s[rows], SMALLEST_TIME_S),
-        _logarithmic("time since the last stop or start", "s", since_change_s(motion)[rows], SMALLEST_TIME_S),
+        over.motor_angle(motion),
+        over.load_angle(motion, ratio),
+        over.position(motion, ratio),
+        over.speed(motion),
+        over.time(motion),
+        over.since_reversal(motion),
+        over.time_since_reversal(motion),
+        over.since_change(motion),
+        over.acceleration(motion),
+        *(over.measured(motion, each) for each in MEASURED),
     ]
-    for name, unit, values in (
-        ("acceleration", "motor deg/s\N{SUPERSCRIPT TWO}", motion.motor_acceleration_deg_s2),
-        *((each.title, each.unit, motion.measured.get(each)) for each in MEASURED),
-    ):
-        if values is not None:
-            spacing = Spacing.EVEN if name == Channel.TEMPERATURE.title else Spacing.FILLED
-            found.append(Coordinate(name, unit, values[rows], spacing=spacing, bins=40))
-    return {each.name: each for each in found if _varies(each.values)}
-
-
-def since_reversal(motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Motor angle (degrees) and time (s) since the axis last reversed or the record began, shape (n,)."""
-    angle = motion.motor_deg
-    time = _time(motion)
-    turning = np.asarray(branches(angle)[0][:-1] or [0], dtype=np.intp)
-    last = turning[np.maximum(np.searchsorted(turning, np.arange(len(angle)), "left") - 1, 0)]
-    return np.abs(angle - angle[last]), np.maximum(time - time[last], 0.0)
-
-
-def since_change_s(motion: Motion) -> FloatArray:
-    """Time since the axis last stopped, started or reversed, seconds, shape (n,)."""
-    speed, time = motion.motor_speed_deg_s, _time(motion)
-    assert speed is not None, "a diagnosis gives its motion the speed"
-    change = np.flatnonzero(np.diff(np.sign(speed), prepend=np.nan) != 0.0)
-    last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
-    return np.asarray(time - time[last])
-
-
-def _varies(values: FloatArray) -> bool:
-    return bool(np.ptp(values) > SAME * np.max(np.abs(values)) + NOTHING)
-
-
-def _time(motion: Motion) -> FloatArray:
-    assert motion.time_s is not None, "a diagnosis gives its motion the time"
-    return motion.time_s
-
-
-def _logarithmic(name: str, unit: str, values: FloatArray, smallest: float) -> Coordinate:
-    return Coordinate(name, unit, np.maximum(values, smallest), True, Spacing.LOGARITHMIC, 40)
+    kept = [Coordinate("direction", "", traces.direction, bins=2), *(each.at(rows) for each in found)]
+    order = ("motor angle", "load angle", "position", "direction")
+    kept.sort(key=lambda each: order.index(each.name) if each.name in order else len(order))
+    return {each.name: each for each in kept if each.varies()}
 
 
 def _stretches(time_s: FloatArray) -> IntArray:

@@ -8,30 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 
 from hdbridge.diagnose import matched_filters
-from hdbridge.diagnose.acceptance import all_steps_seen, gate, standing_s
-from hdbridge.diagnose.candidates import candidates
-from hdbridge.effects import (
-    AmplitudeDrift,
-    Channel,
-    ChannelSkew,
-    Compliance,
-    CountLoss,
-    Creep,
-    Effect,
-    FloatArray,
-    Start,
-)
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.effects.local_defect import LocalDefect
-from hdbridge.effects.orders import OrderSeries
-from hdbridge.estimation.hypothesis import LOOPS, Estimator, Fitted, Hypothesis
-from hdbridge.estimation.screening import Candidate, Score, Screen, score_of
+from hdbridge.diagnose.acceptance import all_pieces_seen, gate
+from hdbridge.diagnose.overlap import hides
+from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, in_place
+from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.estimation.screening import Candidate, Score, Screen, candidates, score_of
 
 PENALTY = 11.5
 """Chi square that each parameter has to earn."""
@@ -45,41 +31,17 @@ AGAIN = 1.5
 """Chi square per point beyond which a search is made again."""
 PAIR_SHARE = 0.9
 """Two causes at once in place of one, or none, have to leave less than this share of what it leaves."""
-WITH_SPEED = frozenset({"velocity_windup", "channel_skew", "rate_dependence"})
 FREE_LOOP_ARCSEC = 0.2
 """Root mean square that a free-form loop has to take away to be added to the law."""
 SLOW = 0.8
 """A third pick that leaves more than this of a large rest is the last."""
 EXTRAPOLATED = 2.0
-"""An order is not named on an arc of it whose span is so much smaller than the order itself, nor creep of
-exponentials that cancel."""
-RESTS = 3.0
-"""Creep is known by its bend: its shortest time constant is at most so many times the longest rest."""
-ORDER_SHARE_LEFT = 0.03
-"""An order of which the others leave less is a twin of one of them: together they would only cancel."""
-SHORT_TRAVEL = 0.9
-"""Over less than a load turn a flexspline order has to be so much better than an order of the motor."""
-REPEATED = frozenset(
-    {
-        "motor_order",
-        "load_order",
-        "flexspline_order",
-        "count_loss",
-        "creep",
-        "vibration",
-        "local_defect",
-        "subdivisional_error",
-    }
-)
-"""Causes of which there may be more than one."""
+"""Nothing is named of which one piece is so much larger than all that is seen: pieces that cancel, or an
+order on an arc of its turn."""
+WAVE_SHARE_LEFT = 0.03
+"""A wave of which the others leave less is a twin of one of them: together they would only cancel."""
 FLOOR_ARCSEC = 0.5
 """Findings whose peak is smaller than this are of no use to anybody, however certain."""
-ORDINARY_ARCSEC = {"inertial_windup": 1.5, "channel_skew": 1.0}
-"""Every axis winds up a little in its fastest moves, and no two encoders are read at the same instant: it is
-allowed for, and a finding when it is more than that."""
-LATE_MS2, LATE_SHARE = 30.0, 4.0
-"""A delayed sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz
-and more) it is at most so many ms^2 and so many times the delay squared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,9 +67,9 @@ class Search:
         self.refusals: dict[str, str] = {}
         """Causes that a gate stopped during the search, with its reason in words."""
         self._left_out: str | None = None
-        law = next((each for each in self._base if isinstance(each, LOOPS)), None)
+        law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
-            estimator.loop_sign = -1.0 if law.offset_arcsec < 0.0 else 1.0
+            estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
             self._choose_sign()
 
     def _choose_sign(self) -> None:
@@ -117,7 +79,7 @@ class Search:
         if self.estimator.data.reversals < 2:
             return
         known = self._begin()
-        if any(isinstance(each, LOOPS) and each.offset_arcsec for each in known.hypothesis.effects):
+        if any(each.part is Part.LOOP and each.coefficients()[0] for each in known.hypothesis.effects):
             return  # not held at zero: it has the model's sign
         self.estimator.loop_sign *= -1.0
         other = self._begin()
@@ -178,12 +140,12 @@ class Search:
         return min(fits, key=lambda each: each.chi_square)
 
     def with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
-        """The article's law or the one with return-point memory, whichever fits better with all the rest."""
+        """The model's law of the loop or one that can stand in its place, whichever fits better."""
         for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
-            if isinstance(effect, Hysteresis | HysteresisMemory):
-                other = HysteresisMemory if isinstance(effect, Hysteresis) else Hysteresis
-                law = other(**effect.parameters())
-                rival = self.estimator.fit(fitted.hypothesis.instead(place, law))
+            laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
+            if laws:
+                trials = [self.estimator.fit(fitted.hypothesis.instead(place, law)) for law in laws]
+                rival = min(trials, key=lambda each: each.chi_square)
                 gain = rival.chi_square - fitted.chi_square
                 return (fitted, gain) if gain >= 0.0 else (rival, -gain)
         return fitted, 0.0
@@ -212,13 +174,10 @@ class Search:
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
             trial = self.estimator.fit(joined(fitted.hypothesis, score.candidate.effect, self.base))
-            if isinstance(score.candidate.effect, AmplitudeDrift):
-                trial = self._at_home(trial)
+            trial = self._restated(trial, score.candidate.cause)
             added = trial.free() - fitted.free()
             net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
-            if score.candidate.cause == "flexspline_order" and self._travel_turns() < 1.0:
-                net *= SHORT_TRAVEL  # not distinguished from the commoner motor's order there
-            key = _key(score.candidate.effect)
+            key = _key(score)
             if net <= 0.0 or not self._counts(trial, score.candidate):
                 self._refused.add(key)
                 continue
@@ -227,86 +186,56 @@ class Search:
         return None if best is None else best[1]
 
     def _best_pair(self, fitted: Fitted) -> Fitted | None:
-        """With two causes more that grow with speed, each of which may hide the other."""
+        """With two causes more, each of which may hide the other."""
         present = {each.name for each in fitted.hypothesis.effects} | {self._left_out}
         best: dict[str, Score] = {}
         for each in self._screen(fitted).scores(fitted):
             cause = each.candidate.cause
-            if cause in WITH_SPEED - present and (cause not in best or each.gain > best[cause].gain):
+            if cause not in present and (cause not in best or each.gain > best[cause].gain):
                 best[cause] = each
         pairs = []
         for one, other in combinations(sorted(best), 2):
             two = (best[one].candidate, best[other].candidate)
+            if not hides(two[0].effect, two[1].effect):
+                continue
             trial = self.estimator.fit(fitted.hypothesis.plus(two[0].effect).plus(two[1].effect))
             if cost(fitted) - cost(trial) > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
                 pairs.append(trial)
         return min(pairs, key=cost, default=None)
 
-    def _at_home(self, trial: Fitted) -> Fitted:
-        """A drift of amplitudes told at a temperature of this record, where it makes no sense at its own.
-
-        At a reference that is far away the line may have no amplitude left of which to tell a share.
-        """
-        place = next(i for i, each in enumerate(trial.hypothesis.effects) if isinstance(each, AmplitudeDrift))
-        temperature = self.estimator.motion.measured.get(Channel.TEMPERATURE)
+    def _restated(self, trial: Fitted, cause: str) -> Fitted:
+        """What was added by another of its conventions, where it makes no sense by the one it has."""
+        place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
-        if not effect.violations() or temperature is None:
-            return trial
-        for reference in (float(np.max(temperature)), float(np.min(temperature))):
-            other = effect.model_copy(update={"reference_c": round(reference, 1)})
-            again = self.estimator.fit(trial.hypothesis.instead(place, other))
-            if not again.hypothesis.effects[place].violations():
-                return again
+        if effect.violations():
+            for other in effect.restated(self.estimator.data):
+                again = self.estimator.fit(trial.hypothesis.instead(place, other))
+                if not again.hypothesis.effects[place].violations():
+                    return again
         return trial
-
-    def _travel_turns(self) -> float:
-        """Turns of the load that the record covers without a cut."""
-        return self.estimator.data.travel_deg / 360.0 / self.estimator.data.ratio
 
     def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
         """Whether what was added is large enough, physical, and really seen."""
-        place = next(
-            i for i in range(len(trial.hypothesis.effects) - 1, -1, -1)
-            if trial.hypothesis.effects[i].name == candidate.cause
-        )  # fmt: skip
+        place = _last(trial, candidate.cause)
         effect = trial.hypothesis.effects[place]
-        if not self._makes_sense(effect):
+        if not self.makes_sense(effect):
             return False
         peak = self.peak(trial, place)
-        largest = 0.0
-        if isinstance(effect, OrderSeries):
-            largest = max(each.amplitude_arcsec for each in effect.orders)
-        if isinstance(effect, Creep):
-            largest = max(abs(each.amplitude_arcsec) for each in effect.parts)
-        if peak < FLOOR_ARCSEC or largest > EXTRAPOLATED * peak:
+        if peak < FLOOR_ARCSEC or effect.largest_piece_arcsec() > EXTRAPOLATED * peak:
             return False
-        if not isinstance(effect, Creep | CountLoss):
+        if Channel.TIME not in effect.needs() or effect.shows(self.estimator.motion) is None:
             return True
-        # What is over at once, or seen only where the axis reverses, is another cause's, which would not
-        # be found with it in the fit.
+        # What happens in time may be placed anywhere: where it is not seen as it has to be, it is another
+        # cause's, which would not be found with it in the fit.
         judged = gate(self.estimator, trial, place)
         if not judged.passed:
             self.refusals[candidate.cause] = judged.reason
             return False
-        return isinstance(effect, Creep) or all_steps_seen(self.estimator, trial, place)
+        return all_pieces_seen(self.estimator, trial, place)
 
-    def _makes_sense(self, effect: Effect) -> bool:
-        """Whether an effect is physical, and this record one in which it can be seen."""
-        if effect.violations() and not isinstance(effect, OrderSeries):
-            return False
-        if isinstance(effect, Compliance):
-            return _stiffens(effect)
-        if isinstance(effect, ChannelSkew):
-            return _late(effect)
-        if isinstance(effect, LocalDefect):
-            return matched_filters.is_met(effect, self.estimator)
-        if isinstance(effect, CountLoss):
-            # Nowhere twice: a step in time may as well be one at a place.
-            return self.estimator.data.reversals >= 2
-        if isinstance(effect, Creep):
-            rest_s = float(np.max(standing_s(self.estimator)))
-            return min(each.tau_s for each in effect.parts) <= RESTS * rest_s
-        return True
+    def makes_sense(self, effect: Effect) -> bool:
+        """Whether an effect is physical, and this record one in which it can be known."""
+        return not effect.violations() and not effect.implausible(self.estimator.data)
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
@@ -319,14 +248,14 @@ class Search:
 
         One of more parameters gains more only once its shapes are fitted.
         """
-        present = {each.name for each in fitted.hypothesis.effects} - REPEATED
+        present = {each.name for each in fitted.hypothesis.effects if not each.repeats}
         scores = [
             each
             for each in self._scores(fitted)
-            if _key(each.candidate.effect) not in self._refused
+            if _key(each) not in self._refused
             and each.candidate.cause not in present
             and each.candidate.cause != self._left_out
-            and not (isinstance(each.candidate.effect, OrderSeries) and each.share < ORDER_SHARE_LEFT)
+            and not (each.candidate.effect.waves() and each.share < WAVE_SHARE_LEFT)
         ]
         net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
@@ -339,25 +268,12 @@ class Search:
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)
         scores = screen.scores(fitted)
-        residual, load_deg = matched_filters.fast_residual(self.estimator, fitted)
-        matched_filters.with_load_angle(self.estimator, load_deg)
-        for candidate in self._sought(fitted, residual, load_deg):
+        for candidate in matched_filters.found(self.estimator, fitted):
             columns = self.estimator.weighted(
                 self.estimator.columns(candidate.effect, fitted.hypothesis.start)
             )
             scores.append(score_of(candidate, columns, fitted))
         return scores
-
-    def _sought(self, fitted: Fitted, residual: FloatArray, load_deg: FloatArray) -> list[Candidate]:
-        found = [
-            matched_filters.count_loss(self.estimator, fitted),
-            matched_filters.local_defect(self.estimator, fitted),
-        ]
-        return [
-            *(each for each in found if each is not None),
-            *matched_filters.vibrations(self.estimator, residual, fitted.hypothesis.effects),
-            *matched_filters.interpolation_errors(self.estimator, residual, load_deg),
-        ]
 
     def _screen(self, fitted: Fitted) -> Screen:
         base = fitted.hypothesis.effects[: self.base]
@@ -387,42 +303,23 @@ def cost(fitted: Fitted) -> float:
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
-    """A hypothesis with one more effect; orders and steps go into the finding of the same name."""
+    """A hypothesis with one more effect, as part of a finding where the two are of one."""
     for place in range(base, len(hypothesis.effects)):
-        present = hypothesis.effects[place]
-        if (
-            isinstance(present, OrderSeries)
-            and isinstance(effect, OrderSeries)
-            and present.name == effect.name
-        ):
-            new = [each for each in effect.orders if each.order not in {o.order for o in present.orders}]
-            orders = tuple(sorted((*present.orders, *new), key=lambda each: each.order))
-            return hypothesis.instead(place, present.model_copy(update={"orders": orders}))
-        if isinstance(present, CountLoss) and isinstance(effect, CountLoss):
-            steps = tuple(sorted((*present.steps, *effect.steps), key=lambda each: each.time_s))
-            return hypothesis.instead(place, present.model_copy(update={"steps": steps}))
-        if isinstance(present, Creep) and isinstance(effect, Creep):
-            return hypothesis.instead(
-                place, present.model_copy(update={"parts": (*present.parts, *effect.parts)})
-            )
+        both = hypothesis.effects[place].joined(effect)
+        if both is not None:
+            return hypothesis.instead(place, both)
     return hypothesis.plus(effect)
 
 
-def _stiffens(effect: Compliance) -> bool:
-    """A gear's spring stiffens with torque; a zone that the record does not reach has no compliance."""
-    zones = [each for each in effect.coefficients().tolist() if each != 0.0]
-    return all(later <= 1.05 * earlier for earlier, later in pairwise(zones))
+def _last(fitted: Fitted, cause: str) -> int:
+    """Place of the last effect of a name."""
+    effects = fitted.hypothesis.effects
+    return next(i for i in range(len(effects) - 1, -1, -1) if effects[i].name == cause)
 
 
-def _late(effect: ChannelSkew) -> bool:
-    """Whether a part in speed and one in acceleration can be those of one delayed sample."""
-    return abs(effect.second_order_ms2) <= LATE_MS2 + LATE_SHARE * effect.delay_ms**2
-
-
-def _key(effect: Effect) -> object:
-    """What distinguishes one candidate from another: its kind and, for orders, the orders."""
-    if isinstance(effect, OrderSeries):
-        return (effect.name, tuple(each.order for each in effect.orders))
-    if isinstance(effect, Compliance):
-        return (effect.name, effect.torque1_nm)
-    return effect.name
+def _key(score: Score) -> object:
+    """What distinguishes one candidate from another: its kind, its coefficients, its degrees of freedom."""
+    effect = score.candidate.effect
+    if effect.sought is not None:
+        return effect.name
+    return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.acceptance import since_reversal
 from hdbridge.diagnose.holdout import stretches
 from hdbridge.diagnose.result import Finding
-from hdbridge.diagnose.search import REPEATED
-from hdbridge.effects import FloatArray
+from hdbridge.effects import FloatArray, Part
 from hdbridge.effects.kinematics import direction_of
+from hdbridge.effects.path import since_reversal_deg
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.units import DEG_PER_TURN
 
@@ -38,9 +37,8 @@ EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
 ACTS = 0.1
 """Share of its peak from which on an effect acts."""
-SERIAL = REPEATED - {"creep"}
-SAME_FAMILY = 3
-"""So many picks of one family, nearly equal, are one unknown and not many causes."""
+NEAR = 0.4
+"""Pieces of more than this share of the largest one are nearly equal to it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,22 +106,15 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
 
 
 def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
-    """Several near-equal picks of one family: sidebands of something that is none of them."""
+    """Several near-equal picks of one kind, more than usual: sidebands of something that is none of them."""
     for family in {each.cause for each in findings}:
         same = [each for each in findings if each.cause == family]
-        sizes = [
-            value.value
-            for each in same
-            for name, value in each.parameters.items()
-            if name.endswith("amplitude_arcsec") or name.endswith("size_arcsec")
-        ]
-        if not sizes or family == "subdivisional_error":  # whose lines have several orders each
-            sizes = [each.peak_arcsec for each in same]
-        if family in SERIAL:
-            sizes.sort(key=abs, reverse=True)
-            near = [each for each in sizes if abs(each) > 0.4 * abs(sizes[0])]
-            if len(near) >= SAME_FAMILY + (2 if family == "motor_order" else 0):
-                return same
+        kinds = [each.effect for each in same if each.effect is not None and not each.within]
+        if not kinds or not kinds[0].repeats:
+            continue
+        sizes = [piece.bound_arcsec() for each in kinds for piece in each.pieces()]
+        if sum(each > NEAR * max(sizes) for each in sizes) > kinds[0].usual:
+            return same
     return None
 
 
@@ -134,7 +125,10 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
     doubtful = [
         each
         for each in findings
-        if each.cause == "hysteresis_parameters"
+        if each.within
+        and each.effect is not None
+        and each.effect.changes is Part.LOOP
+        and each.effect.part is not Part.LOOP
         and "last reversal" not in left.lives_in
         and each.taken_arcsec**2 < SHADOW * left.arcsec**2
     ]
@@ -232,7 +226,7 @@ def _coordinates(estimator: Estimator) -> Iterator[tuple[str, NDArray[np.intp], 
     if float(np.ptp(load)) > 0.0:
         yield "position", *_ranged(load, 400)
     yield "time", *_ranged(estimator.time_s, 200, alternate=True)
-    since = since_reversal(motion.motor_deg)[index]
+    since = since_reversal_deg(motion.motor_deg)[index]
     number, middle = _ranged(np.log10(since + 0.05), 40)
     angles = np.asarray(np.power(10.0, middle) - 0.05, dtype=np.float64)
     yield "motor angle since the last reversal", number + 40 * back, np.tile(angles, 2)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hdbridge.effects import Effect, Start
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.estimation.hypothesis import LOOPS, Estimator, Hypothesis
+from hdbridge.effects import CATALOGUE, Effect, Part, Start
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 
-WIDTHS_DEG = (3.0, 20.0, 60.0)
 MOST = 0.5
 """Share of the squares that the model leaves; a loop that makes up more is most of what is wrong."""
 
@@ -18,11 +16,16 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
 
     What else is wrong shows only with the loop in the fit, so nothing that is named without it means much.
     """
-    if estimator.data.reversals < 2 or any(isinstance(each, LOOPS) for each in effects):
+    if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""
     sign, estimator.loop_sign = estimator.loop_sign, 0.0  # it may lead or lag
     plain = estimator.fit(Hypothesis(effects))
-    loops = [Hysteresis(offset_arcsec=1.0, width_deg=each, exponent=1.6) for each in WIDTHS_DEG]
+    loops = [
+        each
+        for kind in CATALOGUE.values()
+        if kind.part is Part.LOOP
+        for each in kind.proposals(estimator.data, effects)
+    ]
     fits = [
         estimator.fit(replace(plain.hypothesis, start=start).plus(loop))
         for loop in loops

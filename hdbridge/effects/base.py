@@ -51,6 +51,7 @@ from hdbridge.effects.motion import (
     readings,
 )
 from hdbridge.effects.observations import Observations
+from hdbridge.effects.tracker import Memoryless, Tracker
 
 __all__ = [
     "AT_REST",
@@ -85,32 +86,6 @@ __all__ = [
 
 GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 """Values of each shape that the default proposals try, by the number of shapes."""
-
-
-class Tracker(ABC):
-    """An effect followed on line.
-
-    `peek` answers "what would the error be at this motor angle, coming from the present state" as often as
-    it is asked; only `advance` moves the state on.
-    """
-
-    __slots__ = ()
-
-    @property
-    def memory_deg(self) -> float:
-        """Motor angle that, run in one direction, makes the state independent of where it began.
-
-        0 where the path is not remembered at all. Memory of time (creep, warmth) does not count.
-        """
-        return 0.0
-
-    @abstractmethod
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Error in arcsec at the load if the motor moved straight to ``motor_deg``; changes nothing."""
-
-    @abstractmethod
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Move to ``motor_deg``, keep the new state and return the error in arcsec at the load."""
 
 
 class Effect(BaseModel, ABC):
@@ -232,6 +207,11 @@ class Effect(BaseModel, ABC):
             shape = {each.name: value for each, value in zip(moved, values, strict=True)}
             yield typical.fitted(typical.coefficients(), shape)
 
+    @classmethod
+    def at_lines(cls, periods_per_turn: int) -> Iterator[Self]:  # noqa: ARG003
+        """Those that can be a line of so many periods per turn of the load; of what is sought as one."""
+        return iter(())
+
     def implausible(self, observations: Observations) -> str:
         """Why this very effect cannot be, or cannot be known from such a record, in words; else empty."""
         return ""
@@ -323,6 +303,10 @@ class Effect(BaseModel, ABC):
         """
         return None
 
+    def found_in(self, effects: Sequence[Effect]) -> Effect:
+        """It as a model has it; itself where the model has none."""
+        return next((each for each in effects if type(each) is type(self)), self)
+
     def tidied(self, ratio: float) -> Self:
         """As it goes into a model of this ratio."""
         return self
@@ -388,13 +372,3 @@ def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str,
     """
     lacking = {each.name: each.needs() - available for each in effects}
     return {name: channels for name, channels in lacking.items() if channels}
-
-
-class Memoryless(Tracker):
-    """Base for the trackers of effects without state: to advance is to peek."""
-
-    __slots__ = ()
-
-    def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Same as `peek`."""
-        return self.peek(motor_deg, moment)

@@ -33,10 +33,6 @@ from hdbridge.effects.recurrence import recurrence
 
 RESTS = 3.0
 """It is known by its bend: its shortest time constant is at most so many times the longest rest."""
-SETTLED_S = 0.5
-LEAST_ARCSEC = 0.25
-"""A gear that creeps does so for seconds: what is over so soon after a stop, or is smaller then, is the
-settling of load and servo, or the end of a loop that depends on speed."""
 
 
 class Relaxation(BaseModel):
@@ -110,9 +106,8 @@ class Creep(Effect):
         return "no rest is long enough to see it bend"
 
     def shows(self, motion: Motion) -> Stretch:
-        """At rest, when load and servo have settled."""
-        rows = standing_s(motion) > SETTLED_S
-        return Stretch(rows, "over as soon as the axis has come to rest", LEAST_ARCSEC)
+        """At rest: in motion it may be part of what depends on the speed."""
+        return Stretch(standing_s(motion) > 0.0, "not seen at rest")
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         """Time since the axis last stopped or started."""

@@ -130,5 +130,3 @@ class Stretch:
     """Shape (n,)."""
     otherwise: str
     """In words, what it is when it does not."""
-    least_arcsec: float = 0.0
-    """Half the span that it must have there."""

@@ -76,6 +76,10 @@ class HysteresisParameters(Effect):
             return None
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
 
+    def found_in(self, effects: Sequence[Effect]) -> Effect:
+        """From the loop that it was to the loop that the model has."""
+        return self.model_copy(update=loop_of(effects).model_dump(exclude={"memory"}))
+
     def changed(self) -> Loop:
         """The loop as it is now."""
         return self.base.model_copy(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-from hdbridge.effects.base import Cause, Compensable, Part
+from hdbridge.effects.base import Cause, Compensable, Effect, Observations, Part
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 
 TYPICAL_ORDERS = tuple(
@@ -39,6 +39,11 @@ class Synchronous(OrderSeries):
     part: ClassVar[Part | None] = Part.ORDERS
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
     """Teeth and the wave generator's bearing wear."""
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Synchronous]:  # noqa: ARG003
+        """None: its orders are read off a spectrum."""
+        return iter(())
 
     def turns_per_motor_turn(self) -> float:
         """One: it counts on the motor angle itself."""

@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
-from hdbridge.effects.orders import OrderSeries
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.terms import Prior
 
@@ -92,14 +91,18 @@ def _parts(
     # What the record does not see stays as it is.
     least = np.where(peaks > 0.0, PEAK_ARCSEC / np.maximum(peaks, 1e-12), 0.0)
     values = effect.coefficients()
-    if isinstance(effect, OrderSeries):
-        known = {each["order"]: each for each in halves.get("orders", ())}
-        for i, order in enumerate(effect.orders):
-            wide = _of_order(order.amplitude_arcsec, known.get(order.order))
-            pair = (2 * i, 2 * i + 1)
-            yield {str(at): (float(values[at]), math.hypot(wide, float(least[at]))) for at in pair}
+    named = effect.named_coefficients()
+    waves = [each for each in named if len(each.columns) > 1]
+    known = {each["order"]: each for each in halves.get("orders", ())}
+    given = effect.parameters()
+    for wave in waves:
+        number = given["orders"][wave.path[1]]["order"] if known else 0
+        size = float(np.linalg.norm(values[list(wave.columns)]))
+        wide = _of_order(size, known.get(number))
+        yield {str(i): (float(values[i]), math.hypot(wide, float(least[i]))) for i in wave.columns}
+    if waves:
         return
-    names = getattr(effect, "linear", ("offset_arcsec",) * len(values))
+    names = [each.name for each in named]
     result: dict[str, tuple[float, float]] = {}
     for at, (name, value) in enumerate(zip(names, values.tolist(), strict=True)):
         wide = _width(halves.get(name), SHARE * abs(value))

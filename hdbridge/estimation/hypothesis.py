@@ -13,17 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import savgol_filter
 
-from hdbridge.effects import (
-    Channel,
-    Effect,
-    FloatArray,
-    Motion,
-    Start,
-)
-from hdbridge.effects.described import Moves, Part
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.effects.orders import MotorOrder, OrderSeries
+from hdbridge.effects import Channel, Effect, FloatArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
 from hdbridge.estimation.linear import seen_directions
@@ -38,7 +28,6 @@ ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 KEPT_FITS = 8
 KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large."""
-LOOPS = (Hysteresis, HysteresisMemory)
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
 """Measured channels of which each reading has its own noise that goes into a column as it is."""
 SMOOTH = 15
@@ -164,10 +153,13 @@ class Estimator:
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
-        if isinstance(effect, OrderSeries):
-            return np.hstack(
-                [np.empty((len(self.index), 0)), *(self._order(effect, each) for each in effect.orders)]
-            )
+        pieces = effect.pieces()
+        if (
+            not (effect.shape or effect.carries or effect.curved)
+            and Channel.LOAD_ANGLE not in effect.channels
+        ):
+            # The same in every fit.
+            return np.hstack([np.empty((len(self.index), 0)), *(self._kept(each, start) for each in pieces)])
         # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
         # depend on those, and these are fields of them.
         recent = (unit(effect), start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
@@ -180,12 +172,12 @@ class Estimator:
             self._recent.popitem(last=False)
         return columns
 
-    def _order(self, series: OrderSeries, order: MotorOrder) -> FloatArray:
-        """Cosine and sine of one order at the usable points, shape (m, 2)."""
-        key = (series.turns_per_motor_turn(), order.order)
+    def _kept(self, effect: Effect, start: Start) -> FloatArray:
+        """Columns of what has no shape, once and for all, shape (m, p)."""
+        one = unit(effect)
+        key = (one, start if one.tracker().memory_deg else None)
         if key not in self._memo:
-            alone = series.model_copy(update={"orders": (order,)})
-            self._memo[key] = self.at_points(alone.columns(self.data.full.motion))
+            self._memo[key] = self.at_points(one.columns(self.data.full.motion, start))
         return self._memo[key]
 
     def at_points(self, values: FloatArray) -> FloatArray:

@@ -119,6 +119,11 @@ class Observed:
         """The same samples averaged over other runs, given by their first samples."""
         return replace(self, points=_averaged(self.full, runs), runs=runs)
 
+    @property
+    def motion(self) -> Motion:
+        """What drove the axis, point by point."""
+        return self.points.motion
+
     def mean(self, values: FloatArray) -> FloatArray:
         """Means of a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
         return means(values, self.runs)

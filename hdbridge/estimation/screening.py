@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, Start
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Observations, Start, causes, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 SHARE_LEFT = 1e-4
@@ -26,6 +26,19 @@ class Candidate:
     cause: str
     effect: Effect
     """With the shape of this point of the grid; its coefficients are of no account."""
+
+
+def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Candidate]:
+    """What the catalogue proposes for a record and the model ``base``; all whose channels are there.
+
+    To be ``screened`` are those that would be an addition to the model, and that a grid covers; else all.
+    """
+    available = observations.motion.available()
+    kinds = [CATALOGUE[each] for each in causes()]
+    if screened:
+        kinds = [each for each in kinds if each.changes is None and each.sought is None]
+    found = [each for kind in kinds for each in kind.proposals(observations, base)]
+    return [Candidate(each.name, each) for each in found if not unmet([each], available)]
 
 
 @dataclass(frozen=True, slots=True)

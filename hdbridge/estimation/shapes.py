@@ -82,8 +82,10 @@ def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
 
 def shape_value(effect: Effect, name: str) -> float:
     """A shape parameter; where it is not a field, that of the first of its parts."""
-    holder = effect if hasattr(effect, name) else effect.parts[0]  # type: ignore[attr-defined]
-    return float(getattr(holder, name))
+    if name in type(effect).model_fields:
+        return float(getattr(effect, name))
+    parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
+    return float(parts[0][name])
 
 
 def is_valid(effect: Effect) -> bool:

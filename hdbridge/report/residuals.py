@@ -10,8 +10,9 @@ import numpy as np
 
 from hdbridge.diagnose import Traces
 from hdbridge.diagnose.partial_residuals import PartialResidual, Strength
-from hdbridge.diagnose.residual_views import BoolArray, Coordinate, ResidualViews, Spacing, binned
+from hdbridge.diagnose.residual_views import BoolArray, ResidualViews, binned
 from hdbridge.effects import FloatArray
+from hdbridge.effects.coordinate import Coordinate, Spacing
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
 
 R_LABEL: Final = "residual, arcsec"

@@ -7,15 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.residual_views import (
-    Coordinate,
-    ResidualViews,
-    Spacing,
-    binned,
-    since_change_s,
-    since_reversal,
-)
+from hdbridge.diagnose.residual_views import ResidualViews, binned
 from hdbridge.effects import Motion
+from hdbridge.effects import coordinate as over
+from hdbridge.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
 
 COUNT = 8000
 TIME_S = np.arange(COUNT) * 0.1
@@ -80,19 +75,20 @@ def test_bins_lose_no_point_and_keep_the_mean(points, spacing):
 
 def test_way_and_time_since_a_reversal_begin_anew_at_each():
     motor = np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0, 3.0])
-    way, since_s = since_reversal(Motion(motor_deg=motor, time_s=np.arange(7.0)))
+    motion = Motion(motor_deg=motor, time_s=np.arange(7.0))
     # A rest belongs to the motion before it: the axis has not turned round yet.
-    assert way.tolist() == [0.0, 1.0, 2.0, 2.0, 1.0, 2.0, 3.0]
-    assert since_s.tolist() == [0.0, 1.0, 2.0, 3.0, 1.0, 2.0, 1.0]
+    assert over.since_reversal(motion).values.tolist() == [SMALLEST_WAY_DEG, 1.0, 2.0, 2.0, 1.0, 2.0, 3.0]
+    assert over.time_since_reversal(motion).values.tolist() == [SMALLEST_TIME_S, 1.0, 2.0, 3.0, 1.0, 2.0, 1.0]
 
 
 def test_an_axis_that_never_turns_counts_from_its_beginning():
-    way, since_s = since_reversal(Motion(motor_deg=np.zeros(4), time_s=np.arange(4.0)))
-    assert not np.any(way)
-    assert since_s.tolist() == [0.0, 1.0, 2.0, 3.0]
+    motion = Motion(motor_deg=np.zeros(4), time_s=np.arange(4.0))
+    assert np.all(over.since_reversal(motion).values == SMALLEST_WAY_DEG)
+    assert over.time_since_reversal(motion).values.tolist() == [SMALLEST_TIME_S, 1.0, 2.0, 3.0]
 
 
 def test_time_since_a_stop_or_start():
     speed = np.array([0.0, 0.0, 5.0, 5.0, 0.0, -5.0])
     motion = Motion(motor_deg=np.cumsum(speed), time_s=np.arange(6.0), motor_speed_deg_s=speed)
-    assert since_change_s(motion).tolist() == [0.0, 1.0, 0.0, 1.0, 0.0, 0.0]
+    least = SMALLEST_TIME_S
+    assert over.since_change(motion).values.tolist() == [least, 1.0, least, 1.0, least, least]

@@ -20,6 +20,7 @@ from hdbridge.effects import (
     Hysteresis,
     Motion,
     MotorOrder,
+    MotorOrders,
     Start,
     Step,
     Synchronous,
@@ -280,12 +281,9 @@ def test_every_cause_of_the_catalogue_has_a_picture(cause):
     assert max(abs(value) for curve in curves for value in curve) > 0.01
 
 
-def test_a_change_of_orders_is_drawn_from_its_parameters():
-    parameters = {
-        "order_2_amplitude_arcsec": Parameter(3.0, "arcsec", 2.9, 3.1),
-        "order_2_phase_deg": Parameter(90.0, "deg", 88.0, 92.0),
-    }
-    text = page(finding("motor_order", effect=None, parameters=parameters))
+def test_a_change_of_orders_is_drawn_as_it_was_found():
+    change = MotorOrders(orders=(MotorOrder(order=2, amplitude_arcsec=3.0, phase_deg=90.0),))
+    text = page(finding("motor_order", effect=change))
     angle, curve = series(charts(text)["Residual without it, over the motor angle"], "the finding, forward")
     assert curve == pytest.approx(-3.0 * np.sin(np.radians(2.0 * angle)), abs=0.05)
 

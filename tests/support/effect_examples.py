@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from hdbridge.effects import (
+    CATALOGUE,
     AmplitudeDrift,
     Backlash,
     Channel,
@@ -76,7 +77,8 @@ torque = {
     "limit_nm": st.floats(1, 100),
 }
 growths = st.builds(TorqueGrowth, growth_percent_per_nm=st.floats(-5, 5), signed=st.booleans(), **torque)
-EXAMPLES = {
+BASE = [CATALOGUE[name].candidate(50.0) for name in ("synchronous", "hysteresis")]
+EXAMPLES = {name: st.just(kind.candidate(50.0, BASE)) for name, kind in CATALOGUE.items()} | {
     "synchronous": st.builds(Synchronous, orders=low_orders),
     "hysteresis": st.builds(Hysteresis, **loop),
     "motor_order": st.builds(MotorOrders, orders=low_orders),
@@ -153,7 +155,7 @@ EXAMPLES = {
         ratio=ratios, height_arcsec=signed, centre_deg=st.floats(0, 360), half_width_deg=st.floats(0.1, 20),
     ),
 }  # fmt: skip
-"""Effect name -> strategy for effects of that kind."""
+"""Effect name -> strategy for effects of that kind; as a rule one of typical size."""
 
 angle_steps = st.lists(
     st.one_of(st.sampled_from([0.0, 1e-6, -1e-6]), st.floats(-30, 30, allow_subnormal=False)),
