@@ -33,8 +33,9 @@ from hdbridge.twin.parameters import (
 from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
 
-STEP = 0.01
-"""Step of the Jacobian's differences: of a logarithm, or of a parameter's spread where it is linear."""
+STEP = 0.03
+"""Step of the Jacobian's central differences: of a logarithm, or of a parameter's spread where it is linear.
+A motor that sticks a substep earlier makes residuals jump; in a smaller step that would be all of it."""
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where the resonance of the load is looked for: a fit finds only the nearest of its minima."""
 NINETY_FIVE = 1.96
@@ -126,12 +127,12 @@ def fit(
     with Replays(rough, workers) as replays:
         begun = _at_best_frequency(replays, begun)
         progress(0.1)
-        starts = [solve(replays, each, parameters, prior, 12) for each in _filters(begun)]
+        starts = [solve(replays, each, parameters, prior, 8) for each in _filters(begun)]
         first = min(starts, key=lambda each: each.misfit)
     progress(0.4)
     with Replays(data, workers) as replays:
-        second = solve(replays, first.truth, parameters, prior, 8, lambda share: progress(0.4 + 0.3 * share))
-        best = solve(replays, second.truth, parameters, prior, 8, lambda share: progress(0.7 + 0.2 * share))
+        second = solve(replays, first.truth, parameters, prior, 12, lambda share: progress(0.4 + 0.3 * share))
+        best = solve(replays, second.truth, parameters, prior, 12, lambda share: progress(0.7 + 0.2 * share))
         for name in LAST:
             wider = (*parameters, BY_NAME[name])
             if value_in(begun, BY_NAME[name]) is None or name in more:
@@ -269,17 +270,18 @@ def _slopes(
     vector: Callable[[dict[str, FloatArray]], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Derivative of the scaled residuals by each coordinate, and the residuals themselves."""
-    steps = []
-    for each, x in zip(parameters, place, strict=True):
+    truths, ways = [at_coordinates(base, parameters, place.tolist())], []
+    for number, each in enumerate(parameters):
         step = STEP * (each.spread if each.linear else 1.0)
-        steps.append(-step if x + step > each.bounds[1] else step)
-    truths = [at_coordinates(base, parameters, place.tolist())]
-    for number, step in enumerate(steps):
-        moved = place.copy()
-        moved[number] += step
-        truths.append(at_coordinates(base, parameters, moved.tolist()))
+        ends = [min(max(place[number] + way, each.bounds[0]), each.bounds[1]) for way in (step, -step)]
+        ways.append(ends[0] - ends[1])
+        for end in ends:
+            moved = place.copy()
+            moved[number] = end
+            truths.append(at_coordinates(base, parameters, moved.tolist()))
     here, *there = (vector(each) for each in replays(truths))
-    return np.stack([(each - here) / step for each, step in zip(there, steps, strict=True)], axis=1), here
+    slopes = [(there[2 * number] - there[2 * number + 1]) / way for number, way in enumerate(ways)]
+    return np.stack(slopes, axis=1), here
 
 
 def _soft(values: FloatArray) -> FloatArray:

@@ -79,6 +79,16 @@ def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
         assert found == pytest.approx(true, rel=0.03, abs=0.05), each.name
 
 
+def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> None:
+    known = twin()
+    assert known.load_.encoder.noise_arcsec == pytest.approx(TRUTH.load_.encoder.noise_arcsec, rel=0.15)
+    for name in NAMES:
+        lower, upper = known.intervals[".".join(BY_NAME[name].path)]
+        found = value_in(known, BY_NAME[name])
+        assert found is not None
+        assert lower <= found <= upper, name
+
+
 def test_a_check_is_silent_where_nothing_has_changed() -> None:
     told = check(recorded(seed=1), AXIS, twin(), workers=1)
     assert told.changes == ()
