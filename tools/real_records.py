@@ -1,6 +1,6 @@
 """The figures of docs/real-records.md, from the measured records (which are not part of the project).
 
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py      # a minute of CPU
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py      # ten minutes of CPU
 
 The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-command`, `damper/sine.csv` and
 `damper/earthquake.csv`.
@@ -64,7 +64,6 @@ def main() -> None:
         print(f"{name}, joint {joint}, all recordings")
         _print(diagnose(concatenate(records), NOTHING, independent_zeros=True))
         _leave_one_out(records)
-    _twins(folder)
     _laws(folder)
     for name in ("sine", "earthquake"):
         time, displacement, force = _damper(folder, name)
@@ -75,6 +74,7 @@ def main() -> None:
             law = Hysteresis(offset_arcsec=95.0, width_deg=16.0 * scale, exponent=2.2)
             print(f"damper, {name}, {scale:g} deg/mm")
             _print(diagnose(record, TransmissionModel(50.0, (law,))))
+    _twins(folder)
 
 
 def joint_axis() -> AxisConfig:

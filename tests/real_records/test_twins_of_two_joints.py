@@ -1,0 +1,47 @@
+"""What a simulated drive gets right and wrong of two robot joints that somebody else measured.
+
+The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import real_records
+
+from hdbridge.records.recording import Recording
+from hdbridge.twin.translation import translate
+
+BESIDE = Path(__file__).parents[3] / "shared" / "data"
+
+
+def recordings_of(joint: int) -> list[Recording]:
+    folder = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE))
+    found = real_records.joint_recordings(folder, joint)
+    if not found:
+        pytest.skip(f"no cobot-command/joint{joint}-*.csv in {folder}: set HDBRIDGE_REAL_RECORDS")
+    return found
+
+
+@pytest.mark.parametrize("joint", [4, 5])
+def test_usual_values_do_not_follow_as_a_robot_joint_does(joint: int) -> None:
+    """Its drive lags the command by 8 ms; a usual one follows within two or three."""
+    truth = translate(real_records.joint_axis()).truth
+    for recording in recordings_of(joint):
+        row = real_records.held_against(recording, truth).row("following_error")
+        assert row is not None
+        assert row.measured > 5.0, "motor degrees"
+        assert row.simulated < 0.4 * row.measured
+
+
+@pytest.mark.slow
+def test_a_twin_of_three_recordings_follows_as_the_fourth_does() -> None:
+    twin, compared = real_records.twin_of_others(recordings_of(4), 0)
+    assert "friction" in {each.cause for each in twin.findings}
+    for signal in ("following_error", "motor_torque"):
+        usual, now = compared["usual values"].row(signal), compared["twin"].row(signal)
+        assert usual is not None
+        assert now is not None
+        assert now.difference < 0.5 * usual.difference
