@@ -126,7 +126,8 @@ def draw(seed: int) -> tuple[AxisConfig, Truth]:
         }
         for order in sorted(rng.choice(np.arange(1, 11), 5, replace=False))
     ]
-    truth.setdefault("temperature", {})["friction_growth_per_k"] = -0.015
+    # A reference of its own: without one the friction would follow the surroundings' own warmth.
+    truth.setdefault("temperature", {}).update(friction_growth_per_k=-0.015, reference_c=22.0)
     return axis, Truth.model_validate(truth)
 
 
@@ -152,7 +153,10 @@ def usual(axis: AxisConfig, truth: Truth) -> Truth:
         update={
             "gear": start.gear.model_copy(update=known),
             "temperature": start.temperature.model_copy(
-                update={"friction_growth_per_k": truth.temperature.friction_growth_per_k}
+                update={
+                    "friction_growth_per_k": truth.temperature.friction_growth_per_k,
+                    "reference_c": truth.temperature.reference_c,
+                }
             ),
         }
     )
