@@ -23,6 +23,7 @@ from hdbridge.effects.base import (
     readings,
     unmet,
 )
+from hdbridge.effects.basic import BASIC, USUAL_LOOP, is_ripple, ripple
 from hdbridge.effects.carried import Loop, loop_of, orders_of
 from hdbridge.effects.channel_skew import ChannelSkew
 from hdbridge.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
@@ -85,13 +86,10 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 """Every effect by its canonical name."""
 
-_BASIC = frozenset({Synchronous.name, Hysteresis.name})
-"""The two parts that a model has from its calibration."""
-
 
 def causes() -> tuple[str, ...]:
     """Names of the causes that a diagnosis can find in addition to the two basic parts of a model."""
-    return tuple(name for name in CATALOGUE if name not in _BASIC)
+    return tuple(name for name in CATALOGUE if name not in BASIC)
 
 
 def register(kind: type[Effect]) -> type[Effect]:
@@ -121,9 +119,11 @@ def aliases_of(name: str) -> tuple[str, ...]:
 
 
 __all__ = [
+    "BASIC",
     "CATALOGUE",
     "MEASURED",
     "SLOT",
+    "USUAL_LOOP",
     "AmplitudeDrift",
     "Backlash",
     "Cause",
@@ -177,12 +177,14 @@ __all__ = [
     "extended",
     "fall_bound",
     "in_place",
+    "is_ripple",
     "loop_of",
     "moments",
     "orders_of",
     "readings",
     "refreshed",
     "register",
+    "ripple",
     "unmet",
     "withdraw",
 ]

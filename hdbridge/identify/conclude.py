@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, Synchronous
+from hdbridge.effects import Effect, FloatArray, Part
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
@@ -69,7 +69,7 @@ def conclude(
     further = _further(solution, cov)
     zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
     clean = solution.residual + sum(
-        (_predicted(design, each) for each in solution.effects if isinstance(each, Synchronous)),
+        (_predicted(design, each) for each in solution.effects if each.part is Part.ORDERS),
         start=np.zeros(len(blocks)),
     )
     lines = _lines(state, selection, system, clean, options)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, Synchronous
+from hdbridge.effects import Effect, FloatArray, Part
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.linear import inverse_symmetric
@@ -80,7 +80,7 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
 
 
 def _is_wave(solution: Solution, column: Column) -> bool:
-    return column.effect >= 0 and isinstance(solution.effects[column.effect], Synchronous)
+    return column.effect >= 0 and solution.effects[column.effect].part is Part.ORDERS
 
 
 def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:

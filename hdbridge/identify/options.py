@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hdbridge.effects import Effect, Hysteresis, Start
+from hdbridge.effects import USUAL_LOOP, Effect, Start
 from hdbridge.model import TransmissionModel
-
-TYPICAL: tuple[Effect, ...] = (Hysteresis(offset_arcsec=40.0, width_deg=20.0, exponent=1.8),)
 
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
     """All have defaults that suit the bench's own recordings."""
 
-    effects: tuple[Effect, ...] = TYPICAL
-    """Fitted in addition to the synchronous part. Where data cannot say, their shapes stay as given here."""
+    effects: tuple[Effect, ...] = (USUAL_LOOP,)
+    """Fitted in addition to the ripple. Where data cannot say, their shapes stay as given here."""
     highest_order: int = 24
     """Motor orders up to this are looked for."""
     load_orders: int = 4

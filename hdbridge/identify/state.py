@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, MotorOrder, Synchronous
+from hdbridge.effects import Effect, FloatArray, is_ripple, ripple
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.design import Design, harmonics
 from hdbridge.estimation.noise import NoiseModel, Precision
@@ -38,11 +38,11 @@ class State(NamedTuple):
     """Columns of the candidates, (b, 2 candidates)."""
     nuisances: tuple[str, ...]
     effects: tuple[Effect, ...]
-    """All but the synchronous part."""
+    """All but the ripple."""
     noise: NoiseModel
     delay_ms: float = 0.0
     """By which the samples have been put right already."""
-    synchronous: Synchronous | None = None
+    ripple: Effect | None = None
     """As last fitted."""
 
     def nuisance_columns(self) -> Nuisances:
@@ -50,19 +50,21 @@ class State(NamedTuple):
         return nuisances_of(self.design, self.nuisances, self.effects, self._shaking())
 
     def _shaking(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """Orders of the synchronous part, what each contributes to the blocks, and a quarter later."""
-        if self.synchronous is None:
+        """Orders of the ripple, what each contributes to the blocks, and a quarter later."""
+        if self.ripple is None:
             return []
-        places = {each.number: at for at, each in enumerate(self.candidates) if each.family is Family.MOTOR}
+        places = {
+            float(each.number): at for at, each in enumerate(self.candidates) if each.family is Family.MOTOR
+        }
         waves = []
-        for each in self.synchronous.orders:
-            phase = np.deg2rad(each.phase_deg)
-            pair = self.waves[:, 2 * places[each.order] : 2 * places[each.order] + 2]
-            both = each.amplitude_arcsec * np.array(
+        for order, amplitude_arcsec, phase_deg in self.ripple.waves():
+            phase = np.deg2rad(phase_deg)
+            pair = self.waves[:, 2 * places[order] : 2 * places[order] + 2]
+            both = amplitude_arcsec * np.array(
                 [[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]]
             )
             now, later = (pair @ both).T
-            waves.append((float(each.order), now, later))
+            waves.append((order, now, later))
         return waves
 
     def precision(self) -> Precision:
@@ -96,12 +98,8 @@ class State(NamedTuple):
         return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
 
     def problem(self, selection: Selection) -> Problem:
-        """Motor orders as the synchronous part, other effects; orders not the motor's in addition."""
-        motor = tuple(
-            MotorOrder(order=each.number, amplitude_arcsec=0.0, phase_deg=0.0)
-            for each in selection.chosen
-            if each.family is Family.MOTOR
-        )
+        """Motor orders as the ripple, other effects; orders not the motor's in addition."""
+        motor = [each.number for each in selection.chosen if each.family is Family.MOTOR]
         others = [
             index
             for index, each in enumerate(self.candidates)
@@ -109,16 +107,14 @@ class State(NamedTuple):
         ]
         picked = [2 * index + part for index in others for part in (0, 1)]
         names = [f"{self.candidates[index]} {part}" for index in others for part in ("cosine", "sine")]
-        effects = ((Synchronous(orders=motor),) if motor else ()) + self.effects
+        effects = ((ripple(motor),) if motor else ()) + self.effects
         return Problem(self.design, effects, self.nuisance_columns().and_waves(self.waves[:, picked], names))
 
     def after(self, solution: Solution) -> State:
         """With a solution's effects, and the blur that they bring."""
-        effects = tuple(
-            each for each in solution.effects if not isinstance(each, Synchronous) and is_valid(each)
-        )
-        synchronous = next((each for each in solution.effects if isinstance(each, Synchronous)), None)
-        return self._replace(effects=effects, design=self.design.blurred(effects), synchronous=synchronous)
+        effects = tuple(each for each in solution.effects if not is_ripple(each) and is_valid(each))
+        own = next(filter(is_ripple, solution.effects), None)
+        return self._replace(effects=effects, design=self.design.blurred(effects), ripple=own)
 
     def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
         """With corrected samples and without outliers."""
