@@ -23,7 +23,7 @@ from hdbridge.model import TransmissionModel
 from hdbridge.sim.truth import Truth
 from hdbridge.twin import encoder_effects, gear_effects, slow_effects, spring_effects
 from hdbridge.twin.defaults import default_truth
-from hdbridge.twin.draft import Draft, Said
+from hdbridge.twin.draft import Draft, Said, none
 
 OF_GEAR: Final = (
     "motor_orders", "flexspline_orders", "load_orders", "hysteresis", "second_hysteresis", "flank", "jumps",
@@ -55,7 +55,7 @@ class Translation:
 
     truth: Truth
     rows: tuple[Row, ...]
-    """One per effect of the model, in the order of the catalogue."""
+    """One per effect of the model, in the order of the catalogue; last what the catalogue does not have."""
 
 
 class Entry(NamedTuple):
@@ -104,6 +104,8 @@ TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
     }
 )
 """One row per effect of the catalogue."""
+UNKNOWN: Final = none("the simulated drive has no part for an effect that is not of hdbridge's own catalogue")
+"""Of an effect that somebody has registered."""
 
 
 def translate(
@@ -127,7 +129,8 @@ def translate(
         if by_name.get(name) is not None
     }
     draft.finish()
-    rows = tuple(_row(by_name[name], said[name]) for name in CATALOGUE if name in said)
+    order = [name for name in (*CATALOGUE, *by_name) if name in by_name]
+    rows = tuple(_row(by_name[name], said.get(name, UNKNOWN)) for name in dict.fromkeys(order))
     return Translation(_validated(draft.data), rows)
 
 

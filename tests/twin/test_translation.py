@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -334,6 +335,22 @@ def test_what_the_plant_cannot_do_is_said() -> None:
     for name in ("torque_modulation", "wear", "count_loss", "vibration"):
         assert rows[name].counterpart is None
         assert rows[name].note
+
+
+def test_of_an_effect_of_ones_own_it_is_said_that_it_has_no_counterpart() -> None:
+    class Draught(Synchronous):
+        """Not of the catalogue."""
+
+        name: ClassVar[str] = "draught"
+
+    model = TransmissionModel(N, (Draught(orders=ORDERS), Synchronous(orders=ORDERS)))
+    translation = translate(AXIS, model)
+    assert [(row.effect, row.counterpart) for row in translation.rows] == [
+        ("synchronous", TABLE["synchronous"].counterpart),
+        ("draught", None),
+    ]
+    assert "own catalogue" in translation.rows[-1].note
+    assert translation.truth == translate(AXIS, TransmissionModel(N, model.effects[1:])).truth
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
