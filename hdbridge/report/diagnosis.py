@@ -9,10 +9,10 @@ from hdbridge import __version__
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
 from hdbridge.diagnose import Diagnosis, Finding
-from hdbridge.diagnose.partial_residuals import partial_residual
 from hdbridge.diagnose.residual_views import ResidualViews, see
 from hdbridge.effects import CATALOGUE
 from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
+from hdbridge.report.partial_residuals import partial_residual
 from hdbridge.report.residuals import beside_charts, partial_residual_chart, residual_charts
 from hdbridge.report.validation import stepping_sections
 from hdbridge.report.verdict import of_offer

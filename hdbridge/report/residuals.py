@@ -1,4 +1,4 @@
-"""Charts of residuals: the partial_residual of a finding, and what is seen over every coordinate."""
+"""Charts of residuals: the partial residual of a finding, and what is seen over every coordinate."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import Final
 import numpy as np
 
 from hdbridge.diagnose import Traces
-from hdbridge.diagnose.partial_residuals import PartialResidual, Strength
-from hdbridge.diagnose.residual_views import BoolArray, ResidualViews, binned
+from hdbridge.diagnose.residual_views import BoolArray, ResidualViews
 from hdbridge.effects import FloatArray
 from hdbridge.effects.coordinate import Coordinate, Spacing
+from hdbridge.report.bins import binned
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
+from hdbridge.report.partial_residuals import PartialResidual, Strength
 
 R_LABEL: Final = "residual, arcsec"
 E_LABEL: Final = "error, arcsec"
 CLOUD: Final = 2500
-"""Raw points of a partial_residual."""
+"""Raw points of a partial residual."""
 SMALL_CLOUD: Final = 1200
 """... of a small chart."""
 LINE_POINTS: Final = 2000

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.residual_views import ResidualViews, binned
+from hdbridge.diagnose.residual_views import ResidualViews
 from hdbridge.effects import Motion
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
+from hdbridge.report.bins import binned
 
 COUNT = 8000
 TIME_S = np.arange(COUNT) * 0.1

@@ -1,4 +1,4 @@
-"""The partial_residual of a finding: the residual without it, over the coordinate that its cause depends on.
+"""The partial residual of a finding: the residual without it, over the coordinate that its cause depends on.
 
 Everything else that was found stays in the model, so what is seen is this finding alone, with the noise.
 A cause that scales what the model has (ripple that grows with torque, a loop that grows with speed) is seen
