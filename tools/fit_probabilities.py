@@ -26,6 +26,7 @@ from scipy.optimize import minimize
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.diagnose.probability import COEFFICIENTS, LEAST, MOST
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording
 
@@ -65,7 +66,7 @@ def from_suite(folder: Path) -> Iterator[Row]:
         hidden = yaml.safe_load(path.read_text(encoding="utf-8"))
         recording = Recording.load(path.parent / "record.csv")
         model = TransmissionModel.load(path.parent / "model.yaml")
-        result = diagnose(recording, model, named_from=0.0)
+        result = diagnose(recording, model, scales=Scales(named_from=0.0))
         there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
         loop = hidden["kind"] == "other_law"
         yield from judged(
@@ -79,7 +80,7 @@ def from_trials(seeds: int) -> Iterator[Row]:
         for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
             there, record, model = planted(name, seed + 100, SHORT)
             loop = name.startswith("none:") or bool(there & LOOPS)
-            result = diagnose(record, model, named_from=0.0)
+            result = diagnose(record, model, scales=Scales(named_from=0.0))
             yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
 
 

@@ -20,11 +20,7 @@ from hdbridge.estimation.linear import orthonormal
 BLOCKS_S = (1.0, 5.0)
 LEAST_BLOCKS = 30
 """A short record is cut into so many, whatever their length."""
-ROBUST = 25.0
-"""Block-robust chi square that a finding needs, and 6 more for each further parameter."""
 SHARE_LEFT = 1e-5
-BEND = 0.6
-"""What is the same everywhere may not differ by more than this share along the way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +92,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
     robust = robust_chi_square(estimator, fitted, place)
-    needed = ROBUST + 6.0 * (len(effect.coefficients()) - 1)
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(effect.coefficients()) - 1)
     if robust < needed:
         return Gate(robust, needed, passed=False, reason="not seen in enough independent stretches")
     if effect.tracker().memory_deg > 0.0:
@@ -122,7 +118,7 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     if not effect.inexact or len(pieces) != len(effect.pieces()):
         return True
     robust = [robust_chi_square(estimator, fitted, place, only=each) for each in pieces]
-    return min(robust) > max(ROBUST, effect.inexact * max(robust))
+    return min(robust) > max(estimator.scales.robust, effect.inexact * max(robust))
 
 
 def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
@@ -142,7 +138,10 @@ def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     # The coefficient before the first change, with the changes in place.
     step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
     along = first + np.cumsum(step[: 1 + changing.shape[1]])
-    return bool(np.ptp(along) > BEND * np.max(np.abs(along)) and float(moment @ change) > ROBUST)
+    return bool(
+        np.ptp(along) > estimator.scales.bend * np.max(np.abs(along))
+        and float(moment @ change) > estimator.scales.robust
+    )
 
 
 def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:

@@ -12,24 +12,8 @@ from dataclasses import replace
 from itertools import combinations
 
 from hdbridge.diagnose.overlap import overlap
-from hdbridge.diagnose.search import (
-    ENTER,
-    FEW,
-    FLOOR_ARCSEC,
-    PENALTY,
-    Search,
-    Trail,
-    cost,
-)
+from hdbridge.diagnose.search import FEW, Search, Trail
 from hdbridge.estimation.hypothesis import Fitted
-
-EXACTLY = 1.1
-"""Chi square per point that is more than noise. Where kin together leave noise and without the smaller one
-there is more, both are there."""
-MERGED_SHARE = 0.03
-"""One cause in place of two kin may miss this share of what both explain: laws are not exact."""
-LEFTOVER = 2e-5
-"""Findings of less than this share of the largest one's evidence are leftovers of its linearisation."""
 
 
 def reconsidered(search: Search, trail: Trail) -> Trail:
@@ -53,7 +37,7 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
             search.forget()
             without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
             other = search.best_addition(without)
-            if other is not None and cost(other) < cost(fitted) - 5.0:
+            if other is not None and search.cost(other) < search.cost(fitted) - search.scales.swap:
                 fitted, changed = other, True
                 break
         if not changed:
@@ -75,7 +59,7 @@ def _loops_anew(search: Search, fitted: Fitted) -> Fitted:
                 search.estimator.fit(fitted.hypothesis.instead(place, each))
                 for each in type(effect).proposals(search.estimator.data, base)
             ]
-            fitted = min((fitted, *trials), key=cost)
+            fitted = min((fitted, *trials), key=search.cost)
     return fitted
 
 
@@ -92,7 +76,7 @@ def _merged(search: Search, fitted: Fitted) -> Fitted:
         if trial is None:
             continue
         both = without.chi_square - fitted.chi_square
-        if cost(trial) < cost(fitted) + ENTER + MERGED_SHARE * both:
+        if search.cost(trial) < search.cost(fitted) + search.scales.enter + search.scales.merged_share * both:
             search.forget()
             return _merged(search, trial)
     search.forget()
@@ -107,17 +91,17 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
             without = search.estimator.fit(fitted.hypothesis.without(place))
             gains[place] = (without.chi_square - fitted.chi_square, without)
         largest = max(gain for gain, _ in gains.values())
-        place = min(gains, key=lambda each: gains[each][0] - _toll(fitted, each))
+        place = min(gains, key=lambda each: gains[each][0] - _toll(search, fitted, each))
         gain, without = gains[place]
-        small = search.peak(fitted, place) < FLOOR_ARCSEC
+        small = search.peak(fitted, place) < search.scales.floor_arcsec
         count = len(fitted.residual)
         share = max(
             (_overlap(search, fitted, place, other) * gains[other][0] for other in gains if other != place),
             default=0.0,
         )
-        if fitted.chi_square < count and without.chi_square > EXACTLY * count:
+        if fitted.chi_square < count and without.chi_square > search.scales.exactly * count:
             share = 0.0  # what a form gets wrong is not made up for down to the noise
-        if gain > max(_toll(fitted, place), LEFTOVER * largest, share) and not small:
+        if gain > max(_toll(search, fitted, place), search.scales.leftover * largest, share) and not small:
             break
         fitted = without
     return fitted
@@ -125,8 +109,8 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
 
 def _overlap(search: Search, fitted: Fitted, one: int, other: int) -> float:
     effects, data = fitted.hypothesis.effects, search.estimator.data
-    return overlap(effects[one], effects[other], data.motion, data.ratio)
+    return overlap(effects[one], effects[other], data, search.scales)
 
 
-def _toll(fitted: Fitted, place: int) -> float:
-    return PENALTY * len(fitted.places(place)) + ENTER
+def _toll(search: Search, fitted: Fitted, place: int) -> float:
+    return search.scales.penalty * len(fitted.places(place)) + search.scales.enter

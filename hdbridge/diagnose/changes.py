@@ -14,25 +14,10 @@ from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
-from hdbridge.diagnose.search import EXTRAPOLATED, PENALTY, Trail
+from hdbridge.diagnose.search import Trail
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
-
-LAW_GAIN = 60.0
-"""Chi square by which another elastic law has to be better."""
-LAW_ARCSEC = 0.5
-"""... and the root mean square by which the two predictions differ there."""
-LOOP_SHARE = 0.12
-LOOP_ARCSEC = 1.5
-"""A loop has changed when it differs by this share of itself, root mean square, and by this much."""
-CALIBRATED = 0.04
-CALIBRATIONS = 4.0
-"""... or, since width and exponent show only after a reversal, when its parameters are so many standard
-deviations away: those of a calibration, this share of each, and of the fit together."""
-ORDER_SHARE = 0.15
-ORDER_ARCSEC = 0.8
-"""The same for an order of the motor."""
 
 
 def findings(
@@ -71,13 +56,13 @@ def _law(
 
     if type(given) is not type(now):
         causes = causes_of(given, now)
-        if trail.law_gain < LAW_GAIN or not causes:
+        if trail.law_gain < estimator.scales.law_gain or not causes:
             return None
         old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
         apart = (old.residual - fitted.residual) / estimator.weight
         if (
-            float(np.sqrt(np.mean(apart**2))) < 0.25 * LAW_ARCSEC
-            or float(np.max(np.abs(apart))) < 2.0 * LAW_ARCSEC
+            float(np.sqrt(np.mean(apart**2))) < 0.25 * estimator.scales.law_arcsec
+            or float(np.max(np.abs(apart))) < 2.0 * estimator.scales.law_arcsec
         ):
             return None
         gain = held_out(estimator, fitted, old)
@@ -90,12 +75,17 @@ def _law(
         )  # fmt: skip
     before, after = values(given), values(now)
     change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
-    as_a_whole = change >= max(LOOP_ARCSEC, LOOP_SHARE * float(np.std(after)))
+    as_a_whole = change >= max(
+        estimator.scales.loop_arcsec, estimator.scales.loop_share * float(np.std(after))
+    )
     lawless = _lawless_arcsec(estimator, fitted)
     if (
         not as_a_whole
         and not lawless
-        and (peak < LOOP_ARCSEC or _away(precise, place, given, now, spread) < CALIBRATIONS)
+        and (
+            peak < estimator.scales.loop_arcsec
+            or _away(estimator, precise, place, given, now, spread) < estimator.scales.calibrations
+        )
     ):
         return None
     causes = causes_of(given, now)
@@ -127,11 +117,16 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     plain = estimator.fit(fitted.hypothesis)
     estimator.nuisance = searched
     apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 0.998))
-    gained = plain.chi_square - fitted.chi_square > LAW_GAIN + PENALTY * searched.shape[1]
-    return apart if gained and apart > 2.0 * LAW_ARCSEC else 0.0
+    gained = (
+        plain.chi_square - fitted.chi_square
+        > estimator.scales.law_gain + estimator.scales.penalty * searched.shape[1]
+    )
+    return apart if gained and apart > 2.0 * estimator.scales.law_arcsec else 0.0
 
 
-def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray) -> float:
+def _away(
+    estimator: Estimator, fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray
+) -> float:
     """How far offset, width and exponent - 1 are from the given ones, in standard deviations."""
     own = fitted.places(place)
     names = [fitted.parameters[i].name if fitted.parameters[i].shape else "offset_arcsec" for i in own]
@@ -149,7 +144,9 @@ def _away(fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatA
     moved = np.log(here / sizes(given))
     logarithmic = np.array([fitted.parameters[i].logarithmic for i in own])
     scale = np.where(logarithmic, 1.0, here)
-    covariance = spread[np.ix_(own, own)] / np.outer(scale, scale) + CALIBRATED**2 * np.eye(len(own))
+    covariance = spread[np.ix_(own, own)] / np.outer(scale, scale) + estimator.scales.calibrated**2 * np.eye(
+        len(own)
+    )
     return float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
 
 
@@ -171,10 +168,10 @@ def _orders(
         size, own = float(np.linalg.norm(after - before)), float(np.linalg.norm(before))
         # What is odd in the direction takes some of an order away from the mean of both directions.
         share = math.prod(each.left_in_mean(_number(new)) for each in fitted.hypothesis.effects)
-        if float(np.linalg.norm(after - share * before)) < max(ORDER_ARCSEC, 0.5 * size):
+        if float(np.linalg.norm(after - share * before)) < max(estimator.scales.order_arcsec, 0.5 * size):
             continue
         deviation = math.sqrt(max(float(np.trace(spread[np.ix_(pair, pair)])), 0.0))
-        if size < max(ORDER_ARCSEC, ORDER_SHARE * own, 5.0 * deviation):
+        if size < max(estimator.scales.order_arcsec, estimator.scales.order_share * own, 5.0 * deviation):
             continue
         changed.append((old, new))
         kept += pair
@@ -185,7 +182,7 @@ def _orders(
     was, is_now = (_together(each) for each in zip(*changed, strict=True))
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
-    if not causes or difference.largest_piece_arcsec() > EXTRAPOLATED * seen:
+    if not causes or difference.largest_piece_arcsec() > estimator.scales.extrapolated * seen:
         return None  # on an arc of their turn orders take any size
     values = difference.coefficients()
     parameters: dict[str, Parameter] = {}

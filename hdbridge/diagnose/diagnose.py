@@ -19,10 +19,8 @@ from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import PENALTY, Search, Trail
+from hdbridge.diagnose.search import Search, Trail
 from hdbridge.diagnose.unexplained import (
-    LEFT_ARCSEC,
-    SHADOW,
     Rest,
     acts,
     beyond_noise,
@@ -40,6 +38,7 @@ from hdbridge.effects.torque import beyond_limit
 from hdbridge.estimation.calibration import calibrated
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.observed import gather
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.observations.cuts import observed
 from hdbridge.observations.foreign import check_once, check_records, zeros_apart_arcsec
@@ -47,20 +46,7 @@ from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 
-NAMED = 0.3
-"""A name that is so improbable helps nobody; of names below it one in eleven was right in a blind suite."""
-ONE_WAY = 0.6
-"""A record without reversals makes no name more probable than this."""
-LEADS = 3.5
-"""A name comes before what is unexplained when its peak is so many times its root mean square."""
-LOOP_EXPLAINS = 0.3
-"""A loop of another shape accounts for what is left when the travel since the reversal foretells this share
-of it."""
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
-IN_STEP = 0.85
-"""Share of the squares of a wave that others have to explain to be taken for it, whatever else is not quite
-right: two that part by a fifth of a period explain 0.87 of each other, some ten motor turns for orders 2 of
-motor and flexspline at a ratio of 100."""
 
 
 def diagnose(
@@ -69,12 +55,13 @@ def diagnose(
     *,
     independent_zeros: bool = False,
     progress: Callable[[str], None] = lambda _: None,
-    named_from: float = NAMED,
+    scales: Scales | None = None,
 ) -> Diagnosis:
     """Say how the model differs from one or several recordings, and why; ``.as_dict()`` is the document.
 
     ``independent_zeros`` says that the encoders' zeros were lost between them. ``progress`` receives what is
-    being done, in words. Causes that are less probable than ``named_from`` are not named. InputError where a
+    being done, in words. ``scales`` are the numbers that
+    decide, where they shall be others. InputError where a
     recording is too short, was made by no axis of the model's ratio, or lacks a channel that the model needs.
     """
     recordings = by_name(recording)
@@ -94,9 +81,12 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    estimator = Estimator(data)
+    estimator = Estimator(data, scales or Scales())
     estimator.calibrated = calibrated(
-        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN)
+        model.effects,
+        model.uncertainty,
+        lambda effect: estimator.columns(effect, Start.VIRGIN),
+        estimator.scales,
     )
     search = Search(estimator, model.effects)
     first = unfitted(estimator, model.effects)
@@ -106,7 +96,7 @@ def diagnose(
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    found = _Judge(estimator, search, trail, model, record, named_from, bool(first)).diagnosis()
+    found = _Judge(estimator, search, trail, model, record, bool(first)).diagnosis()
     return replace(found, remarks=(*remarks, *found.remarks))
 
 
@@ -138,7 +128,6 @@ class _Judge:
     trail: Trail
     model: TransmissionModel
     record: Record
-    named_from: float
     unfitted: bool
     """Whether the model lacks most of what the axis has."""
 
@@ -186,6 +175,7 @@ class _Judge:
             model=extended,
             traces=self._traces(fitted, given),
             considered=tuple(considered),
+            scales=estimator.scales,
         )
 
     def _likely_only(self, fitted: Fitted) -> _Judged:
@@ -194,7 +184,9 @@ class _Judge:
         nuisance = self.estimator.nuisance
         while True:
             judged = self._judged(fitted)
-            doubted = [each for each in judged.findings if each.probability < self.named_from]
+            doubted = [
+                each for each in judged.findings if each.probability < self.estimator.scales.named_from
+            ]
             considered += [f"{each.cause}: more likely something else" for each in doubted]
             effects = {id(each.effect) for each in doubted}
             kept = fitted.hypothesis
@@ -226,13 +218,16 @@ class _Judge:
             estimator.nuisance = estimator.nuisance[:, :0]
             fitted = estimator.fit(fitted.hypothesis)
         left = rest(estimator, fitted)
-        unknown = is_unexplained(estimator, left) or many_of_one(findings) is not None
+        unknown = is_unexplained(estimator, left) or many_of_one(findings, self.estimator.scales) is not None
         considered: list[str] = []
         if unknown:
-            findings, considered = without_doubtful_loops(findings, left)
+            findings, considered = without_doubtful_loops(findings, left, estimator.scales)
         findings = weighed(findings, Context(left.arcsec, excess, free_loop, unknown))
         if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
-            findings = [replace(each, probability=min(each.probability, ONE_WAY)) for each in findings]
+            findings = [
+                replace(each, probability=min(each.probability, estimator.scales.one_way))
+                for each in findings
+            ]
         return _Judged(fitted, findings, left, covariance(estimator, fitted), considered)
 
     def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
@@ -277,7 +272,7 @@ class _Judge:
                 left_arcsec = beyond_noise(self.estimator, residual, rows)
                 share[place] = (does / max(left_arcsec**2, 1e-12), without)
             place = min(share, key=lambda each: share[each][0], default=-1)
-            if place < 0 or share[place][0] > SHADOW:
+            if place < 0 or share[place][0] > self.estimator.scales.shadow:
                 break
             considered.append(
                 f"{fitted.hypothesis.effects[place].name}: does less than what is left unexplained"
@@ -319,7 +314,9 @@ class _Judge:
         # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - count, 1), 1.0)
         for name, trial in self.search.rivals(without, effect.name):
-            worse = trial.chi_square - fitted.chi_square + PENALTY * (trial.free() - count)
+            worse = (
+                trial.chi_square - fitted.chi_square + self.estimator.scales.penalty * (trial.free() - count)
+            )
             if worse < 20.0 * excess + 0.01 * own:
                 aliases.append(name)
             else:
@@ -347,11 +344,11 @@ class _Judge:
                 continue
             columns = np.hstack([estimator.columns(each, start) for each in near])
             left = does - columns @ np.linalg.lstsq(columns, does, rcond=1e-9)[0]
-            if float(left @ left) < (1.0 - IN_STEP) * float(does @ does):
+            if float(left @ left) < (1.0 - self.estimator.scales.in_step) * float(does @ does):
                 yield name
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
-        many = many_of_one(findings)
+        many = many_of_one(findings, self.estimator.scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
@@ -363,7 +360,7 @@ class _Judge:
             findings = [each for each in findings if each not in many]
         unknown = Finding(
             cause="unexplained",
-            probability=min(max(1.0 - 0.5 * LEFT_ARCSEC / max(size, 1e-9), 0.5), 0.97),
+            probability=min(max(1.0 - 0.5 * self.estimator.scales.left_arcsec / max(size, 1e-9), 0.5), 0.97),
             aliases=(),
             parameters={},
             gain=None,
@@ -377,7 +374,7 @@ class _Judge:
             axis=left.lives_in,
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
-        foretold = left.explained_arcsec**2 > LOOP_EXPLAINS * left.arcsec**2
+        foretold = left.explained_arcsec**2 > self.estimator.scales.loop_explains * left.arcsec**2
         if many is None and loops and "last reversal" in lives and foretold:
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             told = replace(
@@ -391,7 +388,7 @@ class _Judge:
             )
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
-        return [*findings, unknown] if largest > LEADS * size else [unknown, *findings]
+        return [*findings, unknown] if largest > self.estimator.scales.leads * size else [unknown, *findings]
 
     def _as_given(self) -> FloatArray:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from hdbridge.diagnose.parameters import half_widths, parameters_of
-from hdbridge.diagnose.search import EXTRAPOLATED
 from hdbridge.effects import Effect, FloatArray, Part, conflicts, extended, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
@@ -36,7 +35,7 @@ def supported(estimator: Estimator, fitted: Fitted, given: Sequence[Effect]) -> 
         elif old.part is Part.ORDERS and len(old.coefficients()):
             change = new.fitted(new.coefficients() - old.coefficients())
             seen = 0.5 * float(np.ptp(estimator.does(change, start)))
-            if change.largest_piece_arcsec() > EXTRAPOLATED * seen:
+            if change.largest_piece_arcsec() > estimator.scales.extrapolated * seen:
                 result[place] = old
     return tuple(result)
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from hdbridge.diagnose.lookalikes import lookalikes
 from hdbridge.diagnose.result import Identifiability
-from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, PENALTY
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, causes
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.screening import candidates
@@ -59,7 +58,10 @@ def identifiability(
         if share < SHARE_LEFT or size <= 0.0:
             result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
             continue
-        limit = max(INFLATION * math.sqrt(PENALTY * freedom + ENTER) / size, FLOOR_ARCSEC)
+        limit = max(
+            INFLATION * math.sqrt(estimator.scales.penalty * freedom + estimator.scales.enter) / size,
+            estimator.scales.floor_arcsec,
+        )
         alike = [
             name for name in names if name != cause and _correlation(spans[cause], spans[name]) > NOT_APART
         ]

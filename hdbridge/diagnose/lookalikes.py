@@ -8,17 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.search import ENTER, FLOOR_ARCSEC, Search, cost
+from hdbridge.diagnose.search import Search
 from hdbridge.effects import CATALOGUE, MEASURED, Effect, aliases_of, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.observations.reading import third_deviation
-
-TWIN = 1e-3
-"""What follows a measured channel is the better name where it misses less than this share of the data,"""
-NOISY = 1.5
-"""... and so many times what the noise of that channel costs it."""
-SAME = 10.0
-"""Chi square that another convention may cost: what a fit leaves that has not quite converged."""
 
 
 def plausible_only(search: Search, fitted: Fitted) -> Fitted:
@@ -41,10 +34,13 @@ def plausible_only(search: Search, fitted: Fitted) -> Fitted:
         fine = [
             each
             for each in trials
-            if search.makes_sense(each.hypothesis.effects[place]) and search.peak(each, place) >= FLOOR_ARCSEC
+            if search.makes_sense(each.hypothesis.effects[place])
+            and search.peak(each, place) >= search.scales.floor_arcsec
         ]
-        best = min(fine, key=cost, default=without)
-        return plausible_only(search, best if cost(best) + ENTER < cost(without) else without)
+        best = min(fine, key=search.cost, default=without)
+        return plausible_only(
+            search, best if search.cost(best) + search.scales.enter < search.cost(without) else without
+        )
     return fitted
 
 
@@ -55,7 +51,7 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
     the channel takes from it, the wave would be a coincidence. Together the wave makes up for that noise, and
     takes most of what is the other's.
     """
-    effects = fitted.hypothesis.effects
+    effects, scales = fitted.hypothesis.effects, estimator.scales
     for place in range(base, len(effects)):
         for kind, piece in lookalikes(effects[place], estimator.data.ratio):
             others = [each for each in effects[place].pieces() if each != piece]
@@ -81,7 +77,9 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
             driven = [each for each in trial.hypothesis.effects if type(each) is kind]
             if any(each.violations() for each in driven):
                 continue
-            if worse < TWIN * own + NOISY * sum(_lost_to_noise(estimator, each) for each in driven):
+            if worse < scales.twin * own + scales.noisy * sum(
+                _lost_to_noise(estimator, each) for each in driven
+            ):
                 return trial
     return fitted
 
@@ -109,7 +107,10 @@ def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...
         if told is None:
             continue
         trial = estimator.fit(replace(fitted.hypothesis, effects=told))
-        if trial.chi_square < fitted.chi_square + SAME and not trial.hypothesis.effects[place].violations():
+        if (
+            trial.chi_square < fitted.chi_square + estimator.scales.same
+            and not trial.hypothesis.effects[place].violations()
+        ):
             return trial
     return fitted
 

@@ -26,10 +26,6 @@ HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
 LEAST_LINES = 256
 LOWEST_HZ = 0.3
 PEAKS = 3
-FOOT_LINES = 50.0
-"""Lines of the record's resolution next to a vibration that are taken for its feet."""
-LINE_OVER_MEAN = 12.0
-"""A line is looked at when its power is so many times the mean: noise alone reaches 11 in 65,000 lines."""
 
 
 def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
@@ -159,7 +155,7 @@ def tones(
     lobe = max(4, size // length * 4)
     for each in present:
         own_hz = shape_value(each, each.shape[0].name)
-        power[np.abs(frequency - own_hz) < FOOT_LINES / (length * data.period_s)] = 0.0
+        power[np.abs(frequency - own_hz) < estimator.scales.foot_lines / (length * data.period_s)] = 0.0
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= 0.0:
@@ -186,7 +182,9 @@ def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray)
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio
     power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
-    least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
+    least = (
+        estimator.scales.line_over_mean * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
+    )
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= least:

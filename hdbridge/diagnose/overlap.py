@@ -7,14 +7,8 @@ than noise speaks for.
 
 from __future__ import annotations
 
-from typing import Final
-
-from hdbridge.effects import Effect, Motion, aliases_of
-
-MOVING_SHARE: Final = 0.05
-"""Of two effects that follow the motion the smaller one needs this share of the larger one's evidence."""
-ALIAS_SHARE: Final = 0.15
-"""... and this where the two can be taken for each other."""
+from hdbridge.effects import Effect, Observations, aliases_of
+from hdbridge.estimation.scales import Scales
 
 
 def hides(one: Effect, other: Effect) -> bool:
@@ -27,14 +21,14 @@ def hides(one: Effect, other: Effect) -> bool:
     )
 
 
-def overlap(one: Effect, other: Effect, motion: Motion, ratio: float) -> float:
+def overlap(one: Effect, other: Effect, data: Observations, scales: Scales) -> float:
     """Share of the other's evidence that a finding needs, because it may look like what that leaves."""
     if one.name == other.name:
         return one.inexact
     moving = one.follows_motion() and other.follows_motion()
     if other.name in aliases_of(one.name):
-        same = one.coordinate(motion, ratio).name == other.coordinate(motion, ratio).name
+        same = one.coordinate(data.motion, data.ratio).name == other.coordinate(data.motion, data.ratio).name
         exact = one.waves() or other.waves()  # a sum of waves leaves nothing that could look like the other
         if moving or (same and not exact):
-            return ALIAS_SHARE
-    return MOVING_SHARE if moving else 0.0
+            return scales.alias_share
+    return scales.moving_share if moving else 0.0

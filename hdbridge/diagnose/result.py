@@ -14,6 +14,7 @@ from hdbridge.diagnose.residual_views import shares_by_coordinate
 from hdbridge.effects import Effect, FloatArray, Motion, Start
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.observed import means
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 
 SCHEMA = "hdbridge.diagnosis/1"
@@ -205,6 +206,8 @@ class Diagnosis:
     traces: Traces = field(repr=False)
     considered: tuple[str, ...] = ()
     """What was taken into account and not named, with the reason."""
+    scales: Scales = field(default_factory=Scales, repr=False)
+    """The numbers that decided."""
 
     def as_dict(self) -> dict[str, Any]:
         """The document for machines, schema hdbridge.diagnosis/1."""
@@ -222,6 +225,7 @@ class Diagnosis:
             },
             "remarks": list(self.remarks),
             "considered": list(self.considered),
+            "scales": self.scales.described(),
             "seen_over": shares_by_coordinate(self),
         }
 

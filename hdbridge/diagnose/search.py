@@ -1,6 +1,6 @@
 """The search for causes: screen everything, fit the best few with everything, take the best, look again.
 
-Penalty per parameter and to enter as in `PENALTY`, `ENTER`; the elastic law is chosen again after each of
+What a cause has to earn stands in `Scales`; the elastic law is chosen again after each of
 the first picks. What was picked is looked at again in `backward.py`.
 """
 
@@ -19,29 +19,10 @@ from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.screening import Candidate, Score, Screen, candidates, score_of
 
-PENALTY = 11.5
-"""Chi square that each parameter has to earn."""
-ENTER = 30.0
-"""... and each cause."""
 MOST = 6
 BEST = 3
 FEW = 3
 """So many findings are looked at again; more of them mean something that is none of them."""
-AGAIN = 1.5
-"""Chi square per point beyond which a search is made again."""
-PAIR_SHARE = 0.9
-"""Two causes at once in place of one, or none, have to leave less than this share of what it leaves."""
-FREE_LOOP_ARCSEC = 0.2
-"""Root mean square that a free-form loop has to take away to be added to the law."""
-SLOW = 0.8
-"""A third pick that leaves more than this of a large rest is the last."""
-EXTRAPOLATED = 2.0
-"""Nothing is named of which one piece is so much larger than all that is seen: pieces that cancel, or an
-order on an arc of its turn."""
-WAVE_SHARE_LEFT = 0.03
-"""A wave of which the others leave less is a twin of one of them: together they would only cancel."""
-FLOOR_ARCSEC = 0.5
-"""Findings whose peak is smaller than this are of no use to anybody, however certain."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +41,7 @@ class Search:
 
     def __init__(self, estimator: Estimator, base: Sequence[Effect]) -> None:
         self.estimator = estimator
+        self.scales = estimator.scales
         self.base = len(base)
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
@@ -86,7 +68,7 @@ class Search:
         self.estimator.loop_sign *= -1.0
         rival = self.best_addition(known) or known
         self.forget()
-        if cost(other) + ENTER < cost(rival):
+        if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
 
     def run(self) -> Trail:
@@ -96,7 +78,7 @@ class Search:
         """
         trail = self._greedily()
         names = [each.name for each in trail.fitted.hypothesis.effects[self.base :]]
-        if not names or trail.fitted.chi_square < AGAIN * len(trail.fitted.residual):
+        if not names or trail.fitted.chi_square < self.scales.again * len(trail.fitted.residual):
             return trail
         nuisance = self.estimator.nuisance
         self.estimator.nuisance = nuisance[:, :0]
@@ -105,7 +87,7 @@ class Search:
         other = self._greedily()
         self._left_out = None
         self.forget()
-        if cost(other.fitted) + ENTER < cost(trail.fitted):
+        if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
             return other
         self.estimator.nuisance = nuisance
         return trail
@@ -115,9 +97,9 @@ class Search:
         for number in range(MOST):
             found = self.best_addition(fitted)
             rival = found or fitted
-            if rival.chi_square > AGAIN * len(rival.residual):
+            if rival.chi_square > self.scales.again * len(rival.residual):
                 pair = self._best_pair(fitted)
-                if pair is not None and cost(pair) < PAIR_SHARE * cost(rival):
+                if pair is not None and self.cost(pair) < self.scales.pair_share * self.cost(rival):
                     found = pair
             if number < 3 and not self.estimator.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
@@ -127,7 +109,7 @@ class Search:
             if found is None:
                 break
             left = found.chi_square
-            slow = left > SLOW * fitted.chi_square and left > 4.0 * len(found.residual)
+            slow = left > self.scales.slow * fitted.chi_square and left > 4.0 * len(found.residual)
             fitted = found
             if number >= FEW - 1 and slow:
                 break  # piece by piece at something that is none of them
@@ -155,10 +137,10 @@ class Search:
         self.estimator.nuisance = self.estimator.free_loop(fitted.hypothesis.start)
         loose = self.estimator.fit(fitted.hypothesis)
         added = loose.free() - fitted.free()
-        gain = fitted.chi_square - loose.chi_square - PENALTY * added - ENTER
+        gain = fitted.chi_square - loose.chi_square - self.scales.penalty * added - self.scales.enter
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
         size = np.sqrt(max(gain, 0.0) / float(np.sum(self.estimator.weight**2)))
-        if gain > rival and size > FREE_LOOP_ARCSEC:
+        if gain > rival and size > self.scales.free_loop_arcsec:
             return loose
         self.estimator.nuisance = self.estimator.nuisance[:, :0]
         return None
@@ -176,7 +158,9 @@ class Search:
             trial = self.estimator.fit(joined(fitted.hypothesis, score.candidate.effect, self.base))
             trial = self._restated(trial, score.candidate.cause)
             added = trial.free() - fitted.free()
-            net = fitted.chi_square - trial.chi_square - PENALTY * max(added, 1) - ENTER
+            net = (
+                fitted.chi_square - trial.chi_square - self.scales.penalty * max(added, 1) - self.scales.enter
+            )
             key = _key(score)
             if net <= 0.0 or not self._counts(trial, score.candidate):
                 self._refused.add(key)
@@ -199,9 +183,11 @@ class Search:
             if not hides(two[0].effect, two[1].effect):
                 continue
             trial = self.estimator.fit(fitted.hypothesis.plus(two[0].effect).plus(two[1].effect))
-            if cost(fitted) - cost(trial) > 2.0 * ENTER and all(self._counts(trial, each) for each in two):
+            if self.cost(fitted) - self.cost(trial) > 2.0 * self.scales.enter and all(
+                self._counts(trial, each) for each in two
+            ):
                 pairs.append(trial)
-        return min(pairs, key=cost, default=None)
+        return min(pairs, key=self.cost, default=None)
 
     def _restated(self, trial: Fitted, cause: str) -> Fitted:
         """What was added by another of its conventions, where it makes no sense by the one it has."""
@@ -221,7 +207,7 @@ class Search:
         if not self.makes_sense(effect):
             return False
         peak = self.peak(trial, place)
-        if peak < FLOOR_ARCSEC or effect.largest_piece_arcsec() > EXTRAPOLATED * peak:
+        if peak < self.scales.floor_arcsec or effect.largest_piece_arcsec() > self.scales.extrapolated * peak:
             return False
         if Channel.TIME not in effect.needs() or effect.shows(self.estimator.motion) is None:
             return True
@@ -255,12 +241,12 @@ class Search:
             if _key(each) not in self._refused
             and each.candidate.cause not in present
             and each.candidate.cause != self._left_out
-            and not (each.candidate.effect.waves() and each.share < WAVE_SHARE_LEFT)
+            and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
         ]
-        net = {id(each): each.gain - PENALTY * each.freedom for each in scores}
+        net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
-            if net[id(each)] > ENTER:
+            if net[id(each)] > self.scales.enter:
                 best.setdefault((each.candidate.cause, each.freedom), each)
         causes = list(dict.fromkeys(cause for cause, _ in best))[:most]
         return [each for (cause, _), each in best.items() if cause in causes]
@@ -284,6 +270,10 @@ class Search:
             self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start)
         return self._screens[key]
 
+    def cost(self, fitted: Fitted) -> float:
+        """Chi square and what the parameters have to earn."""
+        return fitted.chi_square + self.scales.penalty * fitted.free()
+
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
         """Other causes in the place of one that was taken out, each fitted at its best; best first."""
         self.forget()
@@ -292,14 +282,11 @@ class Search:
             if score.candidate.cause != cause:
                 trial = self.estimator.fit(joined(without.hypothesis, score.candidate.effect, self.base))
                 other = best.get(score.candidate.cause)
-                if self._counts(trial, score.candidate) and (other is None or cost(trial) < cost(other)):
+                if self._counts(trial, score.candidate) and (
+                    other is None or self.cost(trial) < self.cost(other)
+                ):
                     best[score.candidate.cause] = trial
         return sorted(best.items(), key=lambda each: each[1].chi_square)
-
-
-def cost(fitted: Fitted) -> float:
-    """Chi square and what the parameters have to earn."""
-    return fitted.chi_square + PENALTY * fitted.free()
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:

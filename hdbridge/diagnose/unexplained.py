@@ -21,24 +21,12 @@ from hdbridge.effects import FloatArray, Part
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.path import since_reversal_deg
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.scales import Scales
 from hdbridge.units import DEG_PER_TURN
 
-LEFT_ARCSEC = 0.5
-"""More than this left in means over `BLOCK_S` is too much."""
-FAST_ARCSEC = 0.75
-"""The same for what is faster, where it is also more than the noise."""
-PLAIN_ARCSEC = 1.0
-"""More than this left (and counts, and what is left at rest) is too much even where it depends on nothing
-in particular."""
 BLOCK_S = 0.2
-SHADOW = 2.0
-"""A name is kept together with something unexplained when it takes away so many times its variance."""
 EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
-ACTS = 0.1
-"""Share of its peak from which on an effect acts."""
-NEAR = 0.4
-"""Pieces of more than this share of the largest one are nearly equal to it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,22 +78,22 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
 
 def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     """Whether more is left than nobody need explain."""
-    data = estimator.data
+    data, scales = estimator.data, estimator.scales
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
     # that.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    limit = float(np.hypot(LEFT_ARCSEC, 0.0 if data.commanded else counts))
-    if left.arcsec > limit and left.explained_arcsec > 0.5 * LEFT_ARCSEC:
+    limit = float(np.hypot(scales.left_arcsec, 0.0 if data.commanded else counts))
+    if left.arcsec > limit and left.explained_arcsec > 0.5 * scales.left_arcsec:
         return True
     # Where command and standstill distinguish noise and following error from the gear, fast things count.
     if data.commanded and data.standstill:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
-        if left.fast_arcsec > max(FAST_ARCSEC, floor) + left.standing_arcsec / 3.0:
+        if left.fast_arcsec > max(scales.fast_arcsec, floor) + left.standing_arcsec / 3.0:
             return True
-    return bool(left.arcsec > np.linalg.norm((PLAIN_ARCSEC, counts, left.standing_arcsec)))
+    return bool(left.arcsec > np.linalg.norm((scales.plain_arcsec, counts, left.standing_arcsec)))
 
 
-def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
+def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | None:
     """Several near-equal picks of one kind, more than usual: sidebands of something that is none of them."""
     for family in {each.cause for each in findings}:
         same = [each for each in findings if each.cause == family]
@@ -113,12 +101,14 @@ def many_of_one(findings: Sequence[Finding]) -> list[Finding] | None:
         if not kinds or not kinds[0].repeats:
             continue
         sizes = [piece.bound_arcsec() for each in kinds for piece in each.pieces()]
-        if sum(each > NEAR * max(sizes) for each in sizes) > kinds[0].usual:
+        if sum(each > scales.near * max(sizes) for each in sizes) > kinds[0].usual:
             return same
     return None
 
 
-def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Finding], list[str]]:
+def without_doubtful_loops(
+    findings: list[Finding], left: Rest, scales: Scales
+) -> tuple[list[Finding], list[str]]:
     """Without a change of the loop's parameters that does less than what is left, unless that is the loop's
     too.
     """
@@ -130,7 +120,7 @@ def without_doubtful_loops(findings: list[Finding], left: Rest) -> tuple[list[Fi
         and each.effect.changes is Part.LOOP
         and each.effect.part is not Part.LOOP
         and "last reversal" not in left.lives_in
-        and each.taken_arcsec**2 < SHADOW * left.arcsec**2
+        and each.taken_arcsec**2 < scales.shadow * left.arcsec**2
     ]
     words = [f"{each.cause}: does less than what is left unexplained" for each in doubtful]
     return [each for each in findings if each not in doubtful], words
@@ -154,7 +144,7 @@ def acts(estimator: Estimator, fitted: Fitted, place: int) -> NDArray[np.bool_]:
     effect = fitted.hypothesis.effects[place]
     values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
     values = np.abs(values - np.median(values))
-    return np.asarray(values > ACTS * float(np.quantile(values, 0.998)))
+    return np.asarray(values > estimator.scales.acts * float(np.quantile(values, 0.998)))
 
 
 def beyond_noise(

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
+from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.terms import Prior
 
@@ -26,10 +27,6 @@ SHAPE_SHARE: Final = 0.06
 PEAK_ARCSEC: Final = 0.1
 """... and of a coefficient at least so much at its peak in this record."""
 NORMAL_95: Final = 1.96
-CHANGE: Final = 30.0
-"""Chi square that a changed part costs, as much as a new cause,"""
-CHANGE_OF_EACH: Final = 11.5
-"""... and for each of its parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +39,12 @@ class CalibratedPart:
     """Mean and standard deviation, by number of the coefficient or name of the shape; of the logarithm of a
     logarithmic shape.
     """
+    scales: Scales
 
     @property
     def change_cost(self) -> float:
         """Chi square that the part's change costs."""
-        return CHANGE + CHANGE_OF_EACH * len(self.parameters)
+        return self.scales.enter + self.scales.penalty * len(self.parameters)
 
     def strain(self, effects: Sequence[Effect]) -> float:
         """Chi square by which the part is away from its calibration."""
@@ -66,10 +64,11 @@ def calibrated(
     effects: Sequence[Effect],
     half_widths: Mapping[str, Mapping[str, Any]],
     columns: Callable[[Effect], FloatArray],
+    scales: Scales,
 ) -> tuple[CalibratedPart, ...]:
     """The parts of a model with its 95 % half widths; ``columns``: an effect's in the record, (m, p)."""
     return tuple(
-        CalibratedPart(place, parameters)
+        CalibratedPart(place, parameters, scales)
         for place, effect in enumerate(effects)
         for parameters in _parts(effect, half_widths.get(effect.name, {}), columns(effect))
     )

@@ -19,6 +19,7 @@ from hdbridge.estimation.calibration import CalibratedPart, priors
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import IntArray, Observed, Series
+from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
 from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms
@@ -123,9 +124,11 @@ class Fitted:
 class Estimator:
     """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
 
-    def __init__(self, data: Observed) -> None:
+    def __init__(self, data: Observed, scales: Scales | None = None) -> None:
         points = data.points
         self.data = data
+        self.scales = scales or Scales()
+        """The numbers that decide what is named."""
         self.index: IntArray = np.flatnonzero(points.usable)
         self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
         self.observed: FloatArray = points.error_arcsec[self.index]

@@ -32,8 +32,8 @@ from hdbridge.daemon.adaptation.prior import bounds_arcsec, estimator_of
 from hdbridge.daemon.adaptation.proposal import changes_between
 from hdbridge.daemon.adaptation.regressors import Regressors, Term
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
-from hdbridge.diagnose.changes import CALIBRATED, LOOP_ARCSEC, LOOP_SHARE, ORDER_ARCSEC
 from hdbridge.effects import FloatArray
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 
 DAY_S: Final = 86_400.0
@@ -58,10 +58,10 @@ class Allowed:
     """How often it is asked."""
     noise: float = 1.5
     """Noise of a day at work, by that of a calibration."""
-    order_arcsec: float = ORDER_ARCSEC
-    """Least change of the orders that is one, at the load: as a diagnosis has it (`diagnose.changes`)."""
-    loop_arcsec: float = LOOP_ARCSEC
-    loop_share: float = LOOP_SHARE
+    order_arcsec: float = Scales().order_arcsec
+    """Least change of the orders that is one, at the load: as a diagnosis has it (`Scales`)."""
+    loop_arcsec: float = Scales().loop_arcsec
+    loop_share: float = Scales().loop_share
     """The same for a loop: the larger of a size and of this share of what the loop does."""
     zero_arcsec: float = 5.0
     """Least change of the zero: the least that a warm-up does (`effects.zero_drift`)."""
@@ -142,7 +142,7 @@ class Judge:
         self._calibrated = prior.covariance
         for each in regressors.terms:
             if each.effect.name not in regressors.model.uncertainty:
-                share = CALIBRATED * float(np.linalg.norm(each.effect.coefficients(), np.inf))
+                share = Scales().calibrated * float(np.linalg.norm(each.effect.coefficients(), np.inf))
                 self._calibrated[each.columns, each.columns] = share**2 * np.eye(
                     len(each.effect.coefficients())
                 )

@@ -1,0 +1,115 @@
+"""The numbers that decide what a diagnosis names, in one table, each with its unit and where it comes from.
+
+A fit has no opinion: these have. They are handed to a diagnosis and stand in its JSON, so that an answer
+says by which numbers it was reached. At its ``neutral`` value a number decides nothing; tools/ablation.py
+sets each to it in turn and counts what that costs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+BLIND = "blind suites of simulated axes"
+"""Chosen so that wrong names became rare there without a right one being lost."""
+
+
+def _scale(value: float, unit: str, neutral: float, source: str) -> Any:
+    return field(default=value, metadata={"unit": unit, "neutral": neutral, "source": source})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """The deciding numbers of a diagnosis; `described` gives their units and sources."""
+
+    # What a cause has to earn.
+    penalty: float = _scale(
+        11.5, "chi square per parameter", 0.0, "Schwarz 1978: the logarithm of 100,000 points"
+    )
+    enter: float = _scale(
+        30.0, "chi square per cause", 0.0, "2 log of 3e6 places, shapes and kinds that are looked at"
+    )
+    floor_arcsec: float = _scale(0.5, "arcsec at its peak", 0.0, "smaller ones are of no use to an axis")
+    robust: float = _scale(
+        25.0, "chi square of block sums", 0.0, "five standard deviations in independent stretches"
+    )
+    robust_more: float = _scale(
+        6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
+    )
+    named_from: float = _scale(0.3, "probability", 0.0, "below it one name in eleven was right: " + BLIND)
+    one_way: float = _scale(
+        0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
+    )
+
+    # Looking again.
+    again: float = _scale(1.5, "chi square per point", math.inf, BLIND)
+    pair_share: float = _scale(0.9, "share of the cost that two causes at once may leave", 0.0, BLIND)
+    swap: float = _scale(5.0, "chi square by which a swap has to be better", 0.0, "rounding of fits")
+    slow: float = _scale(0.8, "share of a large rest that a third cause may leave", math.inf, BLIND)
+    merged_share: float = _scale(
+        0.03, "share of what two causes explain", 0.0, "a real law differs from its formula by some 7 %"
+    )
+    moving_share: float = _scale(
+        0.05, "share of the larger one's chi square", 0.0, "... so 0.07 squared and more of it is left"
+    )
+    alias_share: float = _scale(0.15, "share of the larger one's chi square", 0.0, BLIND)
+    exactly: float = _scale(
+        1.1,
+        "chi square per point",
+        math.inf,
+        "above it more than noise is left",
+    )
+    leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
+    extrapolated: float = _scale(
+        2.0,
+        "largest piece over what is seen",
+        math.inf,
+        "pieces that cancel, an order on an arc",
+    )
+    wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
+    bend: float = _scale(0.6, "share by which a slope may differ along the way", math.inf, BLIND)
+
+    # Loops of another shape, and changes of the model's own parts.
+    free_loop_arcsec: float = _scale(0.2, "arcsec rms", 0.0, "what two laws of one loop differ by")
+    law_gain: float = _scale(60.0, "chi square", 41.5, "a cause with three parameters")
+    law_arcsec: float = _scale(0.5, "arcsec", 0.0, "as the floor")
+    loop_share: float = _scale(0.12, "share of the loop, rms", 0.0, "three calibrations of 4 %")
+    loop_arcsec: float = _scale(1.5, "arcsec", 0.5, "three times the floor")
+    calibrated: float = _scale(0.04, "share of a parameter", 0.04, "what kelvins and weeks change")
+    calibrations: float = _scale(4.0, "standard deviations", math.inf, "6 in 100,000 by chance")
+    order_share: float = _scale(0.15, "share of an order's amplitude", 0.0, "four calibrations of 4 %")
+    order_arcsec: float = _scale(0.8, "arcsec", 0.5, BLIND)
+
+    # Names that look alike.
+    in_step: float = _scale(
+        0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
+    )
+    twin: float = _scale(1e-3, "share of the data's chi square", 0.0, BLIND)
+    noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
+    same: float = _scale(10.0, "chi square", 0.0, "what a fit leaves that has not quite converged")
+    line_over_mean: float = _scale(
+        12.0, "power over the mean", 0.0, "the highest of 65,000 lines of noise alone: log 65,000 = 11"
+    )
+    foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
+
+    # What is left.
+    left_arcsec: float = _scale(0.5, "arcsec rms over 0.2 s", math.inf, "as the floor")
+    fast_arcsec: float = _scale(0.75, "arcsec rms of single points", math.inf, BLIND)
+    plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
+    shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
+    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
+    near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
+    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
+    loop_explains: float = _scale(0.3, "share of the square of what is left", 0.0, BLIND)
+
+    def described(self) -> dict[str, dict[str, float | str]]:
+        """Name, value, unit and source of each, for machines."""
+        return {
+            each.name: {
+                "value": getattr(self, each.name),
+                "unit": each.metadata["unit"],
+                "source": each.metadata["source"],
+            }
+            for each in fields(self)
+        }
