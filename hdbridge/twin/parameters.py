@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.draft import RESOLVED
 
 FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
 """The channels that a replay is held against."""
@@ -168,6 +169,11 @@ def value_in(truth: Truth, parameter: Parameter) -> float | None:
 
 def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
     """The truth with other values, by the parameters' names; what cannot be is refused as in a file."""
+    return Truth.model_validate(_with(truth, values))
+
+
+def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
+    """The content of the truth with other values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
     for name, value in values.items():
         *sections, key = BY_NAME[name].path
@@ -175,7 +181,7 @@ def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
         for section in sections:
             place = place.setdefault(section, {})
         place[key] = value
-    return Truth.model_validate(data)
+    return data
 
 
 def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
@@ -189,7 +195,20 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
 
 
 def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:
-    """The truth at coordinates of these parameters."""
-    return with_values(
-        truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)}
-    )
+    """The truth at coordinates of these parameters, with a spring no stiffer than its time step resolves.
+
+    A fit may ask for one: at a resonance of hundreds of hertz a recording does not show how stiff it is.
+    """
+    data = _with(truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)})
+    gear, load = data["gear"], data["load"]
+    later = gear.get("stiffening") or {}
+    springs = [(gear, "stiffness_nm_per_rad"), *((later, key) for key in later if "stiffness" in key)]
+    stiffest = max(float(section[key]) for section, key in springs)
+    held = sum(each["limit_nm"] / math.radians(each["travel_deg"]) for each in load.get("presliding") or ())
+    inertia, reflected = load["inertia_kg_m2"], data["motor"]["inertia_kg_m2"] * gear["ratio"] ** 2
+    left = (RESOLVED / truth.substep_s) ** 2 - held / inertia
+    share = left / (stiffest * (1.0 / inertia + 1.0 / reflected))
+    if 0.0 < share < 1.0:
+        for section, key in springs:
+            section[key] *= share
+    return Truth.model_validate(data)

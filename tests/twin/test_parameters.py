@@ -39,3 +39,11 @@ def test_coordinates_lead_there_and_back() -> None:
 def test_a_section_that_is_not_there_has_no_value() -> None:
     bare = DEMO.model_copy(update={"servo": DEMO.servo.model_copy(update={"load_feedforward": None})})
     assert value_in(bare, BY_NAME["load feed-forward"]) is None
+
+
+def test_a_fit_may_ask_for_a_stiffer_spring_than_the_time_step_resolves() -> None:
+    parameters = [BY_NAME["gear stiffness"], BY_NAME["load inertia"]]
+    stiff = [each.coordinate(value) for each, value in zip(parameters, (1e8, 0.01), strict=True)]
+    made = at_coordinates(DEMO, parameters, stiff)
+    assert made.load_.inertia_kg_m2 == pytest.approx(0.01)
+    assert made.gear.stiffness_nm_per_rad == pytest.approx(0.98**2 * made.highest_stiffness_nm_per_rad)
