@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import orthonormal
+from hdbridge.estimation.stretches import of_length, sums
 
 BLOCKS_S = (1.0, 5.0)
 LEAST_BLOCKS = 30
@@ -39,7 +39,7 @@ def robust_chi_square(
     fitted: Fitted,
     place: int,
     nuisances: FloatArray | None = None,
-    rows: NDArray[np.bool_] | None = None,
+    rows: BoolArray | None = None,
     only: int | None = None,
 ) -> float:
     """Of one effect of a hypothesis: its coefficients against zero, by the sums of their scores over
@@ -79,11 +79,13 @@ def robust_chi_square(
     result = np.inf
     scores = left * residual[:, np.newaxis]
     for longest in BLOCKS_S:
-        number = blocks(time, min(longest, estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS))
+        number = of_length(
+            time, min(longest, estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS)
+        )
         number = np.concatenate([number, number[-1] + 1 + np.arange(len(held))])
-        sums = np.stack([np.bincount(number, each) for each in scores.T], axis=1)
+        summed = sums(scores, number)
         # The noise itself is a floor: a residual may be quieter than it by luck.
-        variance = sums.T @ sums + 0.25 * gram
+        variance = summed.T @ summed + 0.25 * gram
         result = min(result, float(moment @ np.linalg.lstsq(variance, moment, rcond=1e-10)[0]))
     return result
 
@@ -142,9 +144,3 @@ def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
         np.ptp(along) > estimator.scales.bend * np.max(np.abs(along))
         and float(moment @ change) > estimator.scales.robust
     )
-
-
-def blocks(time_s: FloatArray, length_s: float) -> NDArray[np.intp]:
-    """A number per point that changes after every so many seconds; empty stretches are not counted."""
-    number = np.floor((time_s - time_s[0]) / length_s).astype(np.intp)
-    return np.asarray(np.unique(number, return_inverse=True)[1])

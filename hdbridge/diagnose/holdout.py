@@ -9,11 +9,11 @@ All of it is small-matrix algebra on the Gram matrices of the folds.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.stretches import counted, of_number
 
 FOLDS = 8
 STRETCHES = 64
@@ -29,7 +29,7 @@ def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | No
 
 
 def held_out_change(
-    estimator: Estimator, fitted: Fitted, columns: NDArray[np.intp], change_arcsec: FloatArray
+    estimator: Estimator, fitted: Fitted, columns: IntArray, change_arcsec: FloatArray
 ) -> Gain | None:
     """The same for a change within what the model has.
 
@@ -61,15 +61,12 @@ def _gain(estimator: Estimator, before: _Linear, after: _Linear) -> Gain | None:
     return Gain(OVER, FOLDS, samples, squares[0], squares[1])
 
 
-def stretches(estimator: Estimator) -> NDArray[np.intp]:
+def stretches(estimator: Estimator) -> IntArray:
     """Number of the stretch of time of each point."""
-    time = estimator.time_s
-    span = max(float(time[-1] - time[0]), 1e-9)
-    number = np.minimum((time - time[0]) / span * STRETCHES, STRETCHES - 1).astype(np.intp)
-    return np.asarray(np.unique(number, return_inverse=True)[1])
+    return counted(of_number(estimator.time_s, STRETCHES))
 
 
-def _errors(estimator: Estimator, linear: _Linear, stretch: NDArray[np.intp]) -> FloatArray:
+def _errors(estimator: Estimator, linear: _Linear, stretch: IntArray) -> FloatArray:
     """Sum of squares of each stretch, arcsec squared, with its fold left out of the fit."""
     tangent, residual, information, pull = linear
     fold = stretch % FOLDS

@@ -9,14 +9,15 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import t as student
 
-from hdbridge.diagnose.acceptance import BLOCKS_S, blocks
+from hdbridge.diagnose.acceptance import BLOCKS_S
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import Effect, FloatArray, Moves
+from hdbridge.effects import Effect, FloatArray, IntArray, Moves
+from hdbridge.estimation.calibration import NORMAL_95
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.observed import IntArray
+from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
+from hdbridge.estimation.stretches import of_length, sums
 
-NORMAL_95: Final = 1.96
 PARTS: Final = (6, 12)
 """Numbers of equal parts of a record that count as one observation each."""
 STEP_95: Final = 11.03
@@ -54,22 +55,18 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """
     tangent, residual = fitted.tangent, fitted.residual
     gram = tangent.T @ tangent + np.diag(fitted.information)
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > 1e-9 * float(values[-1])
-    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
-    inverse[np.diag(gram) <= 0.0] = 0.0
-    inverse[:, np.diag(gram) <= 0.0] = 0.0
+    directions = seen_directions(gram)
+    inverse = directions @ directions.T
     best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
     scores = tangent * residual[:, np.newaxis] + fitted.pull / len(residual)  # about their mean
 
     of_prior = inverse @ np.diag(np.maximum(fitted.information, 0.0)) @ inverse
 
     def at_least(number: IntArray, normal: bool) -> FloatArray:
-        sums, count = _sums(scores, number), int(number[-1]) + 1
-        spread = inverse @ (sums.T @ sums) @ inverse * (count / (count - 1)) + of_prior
+        summed, count = sums(scores, number), int(number[-1]) + 1
+        spread = inverse @ (summed.T @ summed) @ inverse * (count / (count - 1)) + of_prior
         if not normal:
-            share = _sums((tangent @ inverse) ** 2, number)
+            share = sums((tangent @ inverse) ** 2, number)
             carried = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
             wider = student.ppf(0.975, np.maximum(carried - 1.0, 1.0)) / NORMAL_95
             spread = spread * np.outer(wider, wider)
@@ -78,17 +75,12 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
         return np.asarray(best * np.outer(grow, grow))
 
     for length in (*BLOCKS_S, 20.0):
-        number = blocks(estimator.time_s, length)
+        number = of_length(estimator.time_s, length)
         if int(number[-1]) + 1 >= 20:
             best = at_least(number, normal=True)
     for parts in PARTS:
         best = at_least(np.arange(len(residual)) * parts // len(residual), normal=False)
     return np.asarray(best)
-
-
-def _sums(rows: FloatArray, number: IntArray) -> FloatArray:
-    """Sums of rows by their number, shape (numbers, p)."""
-    return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
 
 
 def parameters_of(

@@ -16,12 +16,11 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.nuisances import speeds_differ, swing_columns
 from hdbridge.estimation.terms import FOUND, Effort
 
-SPEEDS_DIFFER: Final = 0.1
-"""Share of the squared speed that its mean has to leave: at one speed the answer is part of the orders."""
-_RATE: Final = 30.0
-"""Radians per second, of size one in the columns."""
+UNIT_S: Final = 1.0 / 30.0
+"""Time in which the columns count: about that of a radian of the motor."""
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
@@ -29,7 +28,7 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
     What its waves shake is left out where the record has one speed only: it is part of the orders there.
     """
-    shaken = _shaken(estimator, fitted) if _speeds_differ(estimator) else np.empty((len(estimator.index), 0))
+    shaken = _shaken(estimator, fitted)
     searched = estimator.nuisance
     try:
         estimator.nuisance = shaken
@@ -43,32 +42,22 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
 
 def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
-    """In phase by the square of frequency, lagging by its cube; shape (m, 2), or (m, 0) without orders.
+    """In phase by the square of frequency, lagging by its cube; shape (m, 2).
 
-    The second is odd in the direction, as a lag is.
+    The second is odd in the direction, as a lag is. Shape (m, 0) without orders, and at one speed.
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
     waves = [wave for each in fitted.hypothesis.effects for wave in each.waves()]
-    if speed is None or not waves:
+    if speed is None or not waves or not _speeds_differ(estimator):
         return np.empty((len(estimator.index), 0))
-    rate = RAD_PER_DEG * speed / _RATE
-    columns = np.zeros((len(motion), 2))
-    for turns, amplitude_arcsec, phase_deg in waves:
-        at = RAD_PER_DEG * (turns * motion.motor_deg + phase_deg)
-        frequency = turns * rate
-        columns[:, 0] += amplitude_arcsec * frequency**2 * np.cos(at)
-        columns[:, 1] += amplitude_arcsec * frequency**3 * np.sin(at)
-    return estimator.at_points(columns)
+    angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
+    both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
+    return estimator.at_points(swing_columns(RAD_PER_DEG * speed, both, UNIT_S))
 
 
 def _speeds_differ(estimator: Estimator) -> bool:
     speed = estimator.motion.motor_speed_deg_s
-    if speed is None:
-        return False
-    squared = speed[estimator.index] ** 2
-    squared = squared[squared > 0.0]
-    if not len(squared):
-        return False
-    left = 1.0 - float(np.mean(squared)) ** 2 / float(np.mean(squared**2))
-    return left > SPEEDS_DIFFER
+    moving = np.empty(0) if speed is None else speed[estimator.index]
+    moving = moving[moving != 0.0]
+    return speeds_differ(moving, np.ones(len(moving)))

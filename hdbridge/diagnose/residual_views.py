@@ -11,17 +11,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import MEASURED, FloatArray
+from hdbridge.effects import MEASURED, BoolArray, FloatArray
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import Coordinate
+from hdbridge.estimation.stretches import of_number
 
 if TYPE_CHECKING:
     from hdbridge.diagnose.result import Diagnosis, Traces
 
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
@@ -47,7 +45,7 @@ class ResidualViews:
 
         Means are taken on every other stretch of time and judged on the rest: noise has a share of zero.
         """
-        odd = _stretches(self.time_s) % 2 == 1
+        odd = of_number(self.time_s, STRETCHES) % 2 == 1
         return {
             name: (
                 _share(each, self.given_arcsec, self.direction, odd),
@@ -97,11 +95,6 @@ def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
     order = ("motor angle", "load angle", "position", "direction")
     kept.sort(key=lambda each: order.index(each.name) if each.name in order else len(order))
     return {each.name: each for each in kept if each.varies()}
-
-
-def _stretches(time_s: FloatArray) -> IntArray:
-    span = max(float(time_s[-1] - time_s[0]), 1e-9)
-    return np.asarray(np.minimum((time_s - time_s[0]) / span * STRETCHES, STRETCHES - 1), dtype=np.intp)
 
 
 def _share(coordinate: Coordinate, y: FloatArray, direction: FloatArray, odd: BoolArray) -> float:

@@ -6,12 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hdbridge.diagnose.probability import Signs
 from hdbridge.diagnose.residual_views import shares_by_coordinate
-from hdbridge.effects import Effect, FloatArray, Motion, Start
+from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.observed import means
 from hdbridge.estimation.scales import Scales
@@ -172,13 +169,13 @@ class Traces:
     kind_number: FloatArray
     motion: Motion
     """What drove the whole record; an elastic state passes through all of it."""
-    rows: NDArray[np.intp]
+    rows: IntArray
     """Which points of ``motion`` these arrays are of."""
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
     samples: Motion
     """The same at every sample."""
-    runs: NDArray[np.intp]
+    runs: IntArray
     """First sample of each point of ``motion``."""
 
     def told(self, effect: Effect) -> FloatArray:

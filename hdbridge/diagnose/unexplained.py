@@ -12,16 +12,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from hdbridge.diagnose.holdout import stretches
 from hdbridge.diagnose.result import Finding
-from hdbridge.effects import FloatArray, Part
+from hdbridge.effects import BoolArray, FloatArray, IntArray, Part
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.path import since_reversal_deg
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.scales import Scales
+from hdbridge.estimation.stretches import of_length
 from hdbridge.units import DEG_PER_TURN
 
 BLOCK_S = 0.2
@@ -126,7 +126,7 @@ def without_doubtful_loops(
     return [each for each in findings if each not in doubtful], words
 
 
-def elsewhere(estimator: Estimator, residual: FloatArray) -> NDArray[np.bool_]:
+def elsewhere(estimator: Estimator, residual: FloatArray) -> BoolArray:
     """The points outside the tenth of the record's stretches in which most is left, shape (m,).
 
     What is left in one episode, say in small swings of a motor that sticks where it turns, casts no
@@ -139,7 +139,7 @@ def elsewhere(estimator: Estimator, residual: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(~np.isin(number, np.argsort(left)[-EPISODES // 10 :]))
 
 
-def acts(estimator: Estimator, fitted: Fitted, place: int) -> NDArray[np.bool_]:
+def acts(estimator: Estimator, fitted: Fitted, place: int) -> BoolArray:
     """The points at which an effect is a good part of what it can be, shape (m,)."""
     effect = fitted.hypothesis.effects[place]
     values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
@@ -147,13 +147,10 @@ def acts(estimator: Estimator, fitted: Fitted, place: int) -> NDArray[np.bool_]:
     return np.asarray(values > estimator.scales.acts * float(np.quantile(values, 0.998)))
 
 
-def beyond_noise(
-    estimator: Estimator, residual: FloatArray, rows: NDArray[np.bool_] | slice = slice(None)
-) -> float:
+def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:
     """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
     time_s, residual, weight = estimator.time_s[rows], residual[rows], estimator.weight[rows]
-    number = np.floor((time_s - time_s[0]) / BLOCK_S).astype(np.intp)
-    number = np.unique(number, return_inverse=True)[1]
+    number = of_length(time_s, BLOCK_S)
     count = np.bincount(number)
     mean = np.bincount(number, residual) / count
     white = np.bincount(number, 1.0 / weight**2) / count**2
@@ -182,9 +179,7 @@ def _smoothed(estimator: Estimator, residual: FloatArray) -> FloatArray:
     return np.asarray(uniform_filter1d(residual, max(1, round(0.1 / period))))
 
 
-def _gain(
-    values: FloatArray, number: NDArray[np.intp], odd: NDArray[np.bool_], bins: int
-) -> tuple[float, FloatArray]:
+def _gain(values: FloatArray, number: IntArray, odd: BoolArray, bins: int) -> tuple[float, FloatArray]:
     """Mean square that bin means from one half take away in the other, both ways round; and the bin means."""
     before = after = 0.0
     for train in (odd, ~odd):
@@ -198,7 +193,7 @@ def _gain(
     return (before - after) / len(values), np.asarray(curve)
 
 
-def _coordinates(estimator: Estimator) -> Iterator[tuple[str, NDArray[np.intp], FloatArray]]:
+def _coordinates(estimator: Estimator) -> Iterator[tuple[str, IntArray, FloatArray]]:
     """Name, bin of each point, and the middle of each bin."""
     motion, index = estimator.motion, estimator.index
     motor = motion.motor_deg[index]
@@ -231,7 +226,7 @@ def _coordinates(estimator: Estimator) -> Iterator[tuple[str, NDArray[np.intp], 
             yield channel.title, *_quantiles(values[index], 40)
 
 
-def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[NDArray[np.intp], FloatArray]:
+def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[IntArray, FloatArray]:
     low, span = float(np.min(values)), max(float(np.ptp(values)), 1e-12)
     number = np.minimum(((values - low) / span * bins).astype(np.intp), bins - 1)
     if alternate:  # bins of time that are wider than the stretches that are held out
@@ -240,7 +235,7 @@ def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[NDA
     return number, np.asarray(low + (np.arange(bins) + 0.5) * (span / bins), dtype=np.float64)
 
 
-def _quantiles(values: FloatArray, bins: int) -> tuple[NDArray[np.intp], FloatArray]:
+def _quantiles(values: FloatArray, bins: int) -> tuple[IntArray, FloatArray]:
     edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
     if len(edges) < 2:
         return np.zeros(len(values), dtype=np.intp), np.array([float(values[0])])

@@ -7,13 +7,10 @@ from enum import Enum
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects.motion import BoolArray, Channel, FloatArray, Motion
+from hdbridge.effects.motion import BoolArray, Channel, FloatArray, IntArray, Motion
 from hdbridge.effects.path import branches
 from hdbridge.units import DEG_PER_TURN
-
-IntArray = NDArray[np.intp]
 
 POINTS_PER_BIN: Final = 8
 LEAST_BINS: Final = 2

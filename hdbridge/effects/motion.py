@@ -14,6 +14,7 @@ from hdbridge.errors import InputError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 
 class Channel(Enum):

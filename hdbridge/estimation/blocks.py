@@ -13,9 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.effects.path import branches
-from hdbridge.estimation.samples import BoolArray, IntArray, Samples
+from hdbridge.estimation.samples import Samples
 from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, Motion, Start
+from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.effects.base import Memoryless, measured_by_all
 from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import Blocks
-from hdbridge.estimation.samples import IntArray, Samples
+from hdbridge.estimation.samples import Samples
 
 PART_SAMPLES = 50_000
 

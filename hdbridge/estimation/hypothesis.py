@@ -13,12 +13,12 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import savgol_filter
 
-from hdbridge.effects import Channel, Effect, FloatArray, Motion, Moves, Part, Start
+from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.noise import White
-from hdbridge.estimation.observed import IntArray, Observed, Series
+from hdbridge.estimation.observed import Observed, Series
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit

@@ -15,9 +15,8 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
-from hdbridge.estimation.samples import BoolArray, IntArray
 from hdbridge.observations.reading import median_deviation
 
 PIECES = 16

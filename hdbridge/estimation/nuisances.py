@@ -11,7 +11,7 @@ faster. Two speeds distinguish that from the orders' amplitudes; at one speed th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -102,30 +102,31 @@ def is_rounding(name: str) -> bool:
     return is_turn(name) or name.startswith(ROUNDING)
 
 
-def swing_columns(design: Design, waves: Sequence[tuple[float, FloatArray, FloatArray]]) -> FloatArray:
-    """What the load shows beyond waves of the motor angle, per ms^2 and per ms^3; shape (b, 2), arcsec.
+def swing_columns(
+    rate: FloatArray, waves: Iterable[tuple[float, FloatArray, FloatArray]], unit_s: float
+) -> FloatArray:
+    """What the load shows beyond waves of the motor angle, shape (b, 2), arcsec.
 
-    ``waves`` are orders, what they contribute to each block, (b,), and the same a quarter of a wave later.
+    Per square and cube of ``unit_s``; ``rate`` (b,) is the motor's, radians per second. ``waves`` are orders,
+    what they contribute, (b,), and the same a quarter of a wave later.
     Driven by a cos(w t) well below its natural frequency f a load on a spring with damping ratio z answers
     with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): more, and later both ways.
     """
-    rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
     columns = np.zeros((len(rate), 2))
     for order, wave, later in waves:
-        columns[:, 0] += (order * rate * 1e-3) ** 2 * wave
-        columns[:, 1] += (order * rate * 1e-3) ** 3 * later
+        columns[:, 0] += (order * rate * unit_s) ** 2 * wave
+        columns[:, 1] += (order * rate * unit_s) ** 3 * later
     return columns
 
 
-def speeds_differ(design: Design) -> float:
-    """Share of the squared speed that its mean leaves: 0 where everything moves at one speed.
+def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
+    """Whether more than `SHARE` of the squared speed is left by its mean; ``count`` (n,) samples have each.
 
     At one speed a swing of the load cannot be distinguished from the orders that shake it.
     """
-    squared = design.blocks.speed_deg_s[design.blocks.moving] ** 2
-    count = design.blocks.count[design.blocks.moving]
+    squared = speed_deg_s**2
     fourth = float(count @ squared**2)
-    return 1.0 - float(count @ squared) ** 2 / (float(np.sum(count)) * fourth) if fourth > 0.0 else 0.0
+    return fourth > 0.0 and 1.0 - float(count @ squared) ** 2 / (float(np.sum(count)) * fourth) > SHARE
 
 
 def nuisances_of(
@@ -154,7 +155,8 @@ def nuisances_of(
         names += [f"turn {number}" for number in range(column.shape[1])]
         prior += [COUNTS**-2] * column.shape[1]
     if SWING in nuisances and waves:
-        columns.append(swing_columns(design, waves))
+        rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
+        columns.append(swing_columns(rate, waves, unit_s=1e-3))
         names += [SWING, SWING_LAG]
         prior += [SWING_MS2**-2, SWING_MS3**-2]
     return Nuisances(np.concatenate(columns, axis=1), tuple(names), np.array(prior))

@@ -16,9 +16,8 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray, Motion
+from hdbridge.effects import BoolArray, FloatArray, IntArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.estimation.white_noise import noise_arcsec
 from hdbridge.observations.cuts import observed
@@ -27,9 +26,6 @@ from hdbridge.observations.kinematics import kinematics
 from hdbridge.observations.reading import Reading, quantum_deg, reading_of
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 MOST_POINTS = 100_000
 """A record of more samples is averaged,"""

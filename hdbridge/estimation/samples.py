@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray, Motion, Start
+from hdbridge.effects import BoolArray, FloatArray, IntArray, Motion, Start
 from hdbridge.effects.base import measured_by_all
 from hdbridge.effects.path import branches
 from hdbridge.errors import InputError
@@ -19,8 +18,6 @@ from hdbridge.observations.driving import driving_angle
 from hdbridge.observations.reading import quantum_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 KINDS = tuple(Kind)
 SPEED_WINDOW_S = 0.02
 """The speed of a sample is taken over this much time on either side."""

@@ -19,15 +19,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import Effect, FloatArray, refreshed
+from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray, refreshed
 from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.shapes import free_shapes, leaves, moved, shape_value, tangent, unit
 from hdbridge.estimation.terms import Column, Effort, Prior, Terms
 
-BoolArray = NDArray[np.bool_]
 DAMPING = 1e-4
 TRIES = 6
 """So often a step that does not help is shortened."""
@@ -133,7 +131,7 @@ class Solution:
         return result
 
     @property
-    def _order(self) -> NDArray[np.intp]:
+    def _order(self) -> IntArray:
         """Where the linear columns stand in the point's Gram matrix."""
         return self._fit.order(self._point)
 
@@ -368,7 +366,7 @@ class Separable:
         """Whether what effects carry of each other is what they were fitted with."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
-    def order(self, point: _Point) -> NDArray[np.intp]:
+    def order(self, point: _Point) -> IntArray:
         """Where the nuisances and the effects' coefficients, in their order, stand among the columns."""
         at = len(self.terms.nuisances.names)
         places: dict[int, range] = {}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import ValidationError
 
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.effects.base import Shape
@@ -86,15 +85,6 @@ def shape_value(effect: Effect, name: str) -> float:
         return float(getattr(effect, name))
     parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
     return float(parts[0][name])
-
-
-def is_valid(effect: Effect) -> bool:
-    """Whether the fitted parameters are ones that the effect can have."""
-    try:
-        type(effect).model_validate(effect.parameters())
-    except ValidationError:
-        return False
-    return True
 
 
 def leaves(effect: Effect, shape: Shape, move: float) -> bool:

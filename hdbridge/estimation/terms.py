@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects import Effect, FloatArray, IntArray
 from hdbridge.effects.described import Moves
 
 LOCAL = frozenset({Moves.ANYWHERE})
@@ -18,7 +17,6 @@ FOUND = LOCAL | {Moves.NEARBY}
 """... and those that a search has brought next to their best value."""
 
 Columns = Callable[[Effect], FloatArray]
-IntArray = NDArray[np.intp]
 
 
 class Weighting(Protocol):

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.observations.reading import third_deviation
 
 SEGMENTS = (128, 64, 32)
@@ -31,7 +30,7 @@ fill a third of the spectrum the deviation is found a quarter too large."""
 
 def noise_arcsec(
     error_arcsec: FloatArray,
-    still: NDArray[np.bool_],
+    still: BoolArray,
     motor_count_arcsec: float,
     load_count_arcsec: float,
     commanded: bool,
@@ -54,7 +53,7 @@ def noise_arcsec(
     return result
 
 
-def between_lines(values: FloatArray, rows: NDArray[np.bool_], starts: Sequence[int] = (0,)) -> float:
+def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (0,)) -> float:
     """Standard deviation of the white noise of ``values`` in some rows, by the level between the lines of
     their spectra; infinite where too few rows are together.
 

@@ -13,7 +13,6 @@ from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.estimation.samples import KINDS, Samples
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.shapes import is_valid
 from hdbridge.identify.figures import laps_arcsec, standing
 from hdbridge.identify.holdout import held_out
 from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths
@@ -47,7 +46,7 @@ def conclude(
     intervals = [
         each for index in range(len(solution.effects)) for each in effect_intervals(solution, index, cov)
     ]
-    effects = tuple(each for each in solution.effects if is_valid(each))
+    effects = tuple(each for each in solution.effects if not each.violations())
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
     inside = _inside_variance(design, solution, problem.nuisances.columns @ solution.nuisances)
     samples_used = float(np.sum(blocks.count))

@@ -27,7 +27,6 @@ from hdbridge.estimation.nuisances import (
 from hdbridge.estimation.samples import Samples, gather
 from hdbridge.estimation.segment import Segment
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.shapes import is_valid
 from hdbridge.identify.conclude import conclude
 from hdbridge.identify.figures import outlying
 from hdbridge.identify.intervals import covariance, effect_intervals
@@ -129,7 +128,8 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     if samples.count_deg and effects:
         nuisances += [ROUNDING, TURNS]
     fine = samples.count_deg / samples.ratio * ARCSEC_PER_DEG < SWING_COUNT_ARCSEC
-    if fine and speeds_differ(design) > SHARE:
+    moving = design.blocks.moving
+    if fine and speeds_differ(design.blocks.speed_deg_s[moving], design.blocks.count[moving]):
         nuisances.append(SWING)
     return State(design, candidates, waves, tuple(nuisances), tuple(effects), NoiseModel(1.0, 1.0))
 
@@ -156,9 +156,9 @@ def _search(state: State, warnings: list[str]) -> State:
             tried.append((*found(thin.beginning(others), effects), others))
         cost, effects, starts = min(tried, key=lambda each: each[0])
     for each in effects:
-        if not is_valid(each):
+        if each.violations():
             warnings.append(f"{each.name}: left out, the record shows it only with an impossible sign")
-    effects = tuple(each for each in effects if is_valid(each))
+    effects = tuple(each for each in effects if not each.violations())
     design = state.design.beginning(starts).blurred(effects)
     state = state._replace(design=design, effects=effects)
     problem = Problem(design, effects, columns)

@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import is_rounding
-from hdbridge.estimation.samples import KINDS, BoolArray, IntArray
+from hdbridge.estimation.samples import KINDS
 from hdbridge.estimation.segment import Kind
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.shapes import is_valid
 from hdbridge.estimation.terms import Effort
 from hdbridge.identify.problem import Problem
 from hdbridge.identify.result import HeldOut
@@ -94,7 +93,7 @@ def held_out(
 def _told(problem: Problem, fit: Solution) -> FloatArray:
     """What the effects of a fit predict, as far as a model can hold them, shape (b,)."""
     design = problem.design
-    valid = [each for each in fit.effects if is_valid(each)]
+    valid = [each for each in fit.effects if not each.violations()]
     parts = (design.columns(each, exact=False) @ each.coefficients() for each in valid)
     return np.asarray(sum(parts, start=np.zeros(len(design.blocks))))
 

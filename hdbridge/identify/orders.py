@@ -9,9 +9,8 @@ from enum import Enum
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.samples import IntArray
 
 NOT_APART = 0.95
 """Correlation above which two orders cannot be distinguished in a record."""

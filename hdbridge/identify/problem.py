@@ -12,7 +12,6 @@ import numpy as np
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.separable import Separable, Solution
-from hdbridge.estimation.shapes import is_valid
 from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting
 
 GRID_LOGARITHMIC: Final = 12
@@ -73,7 +72,7 @@ def _grid(fit: Separable, index: int, effects: Sequence[Effect]) -> list[tuple[f
         candidate = effect.fitted(effect.coefficients(), shape)
         found = fit.fit((*effects[:index], candidate, *effects[index + 1 :]), LINEAR_ONLY)
         tried[place] = found.effects[index]
-        if is_valid(tried[place]):
+        if not tried[place].violations():
             costs[place] = found.chi_square
     minima = []
     for place, candidate in tried.items():

@@ -13,7 +13,7 @@ from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.shapes import is_valid, tangent
+from hdbridge.estimation.shapes import tangent
 from hdbridge.estimation.terms import Nuisances
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, select
@@ -112,7 +112,7 @@ class State(NamedTuple):
 
     def after(self, solution: Solution) -> State:
         """With a solution's effects, and the blur that they bring."""
-        effects = tuple(each for each in solution.effects if not is_ripple(each) and is_valid(each))
+        effects = tuple(each for each in solution.effects if not is_ripple(each) and not each.violations())
         own = next(filter(is_ripple, solution.effects), None)
         return self._replace(effects=effects, design=self.design.blurred(effects), ripple=own)
 

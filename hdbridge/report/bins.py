@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose.residual_views import BoolArray, IntArray
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.effects.coordinate import Coordinate
 
 LEAST_IN_BIN: Final = 3

@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose.residual_views import BoolArray, coordinates
+from hdbridge.diagnose.residual_views import coordinates
 from hdbridge.diagnose.result import Diagnosis, Finding, Traces
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
+from hdbridge.effects import CATALOGUE, BoolArray, Effect, FloatArray, Part
 from hdbridge.effects.coordinate import Coordinate, time
 from hdbridge.model import TransmissionModel
 

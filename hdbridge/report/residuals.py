@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from hdbridge.diagnose import Traces
-from hdbridge.diagnose.residual_views import BoolArray, ResidualViews
-from hdbridge.effects import FloatArray
+from hdbridge.diagnose.residual_views import ResidualViews
+from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.effects.coordinate import Coordinate, Spacing
 from hdbridge.report.bins import binned
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned

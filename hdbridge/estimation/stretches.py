@@ -1,0 +1,28 @@
+"""Stretches of a record, numbered point by point, and what is summed over them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdbridge.effects import FloatArray, IntArray
+
+
+def of_length(time_s: FloatArray, length_s: float) -> IntArray:
+    """A number per point that changes after every so many seconds; empty stretches are not counted."""
+    return counted(np.floor((time_s - time_s[0]) / length_s).astype(np.intp))
+
+
+def of_number(time_s: FloatArray, number: int) -> IntArray:
+    """In which of so many equally long stretches of time each point lies, shape (n,)."""
+    span = max(float(time_s[-1] - time_s[0]), 1e-9)
+    return np.asarray(np.minimum((time_s - time_s[0]) / span * number, number - 1), dtype=np.intp)
+
+
+def counted(number: IntArray) -> IntArray:
+    """The same stretches, numbered without gaps."""
+    return np.asarray(np.unique(number, return_inverse=True)[1])
+
+
+def sums(rows: FloatArray, number: IntArray) -> FloatArray:
+    """Sums of rows (n, p) by their number, shape (numbers, p)."""
+    return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
