@@ -234,7 +234,7 @@ class Search:
 
         One of more parameters gains more only once its shapes are fitted.
         """
-        present = {each.name for each in fitted.hypothesis.effects if not each.repeats}
+        present = {each.name for each in fitted.hypothesis.effects if each.usual == 1}
         scores = [
             each
             for each in self._scores(fitted)

@@ -98,7 +98,7 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
     for family in {each.cause for each in findings}:
         same = [each for each in findings if each.cause == family]
         kinds = [each.effect for each in same if each.effect is not None and not each.within]
-        if not kinds or not kinds[0].repeats:
+        if not kinds or kinds[0].usual == 1:
             continue
         sizes = [piece.bound_arcsec() for each in kinds for piece in each.pieces()]
         if sum(each > scales.near * max(sizes) for each in sizes) > kinds[0].usual:

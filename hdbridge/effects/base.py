@@ -110,10 +110,10 @@ class Effect(BaseModel, ABC):
     """The part of a model that it is a change of, where it is no addition to it."""
     carries: ClassVar[Mapping[Part, str]] = {}
     """The parts that it carries a copy of, because it scales them, and the field that holds each."""
-    repeats: ClassVar[bool] = False
-    """Whether an axis may have several."""
-    usual: ClassVar[int] = 2
-    """So many nearly equal ones are nothing strange; more are one thing that is none of them."""
+    usual: ClassVar[int] = 1
+    """So many nearly equal ones an axis may have; more are one thing that is none of them. At 1 there is no
+    second.
+    """
     nonnegative: ClassVar[bool] = False
     """Whether no coefficient can be negative."""
     curved: ClassVar[bool] = False

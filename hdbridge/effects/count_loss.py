@@ -62,7 +62,7 @@ class CountLoss(Effect):
         "it cannot be foreseen, and after homing it is gone; a loss in the load encoder is no motion at all",
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
-    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.STEP
     inexact: ClassVar[float] = 0.03
     """Something slow leaves small steps next to a large one."""

@@ -76,7 +76,6 @@ class Creep(Effect):
     )
     """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
 
-    repeats: ClassVar[bool] = True
     usual: ClassVar[int] = 8
     """A real relaxation is a sum of exponentials."""
     typical: ClassVar[Mapping[str, Any]] = {

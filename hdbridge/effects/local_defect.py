@@ -63,7 +63,7 @@ class LocalDefect(Linear):
         Shape("centre_deg", 0.0, 360.0),
         Shape("half_width_deg", 0.05, 30.0, logarithmic=True),
     )
-    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.BUMP
     inexact: ClassVar[float] = 0.15
     """No damaged tooth makes just this bump."""

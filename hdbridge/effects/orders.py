@@ -49,7 +49,7 @@ Orders = Annotated[
 class OrderSeries(Effect):
     """Sum of A_k cos(k c theta_M + phi_k), where c says which angle the orders count on."""
 
-    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 2
     few: ClassVar[frozenset[int]] = frozenset()
     """The orders that make sense, where only few do."""
 

@@ -74,7 +74,7 @@ class SubdivisionalError(Effect):
         "it is an error of the measurement; to compensate it would move the load away from where it should "
         "be",
     )
-    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.LINE
     typical: ClassVar[Mapping[str, Any]] = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
     """9000 lines, as an example: the line count is a matter of search or of the data sheet."""

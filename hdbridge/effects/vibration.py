@@ -59,7 +59,7 @@ class Vibration(Effect):
     shape: ClassVar[tuple[Shape, ...]] = (
         Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),
     )
-    repeats: ClassVar[bool] = True
+    usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.TONE
     inexact: ClassVar[float] = 0.03
     """No source keeps its frequency and amplitude exactly, and the gear's loop answers with others."""
