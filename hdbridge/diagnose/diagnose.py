@@ -14,7 +14,13 @@ from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.holdout import held_out
 from hdbridge.diagnose.identifiability import identifiability
-from hdbridge.diagnose.lookalikes import as_calibrated, lookalikes, plausible_only, with_measured
+from hdbridge.diagnose.lookalikes import (
+    as_calibrated,
+    lookalikes,
+    of_one_angle,
+    plausible_only,
+    with_measured,
+)
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, Signs, weighed
@@ -341,6 +347,14 @@ class _Judge:
             proposed = [] if kind is None else [*kind.proposals(estimator.data, ())]
             near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
             if not near:
+                continue
+            if of_one_angle(estimator.data, effect, near[0]):
+                # On an arc of a turn orders cancel each other: what counts is how large they are.
+                shared = {turns for each in near for turns, _, _ in each.waves()}
+                squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
+                most = self.estimator.scales.in_step * sum(squares.values())
+                if sum(value for turns, value in squares.items() if turns in shared) > most:
+                    yield name
                 continue
             columns = np.hstack([estimator.columns(each, start) for each in near])
             left = does - columns @ np.linalg.lstsq(columns, does, rcond=1e-9)[0]

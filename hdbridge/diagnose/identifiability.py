@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.lookalikes import lookalikes
+from hdbridge.diagnose.lookalikes import lookalikes, of_one_angle
 from hdbridge.diagnose.result import Identifiability
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, causes
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -31,6 +31,7 @@ def identifiability(
 ) -> dict[str, Identifiability]:
     """For each cause of the catalogue."""
     left: dict[str, list[tuple[FloatArray, float, float, int]]] = {}
+    example: dict[str, Effect] = {}
     stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
     basis = _orthonormal(fitted.basis[::stride])
@@ -46,6 +47,7 @@ def identifiability(
         share = float(np.max(np.sum(rest**2, axis=0) / np.sum(unit**2, axis=0)))
         size = float(np.sqrt(stride * np.max(np.sum(rest**2, axis=0))))
         left.setdefault(candidate.cause, []).append((rest, share, size, rest.shape[1]))
+        example[candidate.cause] = candidate.effect
     names = list(left)
     best = {name: max(left[name], key=lambda each: each[2]) for name in names}
     spans = {name: _orthonormal(best[name][0]) for name in names}
@@ -63,7 +65,13 @@ def identifiability(
             estimator.scales.floor_arcsec,
         )
         alike = [
-            name for name in names if name != cause and _correlation(spans[cause], spans[name]) > NOT_APART
+            name
+            for name in names
+            if name != cause
+            and (
+                _correlation(spans[cause], spans[name]) > NOT_APART
+                or of_one_angle(estimator.data, example[cause], example[name])
+            )
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
     for candidate in candidates(estimator.data, ()):

@@ -11,6 +11,7 @@ import numpy as np
 from hdbridge.diagnose.search import Search
 from hdbridge.effects import CATALOGUE, MEASURED, Effect, aliases_of, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.observed import Observed
 from hdbridge.observations.reading import third_deviation
 
 
@@ -71,7 +72,11 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
                 ]
                 if not proposed:
                     continue
-                trial, neither = estimator.fit(without.plus(proposed[0])), without
+                # Each of its shapes: a spring that bends is not what a straight one leaves.
+                trials = [estimator.fit(without.plus(each)) for each in proposed]
+                fine = [each for each in trials if not each.hypothesis.effects[-1].violations()]
+                trial = min(fine or trials, key=lambda each: each.chi_square + scales.penalty * each.free())
+                neither = without
             own = estimator.fit(neither).chi_square - fitted.chi_square
             worse = trial.chi_square - fitted.chi_square
             driven = [each for each in trial.hypothesis.effects if type(each) is kind]
@@ -94,6 +99,12 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
         names = look.named_coefficients()
         result += [(CATALOGUE[name], each) for each in effect.pieces() if each.named_coefficients() == names]
     return result
+
+
+def of_one_angle(data: Observed, one: Effect, other: Effect) -> bool:
+    """Whether two kinds are waves over the same angle: no record distinguishes orders that both may have."""
+    same = one.coordinate(data.motion, data.ratio).name == other.coordinate(data.motion, data.ratio).name
+    return bool(same and one.waves() and other.waves() and other.name in aliases_of(one.name))
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:

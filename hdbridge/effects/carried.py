@@ -47,7 +47,7 @@ def loop_of(base: Iterable[Effect]) -> Loop:
     """The loop of a model's elastic law, whichever it is; a typical one where it has none."""
     for each in base:
         if isinstance(each, Hysteresis | HysteresisMemory):
-            return Loop(**each.parameters(), memory=isinstance(each, HysteresisMemory))
+            return Loop.model_construct(**each.parameters(), memory=isinstance(each, HysteresisMemory))
     return TYPICAL_LOOP
 
 

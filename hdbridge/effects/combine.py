@@ -72,9 +72,12 @@ def _refreshed(
 
 
 def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
-    """What can stand in the place of an effect, with its parameters; see `Effect.replaces`."""
+    """What can stand in the place of an effect, with its parameters; see `Effect.replaces`.
+
+    A fit may have led them out of their ranges: as with `fitted`, `violations` says so.
+    """
     return tuple(
-        kind.model_validate(effect.parameters())
+        kind.model_construct(**effect.parameters())
         for kind in kinds
         if kind.replaces == effect.name or effect.replaces == kind.name
     )

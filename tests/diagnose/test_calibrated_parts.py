@@ -10,6 +10,7 @@ import pytest
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.estimation.calibration import calibrated
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
@@ -79,6 +80,7 @@ def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> N
         model.effects,
         {"hysteresis": {"offset_arcsec": 3.92, "width_deg": 1.96}},
         lambda effect: np.ones((5, len(effect.coefficients()))),
+        Scales(),
     )
     (of_loop,) = (each for each in parts if each.place == loop)
     width_deg = model.effects[loop].parameters()["width_deg"]
