@@ -36,7 +36,10 @@ class Loop(BaseModel):
     def law(self) -> Hysteresis | HysteresisMemory:
         """The effect with these parameters."""
         kind = HysteresisMemory if self.memory else Hysteresis
-        return kind(offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent)
+        # Within a fit it may be out of its range, as what it was copied from.
+        return kind.model_construct(
+            offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent
+        )
 
 
 TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
