@@ -76,6 +76,14 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     assert after < 0.4 * before
 
 
+@pytest.mark.xfail(strict=True, reason="a straight drag is refused as implausible before it can be an alias")
+def test_a_drag_that_is_a_straight_line_in_speed_is_an_alias_of_a_delay(
+    joints: dict[int, list[Record]],
+) -> None:
+    named = names(diagnose(concatenate(joints[4][1:]), NOTHING, independent_zeros=True))
+    assert "velocity_windup" in named["channel_skew"]
+
+
 @pytest.mark.parametrize("folder", ["cobot", "cobot-command"])
 @pytest.mark.parametrize(
     ("joint", "cause", "least_arcsec"), [(4, "channel_skew", 14.0), (5, "compliance", 10.0)]
