@@ -22,6 +22,18 @@ FINDER = Path(__file__).parents[2] / "tools" / "chromium.sh"
 PATIENCE_S = 30.0
 """For what a page does: far more than it needs, on a machine that stalls."""
 
+DROPPED = (
+    "Inspected target navigated or closed",
+    "Execution context was destroyed.",
+    "Cannot find context with specified id",
+    "Cannot find default execution context",
+)
+"""What Chromium answers to an expression whose document went away before it was known."""
+
+
+class Navigated(AssertionError):
+    """The page went to another document before an expression had its value."""
+
 
 class Page:
     """One page of the browser."""
@@ -43,6 +55,8 @@ class Page:
         while True:
             message = json.loads(self._line.recv(timeout=PATIENCE_S))
             if message.get("id") == self._asked:
+                if message.get("error", {}).get("message") in DROPPED:
+                    raise Navigated(message["error"]["message"])
                 assert "error" not in message, message["error"]
                 return message.get("result", {})
             self._note(message.get("method", ""), message.get("params", {}))
@@ -67,16 +81,33 @@ class Page:
         self.call("Page.navigate", url=url)
         self.until("document.readyState === 'complete'")
 
+    def reload(self) -> None:
+        """Load the page again, and wait until it is another document."""
+        self.evaluate("window.hasBeenReloaded = false")
+        self.call("Page.reload")
+        self.until("window.hasBeenReloaded === undefined && document.readyState === 'complete'")
+
     def evaluate(self, expression: str) -> Any:
         """The value of an expression in the page; a promise is awaited."""
         answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
+    def _settled(self, expression: str) -> Any:
+        """The value of an expression, or None where the document went away before it was known."""
+        try:
+            return self.evaluate(expression)
+        except Navigated:
+            return None
+
     def until(self, condition: str) -> Any:
-        """Wait until an expression is true in the page; its value."""
+        """Wait until an expression is true in the page; its value.
+
+        The page may be on its way to another document meanwhile: Chromium then drops what it was asked,
+        which answers nothing, so it is asked again.
+        """
         end = time.monotonic() + PATIENCE_S
-        while not (value := self.evaluate(condition)):
+        while not (value := self._settled(condition)):
             assert time.monotonic() < end, f"never became true: {condition}; complaints: {self.complaints}"
             time.sleep(0.05)
         return value

@@ -155,10 +155,17 @@ def event(number, text):
     return Event(sequence=number, kind=EventKind.NOTE, date="2025-01-31T12:00:00Z", text=text)
 
 
+def test_what_chromium_drops_while_a_page_goes_away_is_asked_again(place, chromium):
+    for _ in range(20):
+        chromium.evaluate("void setTimeout(() => location.reload(), 5)")
+        assert chromium.until("new Promise(done => setTimeout(() => done(true), 20))") is True
+
+
 def test_without_its_token_the_page_asks_for_it(place, bridge, chromium):
     chromium.open("about:blank")
     chromium.open(f"http://127.0.0.1:{place.port}/")
-    chromium.evaluate("sessionStorage.clear(), location.reload()")
+    chromium.evaluate("sessionStorage.clear()")
+    chromium.reload()
     chromium.until("document.querySelector('#token-form')?.hidden === false")
     chromium.evaluate(f"document.querySelector('#token').value = {json.dumps(TOKEN)}")
     chromium.evaluate("document.querySelector('#token-form').requestSubmit()")
