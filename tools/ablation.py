@@ -22,8 +22,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
-from diagnose_trials import CAUSES, drawn
 from support import plant
+from support.trials import CAUSES, drawn
 
 from hdbridge.diagnose import diagnose
 from hdbridge.estimation.scales import Scales

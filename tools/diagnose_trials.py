@@ -12,121 +12,10 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support import plant
+from support.trials import CAUSES, NONE, PAIRS, SPECIAL, UNKNOWN, planted, verdict
 
 from hdbridge.diagnose import diagnose
-from hdbridge.model import TransmissionModel
-from hdbridge.records.record import Record
-
-SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
-
-
-def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
-    """An effect of about three arcsec and more, and what the axis needs for it."""
-    size = float(3.0 * (1 + rng.random()) * rng.choice([-1, 1]))
-    phase = float(rng.uniform(0, 360))
-    big = abs(size)
-    options: dict[str, tuple[dict[str, object], dict[str, object]]] = {
-        "motor_order": ({"orders": [(int(rng.choice([5, 7, 10, 12])), big, phase)]}, {}),
-        "motor_encoder_eccentricity": ({"orders": [(1, big, phase)]}, {}),
-        "load_order": ({"orders": [(1, 2 * big, phase), (2, big, phase + 50)]}, {}),
-        "flexspline_order": ({"orders": [(2, big, phase)]}, {}),
-        "direction_phase": ({"shift": float(rng.uniform(2.5, 5))}, {}),
-        "torque_modulation": ({"growth": float(rng.uniform(0.03, 0.05))}, {"torque_nm": 9.0}),
-        "compliance": ({"c1": 0.3 * big, "c2": 0.2 * big, "t1": 4.0}, {"torque_nm": 9.0}),
-        "inertial_windup": ({"s2": 2e-5 * big}, {}),
-        "velocity_windup": ({"coulomb": 0.4 * big, "viscous": 0.008 * big, "shear": 400.0}, {}),
-        "channel_skew": ({"ms": 0.04 * size}, {}),
-        "backlash": ({"gap": 2 * big}, {}),
-        "rate_dependence": ({"growth": 0.02 * big, "reference": 25.0}, {}),
-        "subdivisional_error": (
-            {"lines": int(rng.integers(3000, 20000)), "orders": [(1, big, phase), (2, 0.4 * big, 10.0)]},
-            {},
-        ),
-        "zero_drift": ({"size": 2 * size, "tau": float(rng.uniform(0.2, 0.8))}, {}),
-        "amplitude_drift": (
-            {"ripple": 0.004 * size, "friction": -0.003 * size},
-            {"temperature_rise_k": 14.0},
-        ),
-        "wear": ({"growth": 4 * big}, {}),
-        "creep": ({"size": size, "tau": float(rng.uniform(1, 12))}, {}),
-        "ratio_error": ({"ramp": 0.2 * size}, {}),
-        "count_loss": ({"size": size, "at": float(rng.uniform(0.15, 0.85))}, {}),
-        "vibration": ({"size": big, "hz": float(rng.uniform(0.8, 11))}, {}),
-        "local_defect": (
-            {"size": 1.5 * size, "at": float(rng.uniform(30, 330)), "width": float(rng.uniform(1, 3))},
-            {},
-        ),
-    }
-    effect, axis = options[cause]
-    return {cause: effect}, axis
-
-
-CAUSES = [
-    "motor_order",
-    "motor_encoder_eccentricity",
-    "load_order",
-    "flexspline_order",
-    "direction_phase",
-    "torque_modulation",
-    "compliance",
-    "inertial_windup",
-    "velocity_windup",
-    "channel_skew",
-    "backlash",
-    "rate_dependence",
-    "subdivisional_error",
-    "zero_drift",
-    "amplitude_drift",
-    "wear",
-    "creep",
-    "ratio_error",
-    "count_loss",
-    "vibration",
-    "local_defect",
-]
-SPECIAL = ("hysteresis_memory", "hysteresis_parameters")
-NONE = ("none", "none:memory", "none:bouc_wen", "none:dahl")
-UNKNOWN = tuple(f"unknown:{kind}" for kind in ("saw", "square", "chirp", "one_way", "beat", "bursts"))
-PAIRS = (
-    "load_order+backlash", "motor_order+zero_drift", "compliance+load_order", "count_loss+ratio_error",
-    "direction_phase+creep", "local_defect+velocity_windup",
-    "channel_skew+vibration", "flexspline_order+wear",
-)  # fmt: skip
-LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
-
-
-def planted(
-    name: str, seed: int, plan: plant.Plan | None = None
-) -> tuple[set[str], Record, TransmissionModel]:
-    """What is there, the record, and the model that is put to the test."""
-    rng = np.random.default_rng(1000 * seed + 17)
-    effects: dict[str, dict[str, object]] = {}
-    axis: dict[str, object] = {}
-    there: set[str] = set()
-    nominal = plant.Truth()
-    if name.startswith("none"):
-        axis["law"] = name.partition(":")[2] or "plain"
-    elif name.startswith("unknown"):
-        effects["unknown"] = {"kind": name.partition(":")[2], "size": float(rng.uniform(3, 6))}
-        there = {"unexplained"}
-    elif name == "hysteresis_memory":
-        axis["law"], there = "memory", {name}
-    elif name == "hysteresis_parameters":
-        axis |= {"offset": 40 * float(rng.choice([0.82, 1.2])), "width": 20 * float(rng.uniform(0.9, 1.2))}
-        there = {name}
-    else:
-        for each in name.split("+"):
-            effect, needs = drawn(each, rng)
-            effects |= effect
-            axis |= needs
-            there.add(each)
-    truth = plant.Truth(effects=effects, **axis)  # type: ignore[arg-type]
-    columns = plant.record(truth, plan or plant.Plan(), seed)
-    return there, Record(columns), TransmissionModel.from_text(plant.model_text(seed, truth=nominal))
 
 
 def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], float, dict[str, object]]:
@@ -161,22 +50,7 @@ def main() -> None:
         for seed in range(first, last + 1):
             there, findings, seconds, result = trial(name, seed)
             found = {str(each["cause"]): set(each["aliases"]) for each in findings}  # type: ignore[call-overload]
-            right = sum(
-                any(
-                    each == cause or each in aliases or cause in SYNONYMS.get(each, ())
-                    for cause, aliases in found.items()
-                )
-                for each in there
-            )
-            allowed = there | {other for each in there for other in SYNONYMS.get(each, ())}
-            wrong = [
-                cause
-                for cause, aliases in found.items()
-                if cause not in allowed
-                and not aliases & there
-                and cause != "unexplained"
-                and not (cause in LOOPS and (name.startswith("none:") or LOOPS & there))
-            ]
+            judged = verdict(name, there, found)
             group = (
                 "pair"
                 if "+" in name
@@ -187,12 +61,12 @@ def main() -> None:
             group = "none other law" if name.startswith("none:") else group
             tally = counts.setdefault(group, [0, 0, 0, 0, 0])
             tally[0] += 1
-            tally[1] += right == len(there)
-            tally[2] += bool(wrong)
-            tally[3] += bool(found.get("unexplained") is not None)
-            tally[4] += bool(found) and next(iter(found)) in allowed
+            tally[1] += judged.all_right
+            tally[2] += bool(judged.wrong)
+            tally[3] += judged.unexplained
+            tally[4] += judged.first_right
             words = "; ".join(map(_words, findings))
-            good = "ok  " if right == len(there) and not wrong else "BAD "
+            good = "ok  " if judged.all_right and not judged.wrong else "BAD "
             before, after = (result[each]["rms_arcsec"] for each in ("refitted", "extended"))  # type: ignore[index]
             print(
                 f"{name:32s} {seed} {good} {words}  rms {before:.3g}->{after:.3g} {seconds:.0f}s", flush=True

@@ -21,8 +21,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from diagnose_trials import CAUSES, NONE, PAIRS, SPECIAL, SYNONYMS, UNKNOWN, plant, planted
 from scipy.optimize import minimize
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.diagnose.probability import COEFFICIENTS, LEAST, MOST
@@ -36,8 +38,6 @@ FREE = frozenset({"constant", "within"})
 AGAINST = frozenset({"excess", "free_loop", "unexplained", "not_recovered"})
 PRIOR = {"not_recovered": -2.5, "unexplained": -1.0}
 """What the ridge draws to where these records say little; else to nought."""
-LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
-SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
 Row = dict[str, Any]
 

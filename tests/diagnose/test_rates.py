@@ -1,0 +1,76 @@
+"""How often a hidden cause is named first, and how often something is named that is not there.
+
+One record says little: what is claimed is a rate, and what is counted over records drawn at random has to be
+as large as that rate allows. A few in every run; more of them in the slow tests, and in the blind suites.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+from support.rates import least
+from support.trials import CAUSES, NONE, PAIRS, SHORT, SPECIAL, UNKNOWN, Verdict, planted, verdict
+
+from hdbridge.diagnose import diagnose
+
+MORE = range(2, 5)
+"""Seeds of the slow tests."""
+
+
+def judged(names: Iterable[str], seeds: Iterable[int]) -> dict[str, Verdict]:
+    """Each name hidden once with each seed."""
+    verdicts = {}
+    for name in names:
+        for seed in seeds:
+            there, record, model = planted(name, seed, SHORT)
+            found = diagnose(record, model).findings
+            verdicts[f"{name} {seed}"] = verdict(
+                name, there, {each.cause: set(each.aliases) for each in found}
+            )
+    return verdicts
+
+
+def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
+    """Whether as many are ``good`` (a member of `Verdict`, or ``silent``) as the rate allows."""
+    bad = [
+        (name, each)
+        for name, each in verdicts.items()
+        if not (not each.wrong if good == "silent" else getattr(each, good))
+    ]
+    assert len(verdicts) - len(bad) >= least(len(verdicts), rate), bad
+
+
+@pytest.mark.parametrize("third", range(3))
+def test_a_hidden_cause_is_named_first(third: int) -> None:
+    verdicts = judged(CAUSES[third::3], [1])
+    holds(verdicts, 0.95, "first_right")
+    holds(verdicts, 0.95, "silent")
+
+
+def test_what_the_catalogue_does_not_have_is_unexplained() -> None:
+    holds(judged(UNKNOWN[::2], [1]), 0.9, "unexplained")
+
+
+def test_where_nothing_is_hidden_nothing_is_named() -> None:
+    holds(judged(NONE[::2], [1]), 0.98, "silent")
+
+
+@pytest.mark.slow
+def test_the_rates_over_all_causes() -> None:
+    verdicts = judged([*CAUSES, *SPECIAL], MORE)
+    holds(verdicts, 0.95, "first_right")
+    holds(verdicts, 0.95, "silent")
+
+
+@pytest.mark.slow
+def test_two_at_once() -> None:
+    verdicts = judged(PAIRS, MORE)
+    holds(verdicts, 0.9, "all_right")
+    holds(verdicts, 0.9, "silent")
+
+
+@pytest.mark.slow
+def test_nothing_and_what_nobody_knows() -> None:
+    holds(judged(NONE, MORE), 0.98, "silent")
+    holds(judged(UNKNOWN, MORE), 0.9, "unexplained")

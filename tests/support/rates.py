@@ -1,0 +1,13 @@
+"""A claimed rate against what was counted."""
+
+from __future__ import annotations
+
+from scipy.stats import binom
+
+CHANCE = 0.01
+"""Of a right claim to be refused."""
+
+
+def least(trials: int, rate: float) -> int:
+    """So many successes at least: fewer have a probability below `CHANCE` where the rate is as claimed."""
+    return int(binom.ppf(CHANCE, trials, rate))
