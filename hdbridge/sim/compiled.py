@@ -251,7 +251,8 @@ _UNIONS: Final[dict[Any, Any]] = {}
 
 
 def _register() -> None:
-    """Tell numba the methods of all classes."""
+    """Tell numba the methods of all classes, and what to call the code that it makes of them."""
+    types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]
     declared = {name for cls in STATES for name in _attributes(cls)}
     for cls in STATES:
         for name, method in inspect.getmembers(cls, inspect.isfunction):
@@ -269,6 +270,15 @@ def _register() -> None:
     context = cpu_target.typing_context
     context.refresh()
     context._attributes[types.Record].sort(key=lambda each: isinstance(each, RecordAttribute))
+
+
+def _name_in_code(record: types.Record) -> tuple[str, tuple[str]]:
+    """What a record is called in the names of compiled functions: by what is in it.
+
+    numba itself counts the types of each process. Two layouts that were compiled by two processes then have
+    the same name, and a process that loads both from disk runs the code of one on the data of the other.
+    """
+    return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:32],)
 
 
 _KNOWN: Final[dict[str, int]] = {}
