@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hdbridge.axis import AxisConfig
+from hdbridge.sim.truth.resonance import Resonance
 from hdbridge.units import ARCSEC_PER_DEG
 
 ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
@@ -87,15 +88,14 @@ class Draft:
     @property
     def highest_stiffness_nm_per_rad(self) -> float:
         """The stiffest spring that the plant's shortest time step resolves, with half of that to spare."""
-        reflected: float = self.data["motor"]["inertia_kg_m2"] * self.ratio**2
-        return float(0.5 / (SHORTEST_MS / 1e3) ** 2 / (1.0 / self.load["inertia_kg_m2"] + 1.0 / reflected))
+        return Resonance.of({**self.data, "load": {**self.load, "presliding": ()}}).stiffest_nm_per_rad(
+            math.sqrt(0.5) / (SHORTEST_MS / 1e3)
+        )
 
     @property
     def spare_stiffness_nm_per_rad(self) -> float:
         """How stiff sliders may hold the load, for its resonance to be resolved by the present time step."""
-        inertia, reflected = self.load["inertia_kg_m2"], self.data["motor"]["inertia_kg_m2"] * self.ratio**2
-        fastest = RESOLVED / (self.data["substep_ms"] / 1e3)
-        return float(inertia * fastest**2 - self.stiffness_nm_per_rad * (1.0 + inertia / reflected))
+        return Resonance.of(self.data).most_held_nm_per_rad(RESOLVED / (self.data["substep_ms"] / 1e3))
 
     def finish(self) -> None:
         """Tell the drive of its load, and let the time step resolve the resonance."""
@@ -107,20 +107,9 @@ class Draft:
                 "frequency_hz": min(500.0, max(1.0, turn / math.tau)),
                 "damping_ratio": min(2.0, self.gear["damping_nm_s_per_rad"] / (2.0 * load * turn)),
             }
-        fastest = self._fastest_rad_s()
+        fastest = Resonance.of(self.data).rad_s
         while fastest * self.data["substep_ms"] / 1e3 > RESOLVED and self.data["substep_ms"] > SHORTEST_MS:
             self.data["substep_ms"] = max(SHORTEST_MS, 0.5 * self.data["substep_ms"])
-
-    def _fastest_rad_s(self) -> float:
-        """The highest resonance, as the truth file reckons it."""
-        later = self.gear.get("stiffening") or {}
-        stages = (later.get(f"{stage}_stiffness_nm_per_rad", 0.0) for stage in ("second", "third"))
-        stiffest = max(self.stiffness_nm_per_rad, *stages)
-        held = (
-            each["limit_nm"] / math.radians(each["travel_deg"]) for each in self.load.get("presliding", ())
-        )
-        reflected = self.data["motor"]["inertia_kg_m2"] * self.ratio**2
-        return math.sqrt((stiffest + sum(held)) / self.load["inertia_kg_m2"] + stiffest / reflected)
 
 
 SHORTEST_MS = 0.0625

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.resonance import Resonance
 from hdbridge.twin.draft import RESOLVED
 
 FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
@@ -200,14 +201,11 @@ def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequenc
     A fit may ask for one: at a resonance of hundreds of hertz a recording does not show how stiff it is.
     """
     data = _with(truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)})
-    gear, load = data["gear"], data["load"]
+    gear = data["gear"]
     later = gear.get("stiffening") or {}
     springs = [(gear, "stiffness_nm_per_rad"), *((later, key) for key in later if "stiffness" in key)]
-    stiffest = max(float(section[key]) for section, key in springs)
-    held = sum(each["limit_nm"] / math.radians(each["travel_deg"]) for each in load.get("presliding") or ())
-    inertia, reflected = load["inertia_kg_m2"], data["motor"]["inertia_kg_m2"] * gear["ratio"] ** 2
-    left = (RESOLVED / truth.substep_s) ** 2 - held / inertia
-    share = left / (stiffest * (1.0 / inertia + 1.0 / reflected))
+    fastest = Resonance.of(data)
+    share = fastest.stiffest_nm_per_rad(RESOLVED / truth.substep_s) / fastest.stiffness_nm_per_rad
     if 0.0 < share < 1.0:
         for section, key in springs:
             section[key] *= share

@@ -18,6 +18,7 @@ from hdbridge.sim.truth.gear import TrueGear
 from hdbridge.sim.truth.load import TrueLoad
 from hdbridge.sim.truth.motor import TrueMotor, TrueServo
 from hdbridge.sim.truth.part import Part
+from hdbridge.sim.truth.resonance import Resonance
 
 
 class TrueTemperature(Part):
@@ -94,10 +95,19 @@ class Truth(Part):
         return math.sqrt(self.gear.stiffness_nm_per_rad / self.load_.whole_inertia_kg_m2) / math.tau
 
     @property
+    def resonance(self) -> Resonance:
+        """The fastest one."""
+        return Resonance(
+            self.gear.stiffest_nm_per_rad,
+            math.degrees(self.load_.presliding_nm_per_deg),
+            self.load_.inertia_kg_m2,
+            self.motor.inertia_kg_m2 * self.gear.ratio**2,
+        )
+
+    @property
     def highest_stiffness_nm_per_rad(self) -> float:
         """The stiffest spring whose resonance the time step resolves."""
-        reflected = self.motor.inertia_kg_m2 * self.gear.ratio**2
-        return 1.0 / (self.substep_s**2 * (1.0 / self.load_.whole_inertia_kg_m2 + 1.0 / reflected))
+        return self.resonance.stiffest_nm_per_rad(1.0 / self.substep_s)
 
     @model_validator(mode="after")
     def _intervals_are_intervals(self) -> Self:
@@ -108,10 +118,7 @@ class Truth(Part):
 
     @model_validator(mode="after")
     def _step_resolves_the_spring(self) -> Self:
-        reflected = self.motor.inertia_kg_m2 * self.gear.ratio**2
-        stiffness = self.gear.stiffest_nm_per_rad
-        held = stiffness + math.degrees(self.load_.presliding_nm_per_deg)
-        fastest = math.sqrt(held / self.load_.inertia_kg_m2 + stiffness / reflected)
+        fastest = self.resonance.rad_s
         if fastest * self.substep_s > 1.0:
             raise wrong(
                 f"{self.substep_ms:g} ms is too long for a resonance of {fastest / math.tau:.0f} Hz; "
