@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Self
@@ -48,6 +49,15 @@ class Replays:
 def _begin(data: Data) -> None:
     global _data  # noqa: PLW0603 - a process's own, set once where it begins
     _data = data
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Ends this process when the one that began it has been killed: it would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # a worker has one
+    parent.join()
+    os._exit(1)
 
 
 def _residuals(truth: Truth) -> dict[str, FloatArray]:
