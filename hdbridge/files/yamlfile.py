@@ -193,6 +193,10 @@ class Hex(int):
     """An integer that is written in hexadecimal: object indices, vendor and product numbers."""
 
 
+class Line(list[Any]):
+    """A list that is written in one line: a row of a table, an interval."""
+
+
 class _Dumper(yaml.SafeDumper):
     """Quotes whatever either dialect, 1.1 or 1.2, would read as something other than text."""
 
@@ -214,6 +218,9 @@ for _tag, _pattern, _first in (
 _Dumper.add_representer(
     Hex, lambda dumper, data: dumper.represent_scalar("tag:yaml.org,2002:int", f"{data:#x}")
 )
+_Dumper.add_representer(
+    Line, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+)
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
@@ -233,7 +240,7 @@ _Dumper.add_multi_representer(object, _plain)
 
 
 def dump_yaml(data: Any) -> str:
-    """Plain data (dicts, lists, scalars) as YAML: block style, keys in the order given, numbers exact."""
+    """Plain data (dicts, lists, scalars) as YAML: in block style but for `Line`, in order, numbers exact."""
     text: str = yaml.dump(
         data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=100000
     )

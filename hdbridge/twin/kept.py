@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.errors import InputError
 from hdbridge.files.profile import TWIN_NAME
-from hdbridge.files.yamlfile import Hex, dump_yaml, write_atomically
+from hdbridge.files.yamlfile import Hex, Line, dump_yaml, write_atomically
 from hdbridge.model.binding import binding, check_binding
 from hdbridge.model.file import Provenance
 from hdbridge.model.store import Store
@@ -76,11 +76,16 @@ class KeptTwin:
     def dump(self) -> str:
         """The file's text; what it says reads back exactly, and what is as usual is left out."""
         data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
-        drive = data.get("provenance", {}).get("drive")
+        provenance = data.get("provenance", {})
+        drive, about = provenance.get("drive"), provenance.get("fit")
         if isinstance(drive, dict):
-            data["provenance"]["drive"] = {
+            provenance["drive"] = {
                 name: Hex(value) if isinstance(value, int) else value for name, value in drive.items()
             }
+        if isinstance(about, dict) and "covariance" in about:
+            provenance["fit"] = {**about, "covariance": [Line(row) for row in about["covariance"]]}
+        if "intervals" in data:
+            data["intervals"] = {place: Line(pair) for place, pair in data["intervals"].items()}
         return HEADER + dump_yaml(data)
 
     def save(self, path: Path | str) -> None:

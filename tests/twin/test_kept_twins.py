@@ -61,6 +61,27 @@ def test_what_a_twin_says_reads_back_exactly(profile: Path) -> None:
     assert "serial: 0x11" in (profile / "pending-twin.yaml").read_text()
 
 
+def test_a_twin_has_a_line_for_each_interval_and_for_each_row_of_the_covariance(profile: Path) -> None:
+    rows = [[1e-05, -2.5e-07], [-2.5e-07, 0.0400001]]
+    fit = {"parameters": ["Coulomb friction", "load inertia"], "covariance": rows, "noise": {}}
+    twin = twin_of(profile).told(fit=fit)
+    lines = [each.strip() for each in twin.dump().splitlines()]
+    assert sum(each.startswith("motor.coulomb_nm: [0.045") for each in lines) == 1
+    assert "- [1.0e-05, -2.5e-07]" in lines, lines[-12:]
+    twin.save(profile / "twin.yaml")
+    assert KeptTwin.load(profile / "twin.yaml").provenance["fit"] == fit
+
+
+def test_a_twin_that_was_kept_with_a_line_for_each_number_reads_as_before(profile: Path) -> None:
+    text = KeptTwin(Truth.load(profile)).dump()
+    text += "intervals:\n  motor.coulomb_nm:\n    - 0.03\n    - 0.04\n"
+    text += "provenance:\n  fit:\n    covariance:\n      -\n        - 0.1\n        - 0.2\n"
+    (profile / "twin.yaml").write_text(text)
+    kept = KeptTwin.load(profile / "twin.yaml")
+    assert kept.truth.intervals == {"motor.coulomb_nm": (0.03, 0.04)}
+    assert kept.provenance["fit"]["covariance"] == [[0.1, 0.2]]
+
+
 def test_a_twin_of_another_drive_or_gear_is_refused(profile: Path) -> None:
     TWINS.propose(profile, twin_of(profile), "", DATE, SERIAL)
     with pytest.raises(InputError, match="this twin was made for serial 0x11"):
