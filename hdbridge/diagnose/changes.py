@@ -16,6 +16,7 @@ from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import Trail
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
+from hdbridge.estimation.calibration import variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
 
@@ -162,6 +163,7 @@ def _orders(
     columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     changed: list[tuple[Effect, Effect]] = []
     kept: list[int] = []
+    calibration: list[FloatArray] = []
     for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
         before, after = old.coefficients(), new.coefficients()
         pair = [columns[each] for each in named.columns]
@@ -175,6 +177,7 @@ def _orders(
             continue
         changed.append((old, new))
         kept += pair
+        calibration.append(variances(estimator.calibrated, place, named.columns))
     if not changed:
         return None
     change = now.fitted(now.coefficients() - given.coefficients())
@@ -188,7 +191,9 @@ def _orders(
     parameters: dict[str, Parameter] = {}
     for i, named in enumerate(difference.named_coefficients()):
         pair = kept[2 * i : 2 * i + 2]
-        parameters |= polar(named.name, values[list(named.columns)], spread[np.ix_(pair, pair)])
+        # What it has changed from was itself known to its calibration only.
+        apart = spread[np.ix_(pair, pair)] + np.diag(calibration[i])
+        parameters |= polar(named.name, values[list(named.columns)], apart)
     moved = estimator.columns(difference, fitted.hypothesis.start) @ values
     cause, aliases = causes[0].name, tuple(each.name for each in causes[1:])
     return Finding(

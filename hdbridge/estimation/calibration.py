@@ -9,7 +9,7 @@ cannot distinguish from a new cause stays with the model, and a loop that is ano
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -72,6 +72,12 @@ def calibrated(
         for place, effect in enumerate(effects)
         for parameters in _parts(effect, half_widths.get(effect.name, {}), columns(effect))
     )
+
+
+def variances(parts: Sequence[CalibratedPart], place: int, columns: Iterable[int]) -> FloatArray:
+    """Of some coefficients of an effect of the model, as calibrated, shape (n,); 0 where nothing is known."""
+    own = {name: each for part in parts if part.place == place for name, each in part.parameters.items()}
+    return np.array([own.get(str(each), (0.0, 0.0))[1] ** 2 for each in columns])
 
 
 def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:

@@ -90,6 +90,23 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     assert np.median(halves) < 0.02
 
 
+def test_a_change_of_an_order_is_no_better_known_than_what_it_has_changed_from(
+    columns: Columns, plant: ModuleType
+) -> None:
+    inside: list[bool] = []
+    for seed in range(30, 34):
+        rng = np.random.default_rng(seed)
+        added = [(order, rng.uniform(3.0, 6.0), rng.uniform(-180.0, 180.0)) for order in (2, 3, 6)]
+        record = columns({"motor_order": {"orders": added}}, seed)
+        known = TransmissionModel.from_text(plant.model_text(seed))
+        found = {each.cause: each for each in diagnose(Record(record), known).findings}["motor_order"]
+        for order, size, phase in added:
+            truth = {f"order_{order}_amplitude_arcsec": size, f"order_{order}_phase_deg": phase}
+            inside += [held(found.parameters[name], name, value) for name, value in truth.items()]
+    # Without the calibration's own variance in them one in ten holds.
+    assert sum(inside) >= binom.ppf(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+
+
 def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:
     """The load on a spring, which swings beyond the waves of the motor angle that shake it."""
     motor = columns["motor_target_deg"]
