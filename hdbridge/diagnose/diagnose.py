@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +17,8 @@ from hdbridge.diagnose.identifiability import identifiability
 from hdbridge.diagnose.lookalikes import (
     as_calibrated,
     lookalikes,
-    of_one_angle,
     plausible_only,
+    waves_alike,
     with_measured,
 )
 from hdbridge.diagnose.parameters import covariance, parameters_of
@@ -37,7 +37,7 @@ from hdbridge.diagnose.unexplained import (
     without_doubtful_loops,
 )
 from hdbridge.diagnose.unfitted import unfitted
-from hdbridge.effects import CATALOGUE, Channel, FloatArray, Part, Start, aliases_of, unmet
+from hdbridge.effects import Channel, FloatArray, Part, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
@@ -151,7 +151,8 @@ class _Judge:
         findings = [each for each in judged.findings if each.cause not in usual]
         considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
         known = {each.cause for each in findings} | {each.split(":")[0] for each in considered}
-        considered += [f"{cause}: {why}" for cause, why in self.search.refusals.items() if cause not in known]
+        refused = self.search.told_refusals(fitted)
+        considered += [each for each in refused if each.split(":")[0] not in known]
         findings = self._with_unexplained(findings, left)
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         given, refitted = (
@@ -180,7 +181,7 @@ class _Judge:
             remarks=estimator.data.remarks,
             model=extended,
             traces=self._traces(fitted, given),
-            considered=tuple(considered),
+            considered=tuple(dict.fromkeys(considered)),
             scales=estimator.scales,
         )
 
@@ -327,39 +328,13 @@ class _Judge:
                 aliases.append(name)
             else:
                 margin = min(margin, worse)
-        aliases += [each for each in self._in_step(fitted, place) if each not in aliases]
+        alike = waves_alike(self.estimator, effect, fitted.hypothesis.start)
+        aliases += [each for each in alike if each not in aliases]
         available = self.estimator.motion.available()
         for kind, _ in lookalikes(effect, self.estimator.data.ratio):
             if kind.channels - available and kind.name not in aliases:
                 aliases.append(kind.name)
         return tuple(aliases), margin
-
-    def _in_step(self, fitted: Fitted, place: int) -> Iterator[str]:
-        """Other kinds of waves that have hardly parted from those of a finding anywhere in the record."""
-        effect = fitted.hypothesis.effects[place]
-        if not effect.waves():
-            return
-        estimator, start = self.estimator, fitted.hypothesis.start
-        does = estimator.columns(effect, start) @ effect.coefficients()
-        does -= np.mean(does)
-        for name in aliases_of(effect.name):
-            kind = CATALOGUE.get(name)
-            proposed = [] if kind is None else [*kind.proposals(estimator.data, ())]
-            near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
-            if not near:
-                continue
-            if of_one_angle(estimator.data, effect, near[0]):
-                # On an arc of a turn orders cancel each other: what counts is how large they are.
-                shared = {turns for each in near for turns, _, _ in each.waves()}
-                squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
-                most = self.estimator.scales.in_step * sum(squares.values())
-                if sum(value for turns, value in squares.items() if turns in shared) > most:
-                    yield name
-                continue
-            columns = np.hstack([estimator.columns(each, start) for each in near])
-            left = does - columns @ np.linalg.lstsq(columns, does, rcond=1e-9)[0]
-            if float(left @ left) < (1.0 - self.estimator.scales.in_step) * float(does @ does):
-                yield name
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings, self.estimator.scales)

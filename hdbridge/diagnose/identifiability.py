@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.diagnose.lookalikes import lookalikes, of_one_angle
+from hdbridge.diagnose.lookalikes import lookalikes, waves_alike
 from hdbridge.diagnose.result import Identifiability
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, causes
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -30,8 +30,7 @@ def identifiability(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> dict[str, Identifiability]:
     """For each cause of the catalogue."""
-    left: dict[str, list[tuple[FloatArray, float, float, int]]] = {}
-    example: dict[str, Effect] = {}
+    left: dict[str, list[tuple[FloatArray, float, float, Effect]]] = {}
     stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
     basis = _orthonormal(fitted.basis[::stride])
@@ -46,8 +45,7 @@ def identifiability(
         rest = unit - basis @ (basis.T @ unit)
         share = float(np.max(np.sum(rest**2, axis=0) / np.sum(unit**2, axis=0)))
         size = float(np.sqrt(stride * np.max(np.sum(rest**2, axis=0))))
-        left.setdefault(candidate.cause, []).append((rest, share, size, rest.shape[1]))
-        example[candidate.cause] = candidate.effect
+        left.setdefault(candidate.cause, []).append((rest, share, size, candidate.effect))
     names = list(left)
     best = {name: max(left[name], key=lambda each: each[2]) for name in names}
     spans = {name: _orthonormal(best[name][0]) for name in names}
@@ -56,22 +54,19 @@ def identifiability(
         if cause not in best:
             result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
             continue
-        _, share, size, freedom = best[cause]
+        rest, share, size, example = best[cause]
         if share < SHARE_LEFT or size <= 0.0:
             result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
             continue
         limit = max(
-            INFLATION * math.sqrt(estimator.scales.penalty * freedom + estimator.scales.enter) / size,
+            INFLATION * math.sqrt(estimator.scales.penalty * rest.shape[1] + estimator.scales.enter) / size,
             estimator.scales.floor_arcsec,
         )
+        waves = set(waves_alike(estimator, example, fitted.hypothesis.start))
         alike = [
             name
             for name in names
-            if name != cause
-            and (
-                _correlation(spans[cause], spans[name]) > NOT_APART
-                or of_one_angle(estimator.data, example[cause], example[name])
-            )
+            if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
     for candidate in candidates(estimator.data, ()):

@@ -4,25 +4,28 @@ and what another convention tells without a change of the model.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from hdbridge.diagnose.search import Search
-from hdbridge.effects import CATALOGUE, MEASURED, Effect, aliases_of, unmet
+from hdbridge.effects import CATALOGUE, MEASURED, Effect, Part, Start, aliases_of, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.observed import Observed
+from hdbridge.estimation.linear import orthonormal
 from hdbridge.observations.reading import third_deviation
 
 
 def plausible_only(search: Search, fitted: Fitted) -> Fitted:
-    """With the best look-alike in the place of what is implausible as it has come out, or with nothing."""
+    """With the best look-alike in the place of what is refused as it has come out, or with nothing."""
     estimator = search.estimator
     base = fitted.hypothesis.effects[: search.base]
     for place in range(search.base, len(fitted.hypothesis.effects)):
         effect = fitted.hypothesis.effects[place]
-        if not effect.implausible(estimator.data):
+        reason = effect.implausible(estimator.data) or effect.unidentifiable(estimator.data)
+        if not reason:
             continue
+        search.refusals[effect.name] = reason
         without = estimator.fit(fitted.hypothesis.without(place))
         present = {each.name for each in without.hypothesis.effects}
         trials = [
@@ -35,7 +38,7 @@ def plausible_only(search: Search, fitted: Fitted) -> Fitted:
         fine = [
             each
             for each in trials
-            if search.makes_sense(each.hypothesis.effects[place])
+            if not search.refusal(each.hypothesis.effects[place])
             and search.peak(each, place) >= search.scales.floor_arcsec
         ]
         best = min(fine, key=search.cost, default=without)
@@ -101,10 +104,34 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
     return result
 
 
-def of_one_angle(data: Observed, one: Effect, other: Effect) -> bool:
-    """Whether two kinds are waves over the same angle: no record distinguishes orders that both may have."""
-    same = one.coordinate(data.motion, data.ratio).name == other.coordinate(data.motion, data.ratio).name
-    return bool(same and one.waves() and other.waves() and other.name in aliases_of(one.name))
+def waves_alike(estimator: Estimator, effect: Effect, start: Start) -> Iterator[str]:
+    """Other kinds of waves that have hardly parted from those of an effect, anywhere in the record.
+
+    Over the same angle it is enough that both may have the orders. On an arc of a turn different orders
+    cancel each other, so what counts there is how large they are, not what they do.
+    """
+    data, most = estimator.data, estimator.scales.in_step
+    squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
+    if not squares:
+        return
+    does = estimator.columns(effect, start) @ effect.coefficients()
+    does -= np.mean(does)
+    angle = effect.coordinate(data.motion, data.ratio).name
+    for name in aliases_of(effect.name):
+        kind = CATALOGUE.get(name)
+        proposed = [] if kind is None else [*kind.proposals(data, ())]
+        near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
+        if not near:
+            continue
+        if near[0].coordinate(data.motion, data.ratio).name == angle:
+            orders = {turns for each in near for turns, _, _ in each.waves()}
+            both = sum(value for turns, value in squares.items() if turns in orders)
+            if both > most * sum(squares.values()):
+                yield name
+            continue
+        seen = orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
+        if float(np.sum((seen.T @ does) ** 2)) > most * float(does @ does):
+            yield name
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:

@@ -15,9 +15,9 @@ import numpy as np
 from hdbridge.diagnose import matched_filters
 from hdbridge.diagnose.acceptance import all_pieces_seen, gate
 from hdbridge.diagnose.overlap import hides
-from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, in_place
+from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
-from hdbridge.estimation.screening import Candidate, Score, Screen, candidates, score_of
+from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 
 MOST = 6
 BEST = 3
@@ -47,7 +47,7 @@ class Search:
         self._screens: dict[object, Screen] = {}
         self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
-        """Causes that a gate stopped during the search, with its reason in words."""
+        """Causes that were refused though the evidence spoke for them, with the reason in words."""
         self._left_out: str | None = None
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
@@ -162,7 +162,12 @@ class Search:
                 fitted.chi_square - trial.chi_square - self.scales.penalty * max(added, 1) - self.scales.enter
             )
             key = _key(score)
-            if net <= 0.0 or not self._counts(trial, score.candidate):
+            cause = score.candidate.cause
+            none = net <= 0.0 or self._too_small(trial, cause)
+            reason = "" if none else self._refusal(trial, cause)
+            if reason:
+                self.refusals[cause] = reason
+            if none or reason:
                 self._refused.add(key)
                 continue
             if best is None or net > best[0]:
@@ -183,8 +188,8 @@ class Search:
             if not hides(two[0].effect, two[1].effect):
                 continue
             trial = self.estimator.fit(fitted.hypothesis.plus(two[0].effect).plus(two[1].effect))
-            if self.cost(fitted) - self.cost(trial) > 2.0 * self.scales.enter and all(
-                self._counts(trial, each) for each in two
+            if self.cost(fitted) - self.cost(trial) > 2.0 * self.scales.enter and not any(
+                self._too_small(trial, each.cause) or self._refusal(trial, each.cause) for each in two
             ):
                 pairs.append(trial)
         return min(pairs, key=self.cost, default=None)
@@ -200,28 +205,53 @@ class Search:
                     return again
         return trial
 
-    def _counts(self, trial: Fitted, candidate: Candidate) -> bool:
-        """Whether what was added is large enough, physical, and really seen."""
-        place = _last(trial, candidate.cause)
-        effect = trial.hypothesis.effects[place]
-        if not self.makes_sense(effect):
-            return False
-        peak = self.peak(trial, place)
-        if peak < self.scales.floor_arcsec or effect.largest_piece_arcsec() > self.scales.extrapolated * peak:
-            return False
-        if Channel.TIME not in effect.needs() or effect.shows(self.estimator.motion) is None:
-            return True
-        # What happens in time may be placed anywhere: where it is not seen as it has to be, it is another
-        # cause's, which would not be found with it in the fit.
-        judged = gate(self.estimator, trial, place)
-        if not judged.passed:
-            self.refusals[candidate.cause] = judged.reason
-            return False
-        return all_pieces_seen(self.estimator, trial, place)
+    def _too_small(self, trial: Fitted, cause: str) -> bool:
+        """Whether what was added is of no use to an axis."""
+        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
 
-    def makes_sense(self, effect: Effect) -> bool:
-        """Whether an effect is physical, and this record one in which it can be known."""
-        return not effect.violations() and not effect.implausible(self.estimator.data)
+    def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
+        """Why what was added to a fit as the last of its name is not named, in words.
+
+        It has to be physical and really seen; an alias need not be identifiable.
+        """
+        place = _last(trial, cause)
+        effect = trial.hypothesis.effects[place]
+        reason = self.refusal(effect, as_alias)
+        most = self.scales.extrapolated * self.peak(trial, place)
+        if not reason and effect.largest_piece_arcsec() > most:
+            reason = "the record shows too little of it to say how large it is"
+        elif (
+            not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
+        ):
+            # What happens in time may be placed anywhere: where it is not seen as it has to be, it is
+            # another cause's, which would not be found with it in the fit.
+            reason = gate(self.estimator, trial, place).reason
+            if not reason and not all_pieces_seen(self.estimator, trial, place):
+                reason = "a part of it may be what a larger one gets wrong"
+        return reason
+
+    def refusal(self, effect: Effect, as_alias: bool = False) -> str:
+        """Why an effect as it has come out is not named, in words; of an alias only why it cannot be."""
+        if violations := effect.violations():
+            return f"parameters that it cannot have ({violations[0]})"
+        data = self.estimator.data
+        return effect.implausible(data) or ("" if as_alias else effect.unidentifiable(data))
+
+    def told_refusals(self, fitted: Fitted) -> list[str]:
+        """The refusals that matter: of what may stand for a cause that was named, and of what would still
+        earn its keep beside the ``fitted`` hypothesis by its evidence alone, linearised.
+        """
+        if not self.refusals:
+            return []
+        causes = {each.name for each in fitted.hypothesis.effects[self.base :]}
+        asked = {alias for cause in causes for alias in aliases_of(cause)}
+        asked |= {
+            each.candidate.cause
+            for each in self._scores(fitted)
+            if each.gain > self.scales.penalty * each.freedom + self.scales.enter
+        }
+        told = asked - causes
+        return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
@@ -282,9 +312,9 @@ class Search:
             if score.candidate.cause != cause:
                 trial = self.estimator.fit(joined(without.hypothesis, score.candidate.effect, self.base))
                 other = best.get(score.candidate.cause)
-                if self._counts(trial, score.candidate) and (
-                    other is None or self.cost(trial) < self.cost(other)
-                ):
+                name = score.candidate.cause
+                refused = self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)
+                if not refused and (other is None or self.cost(trial) < self.cost(other)):
                     best[score.candidate.cause] = trial
         return sorted(best.items(), key=lambda each: each[1].chi_square)
 

@@ -86,7 +86,7 @@ class Backlash(Linear):
         """From a hard contact to a soft one."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
-    def implausible(self, observations: Observations) -> str:
+    def unidentifiable(self, observations: Observations) -> str:
         """It shows at reversals only."""
         return "" if observations.reversals >= 2 else "no reversal in which play would show"
 

@@ -215,7 +215,14 @@ class Effect(BaseModel, ABC):
         return iter(())
 
     def implausible(self, observations: Observations) -> str:
-        """Why this very effect cannot be, or cannot be known from such a record, in words; else empty."""
+        """Why this very effect cannot be, whatever a fit says, in words; else empty."""
+        return ""
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Why such a record cannot tell this very effect from another cause, in words; else empty.
+
+        It is not named there, but it may be an alias of what is.
+        """
         return ""
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:

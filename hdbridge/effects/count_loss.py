@@ -80,7 +80,7 @@ class CountLoss(Effect):
             middle = float(np.quantile(observations.motion.time_s, 0.5))
             yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
 
-    def implausible(self, observations: Observations) -> str:
+    def unidentifiable(self, observations: Observations) -> str:
         """On an axis that is nowhere twice, a step in time may as well be one at a place."""
         return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
 

@@ -98,7 +98,7 @@ class Creep(Effect):
             for build_up in (0.03, 0.3, 1.0):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
-    def implausible(self, observations: Observations) -> str:
+    def unidentifiable(self, observations: Observations) -> str:
         """What takes far longer than any rest is not known to end with it."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""

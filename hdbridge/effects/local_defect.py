@@ -86,7 +86,7 @@ class LocalDefect(Linear):
             ratio=observations.ratio, height_arcsec=1.0, centre_deg=load % DEG_PER_TURN, half_width_deg=3.6
         )
 
-    def implausible(self, observations: Observations) -> str:
+    def unidentifiable(self, observations: Observations) -> str:
         """Passes that are all alike cannot distinguish a place from a moment of the move."""
         return "" if self._is_met(observations) else "not passed often enough, or always alike"
 

@@ -89,7 +89,7 @@ class VelocityWindup(Linear):
                 coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.01, shear_deg_s=max(share * fastest, 10.0)
             )
 
-    def implausible(self, observations: Observations) -> str:
+    def unidentifiable(self, observations: Observations) -> str:
         """One that does not bend is a delayed sample.
 
         The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed

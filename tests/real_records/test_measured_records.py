@@ -76,7 +76,6 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
     assert after < 0.4 * before
 
 
-@pytest.mark.xfail(strict=True, reason="a straight drag is refused as implausible before it can be an alias")
 def test_a_drag_that_is_a_straight_line_in_speed_is_an_alias_of_a_delay(
     joints: dict[int, list[Record]],
 ) -> None:
