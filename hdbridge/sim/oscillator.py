@@ -58,5 +58,7 @@ def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> S
         c, s = math.cos(damped * step_s), math.sin(damped * step_s) / damped
     else:
         damped = w * math.sqrt(-inside)
-        c, s = math.cosh(damped * step_s), math.sinh(damped * step_s) / damped
+        # Both decays as they are: cosh and sinh have no number where the damping is very large.
+        slow, fast = math.exp(-w * w / (decay + damped) * step_s), math.exp(-(decay + damped) * step_s)
+        fade, c, s = 1.0, 0.5 * (slow + fast), 0.5 * (slow - fast) / damped
     return Step(fade * (c + decay * s), fade * s, -fade * w * w * s, fade * (c - decay * s))

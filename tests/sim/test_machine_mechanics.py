@@ -137,3 +137,15 @@ def test_two_exact_half_steps_are_one_step(damping_ratio: float) -> None:
     assert twice == pytest.approx(whole, rel=1e-9, abs=1e-12)
     determinant = whole[0] * whole[3] - whole[1] * whole[2]
     assert determinant == pytest.approx(math.exp(-2.0 * damping_ratio * 300.0 * 1e-3))
+
+
+@pytest.mark.parametrize("damping_ratio", [1.5, 40.0, 1e4, 1e8])
+def test_a_very_large_damping_leaves_a_slow_return(damping_ratio: float) -> None:
+    """From rest at a distance; its rate is stiffness over damping."""
+    root = math.sqrt(damping_ratio**2 - 1.0)
+    slow_per_s = 300.0 / (damping_ratio + root)
+    a, b, c, d = exact_step(300.0, damping_ratio, 1e-3)
+    distance, rate = 1.0, 0.0
+    for _ in range(1000):
+        distance, rate = a * distance + b * rate, c * distance + d * rate
+    assert distance == pytest.approx((0.5 + 0.5 * damping_ratio / root) * math.exp(-slow_per_s), rel=1e-6)
