@@ -100,7 +100,7 @@ class Calibration:
                 for each in fit.nuisances
             ],
             "noise": {
-                "standing_arcsec": fit.noise.standing.rms_arcsec if fit.noise.standing else None,
+                "standing_arcsec": fit.noise.standing_arcsec,
                 "laps_arcsec": fit.noise.laps_arcsec,
                 "residual_arcsec": fit.noise.residual_arcsec,
                 "fitted_arcsec": fit.noise.fitted_arcsec,

@@ -49,7 +49,7 @@ def print_calibration(result: Calibration) -> None:
         )
     print_table(table)
     noise = fit.noise
-    standing = f"{noise.standing.rms_arcsec:.2f}" if noise.standing else "not measured"
+    standing = "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f}"
     apart = ""
     if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
         apart = f"; {noise.fitted_arcsec:.2f} with what was fitted in addition to the model taken off"

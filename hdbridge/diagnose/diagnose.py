@@ -425,8 +425,6 @@ class _Judge:
             extended_arcsec=measured - fitted.residual / estimator.weight,
             direction=direction_of(estimator.motion)[estimator.index],
             speed_deg_s=speed[estimator.index],
-            kind=estimator.data.kinds,
-            kind_number=points.kind[estimator.index].astype(np.float64),
             motion=estimator.motion,
             rows=estimator.index,
             samples=estimator.data.full.motion,

@@ -164,9 +164,6 @@ class Traces:
     extended_arcsec: FloatArray
     direction: FloatArray
     speed_deg_s: FloatArray
-    kind: tuple[str, ...]
-    """Names of the kinds of motion."""
-    kind_number: FloatArray
     motion: Motion
     """What drove the whole record; an elastic state passes through all of it."""
     rows: IntArray

@@ -10,7 +10,7 @@ from hdbridge.identify.intervals import Interval
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order
 from hdbridge.identify.result import FitResult
-from hdbridge.identify.spectrum import Spectrum, spectrum
+from hdbridge.identify.spectrum import Spectrum
 
 __all__ = [
     "Family",
@@ -22,5 +22,4 @@ __all__ = [
     "Segment",
     "Spectrum",
     "fit",
-    "spectrum",
 ]

@@ -9,19 +9,18 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Part
 from hdbridge.estimation.design import Design
-from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.estimation.samples import KINDS, Samples
 from hdbridge.estimation.separable import Solution
-from hdbridge.identify.figures import laps_arcsec, standing
+from hdbridge.identify.figures import laps_arcsec, standing_arcsec
 from hdbridge.identify.holdout import held_out
 from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Family, Order, Selection, threshold
+from hdbridge.identify.orders import Family, Order, Selection, System, threshold
 from hdbridge.identify.residuals import residual_tests
 from hdbridge.identify.result import ChosenOrder, FitResult, NoiseFigures, Nuisance, Outliers, Traces
-from hdbridge.identify.spectrum import Curve, Spectrum, assemble, plain_spectrum
-from hdbridge.identify.state import State, System
+from hdbridge.identify.spectrum import Spectrum, plain_spectrum, spectrum
+from hdbridge.identify.state import State
 from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -57,7 +56,7 @@ def conclude(
     residual_rms = math.sqrt(float(blocks.count @ written**2) / samples_used + inside)
     ones = np.ones(len(blocks))
     figures = NoiseFigures(
-        standing=standing(samples),
+        standing_arcsec=standing_arcsec(samples),
         laps_arcsec=laps_arcsec(samples),
         model=state.noise,
         residual_arcsec=residual_rms,
@@ -71,7 +70,16 @@ def conclude(
         (_predicted(design, each) for each in solution.effects if each.part is Part.ORDERS),
         start=np.zeros(len(blocks)),
     )
-    lines = _lines(state, selection, system, clean, options)
+    shown = blocks.moving if np.count_nonzero(blocks.moving) > 0.5 * len(blocks) else blocks.count > 0
+    lines = spectrum(
+        state.candidates,
+        selection.chosen,
+        system,
+        blocks.motor_deg,
+        samples.ratio,
+        plain_spectrum(blocks.motor_deg[shown], clean[shown], blocks.count[shown]),
+        options.family_wise,
+    )
     _describe_limits(selection, lines, outliers, samples, warnings)
     active = _sum(design, options.active.effects if options.active else ())
     return FitResult(
@@ -143,43 +151,6 @@ def _about_zeros(design: Design, left_arcsec: FloatArray) -> FloatArray:
     return np.asarray(left_arcsec - (total / np.maximum(count, 1e-300))[blocks.zero])
 
 
-def _lines(
-    state: State, selection: Selection, system: System, clean: FloatArray, options: FitOptions
-) -> Spectrum:
-    """Each candidate's line, everything that is in the fit allowed for: what it is, or would add."""
-    information, right = system
-    waves = 2 * len(state.candidates)
-    inside = [
-        2 * index + part
-        for index, each in enumerate(state.candidates)
-        if each in selection.chosen
-        for part in (0, 1)
-    ]
-    always = list(range(waves, len(information)))
-    coefficients, errors = np.zeros(waves), np.zeros(waves)
-    for index in range(len(state.candidates)):
-        own = [2 * index, 2 * index + 1]
-        others = [each for each in inside if each not in own] + always
-        explained = solve_symmetric(information[np.ix_(others, others)], information[np.ix_(others, own)])
-        left = information[np.ix_(own, own)] - information[np.ix_(own, others)] @ explained
-        coefficients[own] = solve_symmetric(left, right[own] - explained.T @ right[others])
-        floor = 1e-9 * np.diag(information)[own]
-        errors[own] = 1.0 / np.sqrt(np.maximum(np.diag(left), floor))
-    blocks = state.design.blocks
-    shown = blocks.moving if np.count_nonzero(blocks.moving) > 0.5 * len(blocks) else blocks.count > 0
-    curve = Curve(*plain_spectrum(blocks.motor_deg[shown], clean[shown], blocks.count[shown]))
-    return assemble(
-        state.candidates,
-        coefficients,
-        errors,
-        information[:waves, :waves],
-        blocks.motor_deg,
-        state.design.samples.ratio,
-        options.family_wise,
-        curve,
-    )
-
-
 def _chosen(
     lines: Spectrum, selection: Selection, candidates: int, options: FitOptions
 ) -> tuple[ChosenOrder, ...]:
@@ -230,7 +201,7 @@ def _describe_limits(
     selection: Selection, lines: Spectrum, outliers: Outliers, samples: Samples, warnings: list[str]
 ) -> None:
     """Warnings about what the record's angles cannot tell apart, and about samples left out."""
-    for alike in _families(selection.twins):
+    for alike in _families([(one, other) for one, other, _ in lines.resolution.aliases]):
         warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
     if selection.unresolved:
         warnings.append(f"{_named(selection.unresolved)} cannot be distinguished from what else was fitted")

@@ -12,7 +12,7 @@ from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import REST_DEG_S
 from hdbridge.estimation.samples import KINDS, SLOW, Samples
 from hdbridge.estimation.segment import Kind
-from hdbridge.identify.result import Outliers, Standing
+from hdbridge.identify.result import Outliers
 from hdbridge.observations.reading import median_deviation
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -25,8 +25,8 @@ OUTLYING = 6.0
 """Robust standard deviations."""
 
 
-def standing(samples: Samples) -> Standing | None:
-    """Noise of the load encoder at rest: rms about the mean of each rest, and its correlation in time.
+def standing_arcsec(samples: Samples) -> float | None:
+    """Noise of the load encoder at rest: rms about the mean of each rest.
 
     A motor that rests between two counts of its encoder flickers, which is no noise of the load; a sine or
     sweep that creeps within a count seems to rest, while the load goes on.
@@ -47,16 +47,7 @@ def standing(samples: Samples) -> Standing | None:
     if not runs:
         return None
     loads = [samples.load_deg[run] * ARCSEC_PER_DEG for run in runs]
-    parts = [load - np.mean(load) for load in loads]
-    every = np.concatenate(parts)
-    period = float(np.median(np.concatenate([np.diff(samples.time_s[run]) for run in runs])))
-    time = _integrated_correlation(parts)
-    return Standing(
-        rms_arcsec=float(np.sqrt(np.mean(every**2))),
-        correlation_s=0.5 * (time - 1.0) * period,
-        samples=len(every),
-        effective_samples=len(every) / time,
-    )
+    return float(np.sqrt(np.mean(np.concatenate([load - np.mean(load) for load in loads]) ** 2)))
 
 
 def laps_arcsec(samples: Samples) -> float | None:
@@ -106,20 +97,3 @@ def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArra
     edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
     runs = edges[1::2] - edges[::2]
     return weight, Outliers(int(np.count_nonzero(out)), int(np.max(runs, initial=0)))
-
-
-def _integrated_correlation(parts: list[FloatArray]) -> float:
-    """1 + 2 sum of the autocorrelations up to where their sum in pairs is no longer positive (Geyer 1992)."""
-    longest = max(len(each) for each in parts)
-    total = np.zeros(longest)
-    for each in parts:
-        size = 2 * len(each)
-        power = np.abs(np.fft.rfft(each, size)) ** 2
-        total[: len(each)] += np.fft.irfft(power, size)[: len(each)]
-    if total[0] <= 0:
-        return 1.0
-    rho = total / total[0]
-    pairs = rho[: longest // 2 * 2].reshape(-1, 2).sum(axis=1)
-    negative = np.flatnonzero(pairs <= 0)
-    until = int(negative[0]) if len(negative) else len(pairs)
-    return max(2.0 * float(np.sum(pairs[:until])) - 1.0, 1.0)

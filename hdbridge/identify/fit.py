@@ -31,10 +31,10 @@ from hdbridge.identify.conclude import conclude
 from hdbridge.identify.figures import outlying
 from hdbridge.identify.intervals import covariance, effect_intervals
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Selection
+from hdbridge.identify.orders import Selection, System
 from hdbridge.identify.problem import LINEAR_ONLY, Problem
 from hdbridge.identify.result import FitResult, Outliers
-from hdbridge.identify.state import State, System, candidate_orders, turns_covered
+from hdbridge.identify.state import State, candidate_orders, turns_covered
 from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50

@@ -15,6 +15,9 @@ from hdbridge.estimation.linear import solve_symmetric
 NOT_APART = 0.95
 """Correlation above which two orders cannot be distinguished in a record."""
 
+System = tuple[FloatArray, FloatArray]
+"""J' K^-1 J and J' K^-1 y of columns J and observations y."""
+
 
 class Family(Enum):
     """What an order belongs to."""
@@ -60,8 +63,6 @@ class Selection:
     """What the selection found."""
 
     chosen: tuple[Order, ...]
-    twins: tuple[tuple[Order, Order], ...]
-    """Candidates that this record cannot distinguish from each other."""
     unresolved: tuple[Order, ...]
     """Candidates that this record cannot distinguish from the zero, the hysteresis or an order already in."""
 
@@ -87,7 +88,6 @@ def select(
     pairs = [np.array([2 * index, 2 * index + 1]) for index in range(len(candidates))]
     split = 2 * len(candidates)
     own = np.diag(information)[:split]
-    twins = _twins(pairs, information)
     # What is in the fit anyway is eliminated once; the search works on what is left of the candidates.
     cross = information[split:, :split]
     explained = solve_symmetric(information[split:, split:], cross)
@@ -124,7 +124,6 @@ def select(
     ]
     return Selection(
         tuple(candidates[index] for index in sorted(inside)),
-        tuple((candidates[a], candidates[b]) for a, b in twins),
         tuple(candidates[index] for index in unresolved),
     )
 
@@ -154,16 +153,6 @@ def _scores(
         coefficients = solve_symmetric(left[two, two], score[two])
         result[index] = (float(score[two] @ coefficients), float(np.hypot(*coefficients)), share)
     return result
-
-
-def _twins(pairs: Sequence[IntArray], information: FloatArray) -> list[tuple[int, int]]:
-    """Pairs of candidates whose columns span nearly the same."""
-    found = []
-    for a, one in enumerate(pairs):
-        for b in range(a + 1, len(pairs)):
-            if correlation(information, one, pairs[b]) > NOT_APART:
-                found.append((a, b))
-    return found
 
 
 def correlation(information: FloatArray, one: IntArray, other: IntArray) -> float:

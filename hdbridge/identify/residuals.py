@@ -82,9 +82,9 @@ def _whiteness(noise: NoiseModel) -> ResidualTest:
 
 
 def _level(figures: NoiseFigures) -> ResidualTest:
-    if figures.standing is None:
+    rest = figures.standing_arcsec
+    if rest is None:
         return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
-    size = math.sqrt(max(figures.fitted_arcsec**2 - figures.standing.rms_arcsec**2, 0.0))
-    rest = figures.standing.rms_arcsec
+    size = math.sqrt(max(figures.fitted_arcsec**2 - rest**2, 0.0))
     text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
-    return ResidualTest("noise_level", size < max(figures.standing.rms_arcsec, 1.0), size, text)
+    return ResidualTest("noise_level", size < max(rest, 1.0), size, text)

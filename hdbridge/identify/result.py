@@ -24,24 +24,11 @@ the unchanged demo axis leaves 0.8 % less.
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """The noise of an axis at rest."""
-
-    rms_arcsec: float
-    """About the mean of each rest."""
-    correlation_s: float
-    """Time over which it is correlated with itself (integrated autocorrelation)."""
-    samples: int
-    effective_samples: float
-    """As many independent samples would tell as much about a mean."""
-
-
-@dataclass(frozen=True, slots=True)
 class NoiseFigures:
     """How noisy the record is, and how far the model's residual is above that."""
 
-    standing: Standing | None
-    """None where the axis never stood for long enough."""
+    standing_arcsec: float | None
+    """Rms about the mean of each rest; None where the axis never stood for long enough."""
     laps_arcsec: float | None
     """What two passes over the same angles in one direction differ by, over the root of two."""
     model: NoiseModel

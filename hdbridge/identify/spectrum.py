@@ -8,15 +8,14 @@ each order stands where it is, or is reported as one that the record cannot tell
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hdbridge.effects import FloatArray
-from hdbridge.errors import InputError
-from hdbridge.estimation.linear import inverse_symmetric
-from hdbridge.identify.orders import NOT_APART, Order, correlation, threshold
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.identify.orders import NOT_APART, Order, System, correlation, threshold
 from hdbridge.units import DEG_PER_TURN
 
 BINS_PER_TURN = 128
@@ -52,8 +51,6 @@ class Resolution:
     load_turns: float
     nearest_orders: float
     """Orders closer than this run into each other: one over the turns."""
-    condition: float
-    """Condition number of the orders' columns, scaled to one: 1 at best."""
     aliases: tuple[tuple[Order, Order, float], ...]
     """Pairs whose correlation is above `NOT_APART`."""
 
@@ -76,63 +73,37 @@ class Spectrum:
 
 
 def spectrum(
-    motor_deg: FloatArray,
-    error_arcsec: FloatArray,
     orders: Sequence[Order],
-    ratio: float,
-    family_wise: float = 0.01,
-    count: FloatArray | None = None,
-) -> Spectrum:
-    """Spectrum of an error by least squares at the true angles; all orders and the mean fitted at once.
-
-    ``count`` is how many samples each row stands for. Standard errors come from stretches of the record
-    (sandwich), so noise need not be white. For a record with hysteresis take one direction's part, or use
-    `fit`, which takes everything together. InputError where there are fewer rows than columns.
-    """
-    if len(motor_deg) < 2 * len(orders) + 2:
-        raise InputError(
-            f"{len(motor_deg)} samples for {len(orders)} orders; expected more than twice as many samples as "
-            "orders: record more, or ask for fewer orders"
-        )
-    weight = np.ones(len(motor_deg)) if count is None else count
-    columns = _columns(motor_deg, orders)
-    information = columns.T @ (weight[:, np.newaxis] * columns)
-    inverse = inverse_symmetric(information)
-    coefficients = inverse @ (columns.T @ (weight * error_arcsec))
-    residual = error_arcsec - columns @ coefficients
-    free = max(len(motor_deg) - columns.shape[1], 1)
-    white = inverse * float(weight @ residual**2) / free
-    stretches = np.array_split(
-        columns * (weight * residual)[:, np.newaxis], min(60, max(len(motor_deg) // 8, 1))
-    )
-    sums = np.array([each.sum(axis=0) for each in stretches])
-    robust = inverse @ (sums.T @ sums) @ inverse
-    errors = np.sqrt(np.maximum(np.diag(white), np.diag(robust)))
-    curve = Curve(*plain_spectrum(motor_deg, error_arcsec - coefficients[0], weight))
-    waves = information[1:, 1:]
-    return assemble(orders, coefficients[1:], errors[1:], waves, motor_deg, ratio, family_wise, curve)
-
-
-def assemble(
-    orders: Sequence[Order],
-    coefficients: FloatArray,
-    errors: FloatArray,
-    information: FloatArray,
+    chosen: Collection[Order],
+    system: System,
     motor_deg: FloatArray,
     ratio: float,
-    family_wise: float,
     curve: Curve,
+    family_wise: float = 0.01,
 ) -> Spectrum:
-    """A spectrum from fitted cosine and sine coefficients, their errors and their information matrix."""
+    """Each order's line, everything that is in the fit allowed for: what it is, or would add.
+
+    ``system`` is J' K^-1 J and J' K^-1 y of [the orders' cosine and sine pairs | all that is in the fit
+    anyway]; of the orders those ``chosen`` are in the fit.
+    """
+    information, right = system
     root = math.sqrt(threshold(len(orders), family_wise))
-    resolved = resolution(orders, information, motor_deg, ratio)
+    waves = 2 * len(orders)
+    inside = [2 * at + part for at, each in enumerate(orders) if each in chosen for part in (0, 1)]
+    always = list(range(waves, len(information)))
+    resolved = resolution(orders, information[:waves, :waves], motor_deg, ratio)
     lines = []
     for index, order in enumerate(orders):
-        cosine, sine = (float(each) for each in coefficients[2 * index : 2 * index + 2])
-        error = float(np.max(errors[2 * index : 2 * index + 2]))
-        others = tuple(b if a == order else a for a, b, _ in resolved.aliases if order in {a, b})
+        own = [2 * index, 2 * index + 1]
+        others = [each for each in inside if each not in own] + always
+        explained = solve_symmetric(information[np.ix_(others, others)], information[np.ix_(others, own)])
+        left = information[np.ix_(own, own)] - information[np.ix_(own, others)] @ explained
+        cosine, sine = solve_symmetric(left, right[own] - explained.T @ right[others]).tolist()
+        floor = 1e-9 * np.diag(information)[own]
+        error = float(np.max(1.0 / np.sqrt(np.maximum(np.diag(left), floor))))
+        alike = tuple(b if a == order else a for a, b, _ in resolved.aliases if order in {a, b})
         amplitude, phase = math.hypot(cosine, sine), math.degrees(math.atan2(-sine, cosine))
-        lines.append(Line(order, amplitude, phase, error, error * root, others))
+        lines.append(Line(order, amplitude, phase, error, error * root, alike))
     return Spectrum(tuple(lines), resolved, curve)
 
 
@@ -148,16 +119,13 @@ def resolution(
             value = correlation(information, pairs[a], pairs[b])
             if value > NOT_APART:
                 aliases.append((orders[a], orders[b], min(value, 1.0)))
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values = np.linalg.eigvalsh(information / np.outer(scale, scale)) if len(orders) else np.ones(1)
-    condition = math.sqrt(float(values[-1] / max(values[0], 1e-300 + values[-1] * 1e-15)))
-    return Resolution(turns, turns / ratio, 1.0 / turns if turns else math.inf, condition, tuple(aliases))
+    return Resolution(turns, turns / ratio, 1.0 / turns if turns else math.inf, tuple(aliases))
 
 
 def plain_spectrum(
     motor_deg: FloatArray, error_arcsec: FloatArray, count: FloatArray | None = None, highest: float = 32.0
-) -> tuple[FloatArray, FloatArray]:
-    """Orders and amplitudes of the error averaged in even bins of the motor angle, by FFT; for plots only.
+) -> Curve:
+    """Amplitudes of the error averaged in even bins of the motor angle, by FFT; for plots only.
 
     Empty bins count as zero; amplitudes are scaled by the share of bins that are filled.
     """
@@ -174,10 +142,4 @@ def plain_spectrum(
     order = np.fft.rfftfreq(size, 1.0 / BINS_PER_TURN)
     amplitude = 2.0 * np.abs(np.fft.rfft(binned)) / (size * share) / np.sinc(order / BINS_PER_TURN)
     shown = order <= highest
-    return np.asarray(order[shown], dtype=np.float64), np.asarray(amplitude[shown])
-
-
-def _columns(motor_deg: FloatArray, orders: Sequence[Order]) -> FloatArray:
-    angles = np.deg2rad(np.outer(motor_deg, [each.per_motor_turn for each in orders]))
-    waves = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor_deg), -1)
-    return np.concatenate([np.ones((len(motor_deg), 1)), waves], axis=1)
+    return Curve(np.asarray(order[shown], dtype=np.float64), np.asarray(amplitude[shown]))

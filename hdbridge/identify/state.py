@@ -16,7 +16,7 @@ from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.shapes import tangent
 from hdbridge.estimation.terms import Nuisances
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Family, Order, Selection, select
+from hdbridge.identify.orders import Family, Order, Selection, System, select
 from hdbridge.identify.problem import Problem
 from hdbridge.units import DEG_PER_TURN
 
@@ -24,9 +24,6 @@ WHOLE_TURN = 0.95
 """Turns that count as one."""
 COVERED_DEG = 30.0
 """A motor angle was seen when some angle within the same cell of this size was."""
-
-System = tuple[FloatArray, FloatArray]
-"""J' K^-1 J and J' K^-1 y."""
 
 
 class State(NamedTuple):

@@ -233,7 +233,7 @@ def _residual(result: Calibration) -> Iterator[Block]:
             ("... with what was fitted in addition to it", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
-                f"{noise.standing.rms_arcsec:.2f} arcsec" if noise.standing else "not measured",
+                "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f} arcsec",
             ),
             (
                 "lap to lap",

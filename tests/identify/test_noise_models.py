@@ -11,7 +11,7 @@ from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
 from hdbridge.estimation.samples import gather
 from hdbridge.estimation.segment import Kind, Segment
-from hdbridge.identify.figures import outlying, standing
+from hdbridge.identify.figures import outlying, standing_arcsec
 
 
 def blocks_of(count, rng, motor=None, error=None, kind=Kind.SWEEP):
@@ -70,18 +70,6 @@ def test_a_wander_is_found_beside_white_noise():
     assert np.hypot(noise.moving_arcsec, noise.place_arcsec) == pytest.approx(0.5, rel=0.15)
 
 
-def test_the_noise_at_rest_tells_how_many_samples_are_worth_one():
-    rng = np.random.default_rng(3)
-    time = np.arange(20_000) / 250.0
-    error = np.zeros(20_000)
-    for index in range(1, 20_000):
-        error[index] = 0.9 * error[index - 1] + rng.normal()
-    segment = Segment(time, np.zeros(20_000), error / 3600.0, Kind.STANDSTILL)
-    found = standing(gather([segment], 50.0))
-    assert found.rms_arcsec == pytest.approx(np.sqrt(1.0 / (1.0 - 0.81)), rel=0.1)
-    assert found.samples / found.effective_samples == pytest.approx(19.0, rel=0.3)  # (1 + r) / (1 - r)
-
-
 def test_a_spike_is_an_outlier_and_a_step_that_stays_is_not():
     rng = np.random.default_rng(4)
     residual = rng.normal(size=5000)
@@ -135,7 +123,7 @@ def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
         [Segment(time, np.zeros(5000), load, Kind.STANDSTILL, position_deg=position)], 50.0, slow_deg_s=1e9
     )
     assert samples.count_deg == pytest.approx(count)
-    assert standing(samples).rms_arcsec == pytest.approx(noise, rel=0.05)
+    assert standing_arcsec(samples) == pytest.approx(noise, rel=0.05)
     error = samples.error_arcsec
     assert outlying(error)[1].samples > 100  # as it would be for an encoder without counts
     assert outlying(error, count / 50.0 * 3600.0)[1].samples == 0
@@ -151,6 +139,7 @@ def test_what_moved_unseen_or_slowly_is_not_at_rest():
         Segment(time + 60.0, np.full(1000, 90.0), 90.0 / 50.0 + still[1], Kind.STANDSTILL),
         Segment(time + 64.0, 90.0 + creep, (90.0 + creep) / 50.0 + still[2], Kind.SINE),
     ]
-    found = standing(gather(segments, 50.0, slow_deg_s=1e9))
-    assert found.rms_arcsec == pytest.approx(0.5, rel=0.06)
-    assert found.samples <= 2000
+    found = standing_arcsec(gather(segments, 50.0, slow_deg_s=1e9))
+    assert found == pytest.approx(0.5, rel=0.06)
+    rests = standing_arcsec(gather(segments[:2], 50.0, slow_deg_s=1e9))
+    assert found == pytest.approx(rests, rel=1e-9)  # the creep is not in it

@@ -5,10 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.errors import InputError
-from hdbridge.identify import Order, spectrum
+from hdbridge.identify import Order
 from hdbridge.identify.orders import select, threshold
-from hdbridge.identify.spectrum import plain_spectrum
+from hdbridge.identify.spectrum import plain_spectrum, spectrum
 
 
 def waves(motor_deg, orders):
@@ -19,11 +18,24 @@ def motor_orders(highest):
     return [Order.motor(number) for number in range(1, highest + 1)]
 
 
+def system(motor_deg, error_arcsec, orders):
+    """Normal equations of the orders' waves and the mean; white noise of one arcsec."""
+    angles = np.deg2rad(np.outer(motor_deg, [each.per_motor_turn for each in orders]))
+    columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(motor_deg), -1)
+    columns = np.concatenate([columns, np.ones((len(motor_deg), 1))], axis=1)
+    return columns.T @ columns, columns.T @ error_arcsec
+
+
+def all_fitted(motor_deg, error_arcsec, orders, ratio):
+    curve = plain_spectrum(motor_deg, error_arcsec)
+    return spectrum(orders, orders, system(motor_deg, error_arcsec, orders), motor_deg, ratio, curve)
+
+
 def test_a_stepping_test_shows_each_order_where_it_is():
     """By sample number order 6 would stand at 2.26 and order 8 at 0.26 per turn."""
     motor = np.arange(240) * 43.56
     truth = [(1, 4.9, -126.8), (2, 9.33, -132.1), (6, 3.18, -127.0), (8, 1.87, 124.3)]
-    found = spectrum(motor, waves(motor, truth) + 12.0, motor_orders(10), 50.0)
+    found = all_fitted(motor, waves(motor, truth) + 12.0, motor_orders(10), 50.0)
     lines = {each.order.number: each for each in found.lines}
     for order, amplitude, phase in truth:
         assert lines[order].amplitude_arcsec == pytest.approx(amplitude, abs=1e-6)
@@ -35,14 +47,13 @@ def test_a_stepping_test_shows_each_order_where_it_is():
 
 def test_orders_that_the_angles_cannot_tell_apart_are_named():
     motor = np.arange(200) * 45.0 + 1e-6
-    found = spectrum(motor, waves(motor, [(1, 3.0, 0.0)]), motor_orders(9), 50.0)
+    found = all_fitted(motor, waves(motor, [(1, 3.0, 0.0)]), motor_orders(9), 50.0)
     pairs = {(a.number, b.number) for a, b, _ in found.resolution.aliases}
     assert {(1, 7), (1, 9), (7, 9), (2, 6), (3, 5)} <= pairs
     assert (1, 2) not in pairs
     first = found.lines[0]
     assert {each.number for each in first.aliases} == {7, 9}
     assert not first.significant
-    assert found.resolution.condition > 1e3
 
 
 def test_motor_and_flexspline_orders_come_apart_over_two_load_turns():
@@ -50,15 +61,15 @@ def test_motor_and_flexspline_orders_come_apart_over_two_load_turns():
     rng = np.random.default_rng(1)
     short = np.sort(rng.uniform(0.0, 360.0 * 2, 3000))
     long = np.sort(rng.uniform(0.0, 360.0 * 100, 3000))
-    assert spectrum(short, np.zeros(3000), orders, 50.0).resolution.aliases
-    assert not spectrum(long, np.zeros(3000), orders, 50.0).resolution.aliases
+    assert all_fitted(short, np.zeros(3000), orders, 50.0).resolution.aliases
+    assert not all_fitted(long, np.zeros(3000), orders, 50.0).resolution.aliases
 
 
 @settings(deadline=None, max_examples=25)
 @given(st.integers(1, 12), st.floats(0.5, 50.0), st.floats(-179.0, 179.0), st.integers(0, 10_000))
 def test_any_line_is_found_at_any_uneven_angles(order, amplitude, phase, seed):
     motor = np.sort(np.random.default_rng(seed).uniform(0.0, 3600.0, 400))
-    found = spectrum(motor, waves(motor, [(order, amplitude, phase)]), motor_orders(12), 50.0)
+    found = all_fitted(motor, waves(motor, [(order, amplitude, phase)]), motor_orders(12), 50.0)
     line = found.lines[order - 1]
     assert line.amplitude_arcsec == pytest.approx(amplitude, rel=1e-6)
     assert line.phase_deg == pytest.approx(phase, abs=1e-4)
@@ -68,7 +79,7 @@ def test_standard_errors_are_those_of_many_records():
     rng = np.random.default_rng(2)
     motor = np.sort(rng.uniform(0.0, 7200.0, 800))
     found = [
-        spectrum(motor, waves(motor, [(3, 4.0, 50.0)]) + rng.normal(size=800), motor_orders(4), 50.0)
+        all_fitted(motor, waves(motor, [(3, 4.0, 50.0)]) + rng.normal(size=800), motor_orders(4), 50.0)
         for _ in range(100)
     ]
     scatter = np.std([each.lines[2].amplitude_arcsec for each in found])
@@ -81,12 +92,8 @@ def test_noise_seldom_makes_an_order():
     rng = np.random.default_rng(3)
     motor = np.sort(rng.uniform(0.0, 7200.0, 400))
     orders = motor_orders(16)
-    angles = np.deg2rad(np.outer(motor, [each.per_motor_turn for each in orders]))
-    columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(400, -1)
-    columns = np.concatenate([columns, np.ones((400, 1))], axis=1)
-    gram = columns.T @ columns
     false = sum(
-        bool(select(orders, gram, columns.T @ rng.normal(size=400), smallest_arcsec=0.0).chosen)
+        bool(select(orders, *system(motor, rng.normal(size=400), orders), smallest_arcsec=0.0).chosen)
         for _ in range(200)
     )
     assert false <= 8  # 1 % of 200 is 2; more than 8 would be less likely than 1 in 1000
@@ -96,11 +103,8 @@ def test_selection_takes_all_that_are_there_and_prefers_the_one_that_explains():
     rng = np.random.default_rng(4)
     motor = np.sort(rng.uniform(0.0, 3600.0, 2000))
     orders = motor_orders(12)
-    angles = np.deg2rad(np.outer(motor, [each.per_motor_turn for each in orders]))
-    columns = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(2000, -1)
-    columns = np.concatenate([columns, np.ones((2000, 1))], axis=1)
     error = waves(motor, [(2, 5.0, 10.0), (5, 0.5, 0.0), (11, 0.3, 90.0)]) + rng.normal(size=2000)
-    chosen = select(orders, columns.T @ columns, columns.T @ error)
+    chosen = select(orders, *system(motor, error, orders))
     assert [each.number for each in chosen.chosen] == [2, 5, 11]
 
 
@@ -111,11 +115,6 @@ def test_the_threshold_grows_with_the_number_of_candidates():
 
 def test_the_plain_spectrum_peaks_at_the_order():
     motor = np.linspace(0.0, 3600.0, 20_001)
-    order, amplitude = plain_spectrum(motor, waves(motor, [(4, 6.0, 20.0)]))
-    assert order[np.argmax(amplitude)] == pytest.approx(4.0)
-    assert np.max(amplitude) == pytest.approx(6.0, rel=0.02)
-
-
-def test_fewer_samples_than_columns_are_refused():
-    with pytest.raises(InputError, match="3 samples for 10 orders"):
-        spectrum(np.arange(3.0), np.zeros(3), motor_orders(10), 50.0)
+    found = plain_spectrum(motor, waves(motor, [(4, 6.0, 20.0)]))
+    assert found.order[np.argmax(found.amplitude_arcsec)] == pytest.approx(4.0)
+    assert np.max(found.amplitude_arcsec) == pytest.approx(6.0, rel=0.02)

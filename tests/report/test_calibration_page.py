@@ -78,7 +78,7 @@ def fitted():
                 Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05),
                 Line(second, 5.0, 170.0, 0.01, 0.05),
             ),
-            Resolution(50.0, 1.0, 0.02, 1.0, ()),
+            Resolution(50.0, 1.0, 0.02, ()),
             Curve(np.linspace(0.0, 30.0, 301), np.linspace(0.0, 3.0, 301)),
         ),
         residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),

@@ -142,8 +142,6 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
             model + own,
             direction,
             driven.motor_speed_deg_s,
-            ("slow",),
-            np.zeros(len(driven)),
             driven,
             np.arange(len(driven)),
             Start.FORWARD,
