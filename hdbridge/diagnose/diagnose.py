@@ -166,7 +166,7 @@ class _Judge:
         fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
         named = {each.cause for each in findings if not each.within}
         chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
-        extended = extended_model(estimator, self.model, fitted, chosen, spread, reason, base)
+        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
         after = self._about_zeros(estimator.told(extended.effects, fitted.hypothesis.start))
         fitted = replace(fitted, residual=after * estimator.weight)
         points = estimator.data.points

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.diagnose.parameters import half_widths, parameters_of
 from hdbridge.effects import Effect, FloatArray, Part, conflicts, extended, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.intervals import intervals_of, nested_half_widths
 from hdbridge.model import TransmissionModel
 
 
@@ -41,7 +41,6 @@ def supported(estimator: Estimator, fitted: Fitted, given: Sequence[Effect]) -> 
 
 
 def extended_model(
-    estimator: Estimator,
     model: TransmissionModel,
     fitted: Fitted,
     places: Sequence[int],
@@ -68,8 +67,9 @@ def extended_model(
     for place in chosen:
         effect = fitted.hypothesis.effects[place]
         if effect.name in kept:
-            uncertainty[effect.name] = half_widths(
-                effect.tidied(ratio), parameters_of(estimator, fitted, place, spread)
-            )
+            own = fitted.places(place)
+            intervals = intervals_of(effect, [fitted.parameters[i] for i in own], spread[np.ix_(own, own)])
+            seen = [each for each in intervals if each.half_width > 0.0]
+            uncertainty[effect.name] = nested_half_widths(effect.tidied(ratio), seen)
     provenance = {**model.provenance, "reason": reason}
     return TransmissionModel(model.ratio, effects, uncertainty, provenance)

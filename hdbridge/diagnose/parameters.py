@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.stats import t as student
@@ -186,27 +186,3 @@ def unit_of(name: str) -> str:
     return next(
         (unit for ending, unit in _UNITS.items() if name == ending or name.endswith("_" + ending)), "1"
     )
-
-
-def half_widths(effect: Effect, values: Mapping[str, Parameter]) -> dict[str, Any]:
-    """95 % half widths nested like the parameters of the model file; whole numbers stand as they are."""
-    halves = {
-        name: float(f"{0.5 * (each.high - each.low):.4g}")
-        for name, each in values.items()
-        if math.isfinite(each.high - each.low)
-    }
-    fields = type(effect).model_fields
-    nested: dict[str, Any] = {name: half for name, half in halves.items() if name in fields}
-    for each in effect.named_coefficients():
-        if len(each.path) < 2 or not isinstance(each.path[0], str):
-            continue
-        parts = nested.setdefault(each.path[0], [])
-        given = effect.parameters()[each.path[0]][each.path[1]]
-        part: dict[str, Any] = {name: value for name, value in given.items() if isinstance(value, int)}
-        inner = ("amplitude_arcsec", "phase_deg") if len(each.path) == 2 else (str(each.path[2]),)
-        for name in inner:
-            known = f"{each.name}{name}" if len(each.path) == 2 else each.name
-            if known in halves or len(each.path) > 2:
-                part[name] = halves.get(known, 0.0)
-        parts.append(part)
-    return nested

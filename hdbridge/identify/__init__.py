@@ -4,9 +4,9 @@
 allow for noise that is not white, held-out figures, residual tests, and in words what the data cannot say.
 """
 
+from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.identify.fit import fit
-from hdbridge.identify.intervals import Interval
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order
 from hdbridge.identify.result import FitResult

@@ -9,12 +9,13 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray, Part
 from hdbridge.estimation.design import Design
+from hdbridge.estimation.intervals import NORMAL_95, nested_half_widths
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.estimation.samples import KINDS, Samples
 from hdbridge.estimation.separable import Solution
+from hdbridge.identify.covariance import of_effect
 from hdbridge.identify.figures import laps_arcsec, standing_arcsec
 from hdbridge.identify.holdout import held_out
-from hdbridge.identify.intervals import NORMAL_95, effect_intervals, nested_half_widths
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, threshold
 from hdbridge.identify.residuals import residual_tests
@@ -42,9 +43,7 @@ def conclude(
     design, blocks, samples = state.design, state.design.blocks, state.design.samples
     problem = state.problem(selection)
     precision = state.precision()
-    intervals = [
-        each for index in range(len(solution.effects)) for each in effect_intervals(solution, index, cov)
-    ]
+    intervals = [each for index in range(len(solution.effects)) for each in of_effect(solution, index, cov)]
     effects = tuple(each for each in solution.effects if not each.violations())
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
     inside = _inside_variance(design, solution, problem.nuisances.columns @ solution.nuisances)

@@ -28,8 +28,8 @@ from hdbridge.estimation.samples import Samples, gather
 from hdbridge.estimation.segment import Segment
 from hdbridge.estimation.separable import Solution
 from hdbridge.identify.conclude import conclude
+from hdbridge.identify.covariance import covariance, of_effect
 from hdbridge.identify.figures import outlying
-from hdbridge.identify.intervals import covariance, effect_intervals
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Selection, System
 from hdbridge.identify.problem import LINEAR_ONLY, Problem
@@ -214,7 +214,7 @@ def _hold_what_is_unknown(
     effects = list(solution.effects)
     held = False
     for index, effect in enumerate(effects):
-        unknown = [each for each in effect_intervals(solution, index, cov) if not each.identifiable]
+        unknown = [each for each in of_effect(solution, index, cov) if not each.identifiable]
         edge = [name for owner, name in solution.at_bound if owner == index]
         if edge and not unknown:
             warnings.append(

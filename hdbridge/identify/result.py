@@ -9,8 +9,8 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.noise import NoiseModel
-from hdbridge.identify.intervals import Interval
 from hdbridge.identify.orders import Order
 from hdbridge.identify.spectrum import Spectrum
 from hdbridge.model import TransmissionModel

@@ -12,9 +12,9 @@ from hdbridge.calibration import Calibration, Offer
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.estimation.gain import Gain
+from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.noise import NoiseModel
 from hdbridge.evaluation.stepping import Scatter
-from hdbridge.identify.intervals import Interval
 from hdbridge.identify.orders import Order
 from hdbridge.identify.result import (
     ChosenOrder,

@@ -12,7 +12,8 @@ from hdbridge.daemon.adaptation.estimator import Estimator
 from hdbridge.daemon.adaptation.regressors import Regressors
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.effects import Effect, FloatArray
-from hdbridge.identify.intervals import NORMAL_95, Interval, difference, leaves, nested_half_widths
+from hdbridge.estimation.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
+from hdbridge.estimation.terms import Column
 
 DISC_ARCSEC = 10.0
 """Size that the load encoder's own errors per turn may have."""
@@ -82,16 +83,5 @@ def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArra
 
 def _slopes(effect: Effect) -> dict[str, FloatArray]:
     """Derivatives of the parameters that the coefficients make, by the coefficients, (c,) each."""
-    coefficients = effect.coefficients()
-    slopes: dict[str, FloatArray] = {}
-    for number in range(len(coefficients)):
-        step = np.zeros_like(coefficients)
-        step[number] = STEP_ARCSEC
-        low, high = (
-            dict(leaves(effect.fitted(coefficients + sign * step).parameters())) for sign in (-1.0, 1.0)
-        )
-        for name in low:
-            change = difference(name, low[name], high[name]) / (2.0 * STEP_ARCSEC)
-            if change:
-                slopes.setdefault(name, np.zeros_like(coefficients))[number] = change
-    return slopes
+    count = len(effect.coefficients())
+    return slopes(effect, [Column(0, str(number)) for number in range(count)], np.full(count, STEP_ARCSEC))

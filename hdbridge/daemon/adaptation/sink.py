@@ -22,7 +22,7 @@ from hdbridge.daemon.adaptation.proposal import Entry, Proposal
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode, Standing
 from hdbridge.daemon.watch.encoder_health import Judgement
 from hdbridge.errors import OutputError
-from hdbridge.identify.intervals import difference, leaves
+from hdbridge.estimation.intervals import difference, leaves
 from hdbridge.model import TransmissionModel
 
 if TYPE_CHECKING:

@@ -1,0 +1,77 @@
+"""The covariance of what was fitted, from the noise as it is, not as one would like it.
+
+The covariance of a fit under the noise model is the inverse information. Where the noise model is wrong the
+scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger
+1986) finds out, and wherever it is wider it is believed. What reading in counts leaves in a wave is the same
+all along a sweep, and other in the next: for waves the stretches are whole legs as well, and since there are
+few of these, all waves are taken together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hdbridge.effects import FloatArray, Part
+from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.design import clusters
+from hdbridge.estimation.intervals import Interval, intervals_of
+from hdbridge.estimation.linear import inverse_symmetric
+from hdbridge.estimation.noise import Precision
+from hdbridge.estimation.nuisances import is_turn
+from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.terms import Column
+
+STRETCHES = 100
+"""The record is cut into about so many stretches for the sandwich."""
+
+
+def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> FloatArray:
+    """Covariance of the solution's columns, shape (p, p)."""
+    model = inverse_symmetric(solution.information)
+    gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
+    number = clusters(blocks, max(gone / STRETCHES, 1e-9))
+    count = int(number[-1]) + 1
+    # Turns are noise (each has one stretch to itself), not parameters: they have no scores of their own.
+    main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]
+    if count < 2 * len(main):
+        return model
+    scores = solution.jacobian[:, main] * precision.apply(solution.residual)[:, np.newaxis]
+    sums = np.zeros((count, len(main)))
+    np.add.at(sums, number, scores)
+    inner = model[np.ix_(main, main)]
+    sandwich = inner @ (sums.T @ sums) @ inner * count / (count - 1.0)
+    widen = np.ones(len(model))
+    widen[main] = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inner), 1e-300), 1.0))
+    waves = np.array([at for at, each in enumerate(solution.columns) if _is_wave(solution, each)], dtype=int)
+    if len(waves):
+        between = math.sqrt(_between_legs(solution.jacobian[:, waves], precision, solution.residual, blocks))
+        widen[waves] = np.maximum(widen[waves], between)
+    return np.asarray(model * np.outer(widen, widen))
+
+
+def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]:
+    """Intervals of one effect's parameters by the covariance of a solution's columns."""
+    mine = [at for at, column in enumerate(solution.columns) if column.effect == index]
+    columns = [solution.columns[at] for at in mine]
+    return intervals_of(solution.effects[index], columns, cov[np.ix_(mine, mine)])
+
+
+def _is_wave(solution: Solution, column: Column) -> bool:
+    return column.effect >= 0 and solution.effects[column.effect].part is Part.ORDERS
+
+
+def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
+    """By how much the variance of waves, taken from leg to leg, is more than the noise model's; at least 1.
+
+    Waves (b, p) of one kind have nearly the same information and hardly share any, so that each tells of all.
+    """
+    scores = np.zeros((int(blocks.leg[-1]) + 1, waves.shape[1]))
+    own = np.zeros_like(scores)
+    np.add.at(scores, blocks.leg, waves * precision.apply(residual)[:, np.newaxis])
+    np.add.at(own, blocks.leg, waves * precision.apply(waves))
+    information = np.sum(own, axis=0)
+    legs = information**2 / np.sum(own**2, axis=0)
+    ratio = np.sum(scores**2, axis=0) / information * legs / np.maximum(legs - 1.0, 0.5)
+    return max(float(np.mean(ratio)), 1.0)
