@@ -12,6 +12,7 @@ from hdbridge.diagnose.lookalikes import lookalikes, waves_alike
 from hdbridge.diagnose.result import Identifiability
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, causes
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.linear import orthonormal
 from hdbridge.estimation.screening import candidates
 
 ENOUGH = 8_000
@@ -33,7 +34,7 @@ def identifiability(
     left: dict[str, list[tuple[FloatArray, float, float, Effect]]] = {}
     stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
-    basis = _orthonormal(fitted.basis[::stride])
+    basis = orthonormal(fitted.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
         columns = estimator.columns(candidate.effect, fitted.hypothesis.start)[::stride]
@@ -48,7 +49,7 @@ def identifiability(
         left.setdefault(candidate.cause, []).append((rest, share, size, candidate.effect))
     names = list(left)
     best = {name: max(left[name], key=lambda each: each[2]) for name in names}
-    spans = {name: _orthonormal(best[name][0]) for name in names}
+    spans = {name: orthonormal(best[name][0]) for name in names}
     result: dict[str, Identifiability] = {}
     for cause in causes():
         if cause not in best:
@@ -83,12 +84,6 @@ def _missing(estimator: Estimator, cause: str) -> str:
     if lacking:
         return "not recorded: " + ", ".join(sorted(each.value for each in lacking))
     return "nothing in this record or model to see it by"
-
-
-def _orthonormal(columns: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(columns.T @ columns)
-    kept = values > 1e-8 * max(float(values[-1]), 1e-300)
-    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:

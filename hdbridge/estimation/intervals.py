@@ -1,4 +1,4 @@
-"""95 % intervals of an effect's parameters, from the covariance of what was fitted, nested as in a model file."""
+"""95 % intervals of an effect's parameters, from the covariance of a fit, nested as in a model file."""
 
 from __future__ import annotations
 

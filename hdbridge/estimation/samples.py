@@ -16,6 +16,7 @@ from hdbridge.estimation.segment import MINIMUM_SAMPLES, Kind, Segment
 from hdbridge.observations.cuts import jumps
 from hdbridge.observations.driving import driving_angle
 from hdbridge.observations.reading import quantum_deg
+from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 
 KINDS = tuple(Kind)
@@ -108,14 +109,12 @@ def gather(
         )
     numbers = list(range(len(segments))) if independent_zeros else [each.zero for each in segments]
     names = {number: index for index, number in enumerate(dict.fromkeys(numbers))}
-    begins = [
+    cuts = [
         index
-        for index, each in enumerate(segments)
-        if index == 0
-        or each.start is not None
-        or numbers[index] != numbers[index - 1]
-        or not follows(segments[index - 1], each)
+        for index in range(1, len(segments))
+        if numbers[index] != numbers[index - 1] or not follows(segments[index - 1], segments[index])
     ]
+    begins = sorted({0, *cuts, *(index for index, each in enumerate(segments) if each.start is not None)})
     sizes = np.cumsum([0, *(len(each) for each in segments)]).tolist()
     chains: list[Chain] = []
     for first, last in zip(begins, [*begins[1:], len(segments)], strict=True):
@@ -124,15 +123,17 @@ def gather(
         rows = slice(sizes[first], sizes[last])
         chains.append(Chain(rows, motion, start if known is None and first == 0 else known))
     time = np.concatenate([each.time_s for each in segments])
-    measured = np.concatenate(
-        [each.motor_deg if each.position_deg is None else each.position_deg for each in segments]
-    )
+    measured = np.concatenate([_measured(each) for each in segments])
     load = np.concatenate([each.load_deg for each in segments])
     kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
     speed = np.concatenate([_rate(time[each.rows], each.motion.motor_deg) for each in chains])
     turned = np.concatenate([_has_turned(time[each.rows], each.motion.motor_deg) for each in chains])
     zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
-    _check_ratio(measured, load, zero, ratio, segments[0].name)
+    if not ratio > 0:
+        raise InputError(f"{segments[0].name}: the ratio is {ratio:g}; expected more than 0")
+    first = zero == zero[0]
+    columns = {"time_s": time, "motor_position_deg": measured, "load_position_deg": load}
+    Record({name: each[first] for name, each in columns.items()}, segments[0].name).check_ratio(ratio)
     error = load - measured / ratio
     for index in range(len(names)):
         error[zero == index] -= np.median(error[zero == index])
@@ -147,12 +148,9 @@ def gather(
         kind=kind,
         zero=zero,
         zeros=len(names),
-        count_deg=max(
-            quantum_deg(each.motor_deg if each.position_deg is None else each.position_deg)
-            for each in segments
-        ),
+        count_deg=max(quantum_deg(_measured(each)) for each in segments),
         chains=tuple(chains),
-        travel_deg=_travel_deg(segments, numbers),
+        travel_deg=max(float(np.ptp(each)) for each in np.split(measured, [sizes[index] for index in cuts])),
     )
 
 
@@ -165,19 +163,6 @@ def follows(before: Segment, segment: Segment) -> bool:
 
 def _measured(segment: Segment) -> FloatArray:
     return segment.motor_deg if segment.position_deg is None else segment.position_deg
-
-
-def _travel_deg(segments: Sequence[Segment], zeros: Sequence[int]) -> float:
-    """The largest span without another zero or a cut."""
-    low = high = None
-    largest = 0.0
-    for index, each in enumerate(segments):
-        here = _measured(each)
-        cut = index and (zeros[index] != zeros[index - 1] or not follows(segments[index - 1], each))
-        low = float(np.min(here)) if cut or low is None else min(low, float(np.min(here)))
-        high = float(np.max(here)) if cut or high is None else max(high, float(np.max(here)))
-        largest = max(largest, high - low)
-    return largest
 
 
 def _motion(segments: Sequence[Segment]) -> Motion:
@@ -237,22 +222,3 @@ def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
         settled = time[first] + min(SETTLE_S, SETTLE_SHARE * float(time[last] - time[first]))
         turned[first + 1 : int(np.searchsorted(time, settled, "right"))] = True
     return turned
-
-
-def _check_ratio(motor: FloatArray, load: FloatArray, zero: IntArray, ratio: float, name: str) -> None:
-    """InputError where the slope of load against motor is off by far more than any error of a gear."""
-    inside = zero == zero[0]
-    motor, load = motor[inside] - motor[inside].mean(), load[inside] - load[inside].mean()
-    spread = float(motor @ motor)
-    if not ratio > 0 or spread == 0:
-        if ratio > 0:
-            return
-        raise InputError(f"{name}: the ratio is {ratio:g}; expected more than 0")
-    slope = float(motor @ load) / spread
-    ramp_arcsec = abs(slope - 1.0 / ratio) * float(np.ptp(motor)) * ARCSEC_PER_DEG
-    if ramp_arcsec > 1000.0 and abs(slope * ratio - 1.0) > 2e-3:
-        hint = "turn the encoder's direction round" if slope < 0 else "correct the ratio"
-        found = f"{1.0 / slope:.6g}" if slope else "a load that stands still"
-        raise InputError(
-            f"{name}: the load follows the motor with a ratio of {found}, expected {ratio:g}; {hint}"
-        )

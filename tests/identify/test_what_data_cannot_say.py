@@ -90,9 +90,9 @@ def segment(**changes):
             20.0,
             r"a\.csv: time_s of sample 1 lies before",
         ),
-        (segment, 21.0, r"a\.csv: the load follows the motor with a ratio of 20, expected 21"),
+        (segment, 21.0, r"a\.csv: the motor makes 20 turns per turn of the load .*; expected a ratio of 21"),
         (segment, -20.0, "ratio"),
-        (lambda: segment(load_deg=-np.arange(400) / 10.0), 20.0, "direction round"),
+        (lambda: segment(load_deg=-np.arange(400) / 10.0), 20.0, "direction of one encoder round"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(make, ratio, complaint):
