@@ -358,9 +358,6 @@ class _Judge:
             peak_arcsec=size,
             lives_in=lives,
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
-            place=left.place,
-            curve_arcsec=left.curve_arcsec,
-            axis=left.lives_in,
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         foretold = left.explained_arcsec**2 > self.estimator.scales.loop_explains * left.arcsec**2
@@ -371,9 +368,6 @@ class _Judge:
                 probability=min(loops[0].probability, 0.8),
                 note=f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left",
                 lives_in=lives,
-                place=left.place,
-                curve_arcsec=left.curve_arcsec,
-                axis=left.lives_in,
             )
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)

@@ -133,9 +133,9 @@ _UNEXPLAINED: Final[dict[str, tuple[str, str]]] = {
 
 
 def _coordinate(lives_in: str) -> str:
-    if "load angle" in lives_in or lives_in == "position":
+    if "load angle" in lives_in or "position" in lives_in:
         return "load angle"
-    if "reversal" in lives_in:
+    if "reversal" in lives_in or lives_in == "direction":
         return "reversal"
     if "motor angle" in lives_in or "wave generator" in lives_in:
         return "motor angle"

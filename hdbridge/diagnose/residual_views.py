@@ -1,7 +1,8 @@
 """Seeing: what a model gets wrong, over every coordinate that a cause may depend on.
 
 A residual is looked at over motor angle, load angle, direction, speed, acceleration, torque, temperature,
-time and what has passed since the last reversal: means over bins, and how much of the residual they foretell.
+time and what has passed since the last reversal: means over bins on every other stretch of time, and how much
+of the residual they foretell on the rest.
 """
 
 from __future__ import annotations
@@ -12,19 +13,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hdbridge.effects import MEASURED, BoolArray, FloatArray
+from hdbridge.effects import MEASURED, BoolArray, FloatArray, IntArray, Motion
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import Coordinate
+from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.stretches import of_number
 
 if TYPE_CHECKING:
-    from hdbridge.diagnose.result import Diagnosis, Traces
+    from hdbridge.diagnose.result import Diagnosis
 
 
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
-COARSE: Final = 16
-"""Bins of time: wide enough that each has stretches of either half."""
+BINS: Final = {"load angle": 360, "position": 400, "time": 25}
+"""Where other bins foretell more than are good to look at: of time so few that each has stretches of either
+half."""
+SHRUNK: Final = 2.0
+"""Points with a mean of zero that each bin has in addition: a mean of few points foretells nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,16 +48,17 @@ class ResidualViews:
     def shares(self) -> dict[str, tuple[float, float]]:
         """Per coordinate the share of the mean square that bin means foretell, of both residuals, 0 to 1.
 
-        Means are taken on every other stretch of time and judged on the rest: noise has a share of zero.
+        Noise has a share of zero.
         """
-        odd = of_number(self.time_s, STRETCHES) % 2 == 1
-        return {
-            name: (
-                _share(each, self.given_arcsec, self.direction, odd),
-                _share(each, self.left_arcsec, self.direction, odd),
-            )
-            for name, each in self.coordinates.items()
-        }
+        odd = every_other(self.time_s)
+        both = self.given_arcsec, self.left_arcsec
+        squares = [max(float(np.mean(each**2)), 1e-300) for each in both]
+
+        def share(coordinate: Coordinate, which: int) -> float:
+            gain = foretold(coordinate, both[which], self.direction, odd)
+            return max(gain / squares[which], 0.0)
+
+        return {name: (share(each, 0), share(each, 1)) for name, each in self.coordinates.items()}
 
 
 def see(diagnosis: Diagnosis) -> ResidualViews:
@@ -63,7 +69,7 @@ def see(diagnosis: Diagnosis) -> ResidualViews:
         traces.measured_arcsec - traces.extended_arcsec,
         traces.direction,
         traces.time_s,
-        coordinates(traces, diagnosis.model.ratio),
+        coordinates(traces.motion, traces.rows, diagnosis.model.ratio),
     )
 
 
@@ -76,9 +82,8 @@ def shares_by_coordinate(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
-    """What a record can be looked at over; only what was recorded, and what varies."""
-    motion, rows = traces.motion, traces.rows
+def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:
+    """What a record can be looked at over at some of its points; only what was recorded, and what varies."""
     found = [
         over.motor_angle(motion),
         over.load_angle(motion, ratio),
@@ -91,25 +96,32 @@ def coordinates(traces: Traces, ratio: float) -> dict[str, Coordinate]:
         over.acceleration(motion),
         *(over.measured(motion, each) for each in MEASURED),
     ]
-    kept = [Coordinate("direction", "", traces.direction, bins=2), *(each.at(rows) for each in found)]
+    kept = [
+        Coordinate("direction", "", direction_of(motion)[rows], bins=2),
+        *(each.at(rows) for each in found),
+    ]
     order = ("motor angle", "load angle", "position", "direction")
     kept.sort(key=lambda each: order.index(each.name) if each.name in order else len(order))
     return {each.name: each for each in kept if each.varies()}
 
 
-def _share(coordinate: Coordinate, y: FloatArray, direction: FloatArray, odd: BoolArray) -> float:
-    if coordinate.name == "time":
-        coordinate = replace(coordinate, bins=COARSE)
+def every_other(time_s: FloatArray) -> BoolArray:
+    """The points in every other stretch of time, shape (m,)."""
+    return np.asarray(of_number(time_s, STRETCHES) % 2 == 1)
+
+
+def foretold(coordinate: Coordinate, values: FloatArray, direction: FloatArray, odd: BoolArray) -> float:
+    """Mean square of ``values`` (m,) that bin means of one half of the points take away in the other."""
+    coordinate = replace(coordinate, bins=BINS.get(coordinate.name, coordinate.bins))
     number = coordinate.numbers()
     bins = int(np.max(number)) + 1
     if coordinate.both_ways:
         number = number + bins * (direction < 0.0)
         bins *= 2
-    total = left = 0.0
+    gained = 0.0
     for train in (odd, ~odd):
         count = np.bincount(number[train], minlength=bins)
-        mean = np.bincount(number[train], y[train], bins) / (count + 1.0)
-        test = y[~train]
-        total += float(np.sum(test**2))
-        left += float(np.sum((test - mean[number[~train]]) ** 2))
-    return max(1.0 - left / total, 0.0) if total > 0.0 else 0.0
+        mean = np.bincount(number[train], values[train], bins) / (count + SHRUNK)
+        test = values[~train]
+        gained += float(np.sum(test**2) - np.sum((test - mean[number[~train]]) ** 2))
+    return gained / len(values)

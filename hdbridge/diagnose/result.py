@@ -77,10 +77,6 @@ class Finding:
     """What speaks for it."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
     """The terms of the formula of its probability."""
-    place: FloatArray | None = field(default=None, repr=False)
-    """Abscissa of a picture of it, shape (b,); in the unit of ``axis``."""
-    curve_arcsec: FloatArray | None = field(default=None, repr=False)
-    axis: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """For machines."""

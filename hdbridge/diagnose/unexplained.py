@@ -1,28 +1,25 @@
 """What is left when no cause fits: how much, and what it depends on.
 
-Non-parametric rivals that know nothing of causes (bins over load angle and direction, motor angle and
-direction, time, travel since the last reversal, speed, torque, temperature) are fitted on every other stretch
-of time and judged on the rest. Where the best of them takes a good deal away, there something is that the
-catalogue does not have.
+Non-parametric rivals that know nothing of causes (bins over all that a residual can be looked at over, see
+`residual_views`) are fitted on every other stretch of time and judged on the rest. Where the best of them
+takes a good deal away, there something is that the catalogue does not have.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.holdout import stretches
+from hdbridge.diagnose.residual_views import coordinates, every_other, foretold
 from hdbridge.diagnose.result import Finding
-from hdbridge.effects import BoolArray, FloatArray, IntArray, Part
+from hdbridge.effects import BoolArray, FloatArray, Part
 from hdbridge.effects.kinematics import direction_of
-from hdbridge.effects.path import since_reversal_deg
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.stretches import of_length
-from hdbridge.units import DEG_PER_TURN
 
 BLOCK_S = 0.2
 EPISODES = 30
@@ -40,39 +37,29 @@ class Rest:
     standing_arcsec: float
     """The same at rest only; 0 where it never rests."""
     lives_in: str
-    """Where most of it is; empty where nothing in particular."""
+    """Where most of it is; time where nothing in particular."""
     explained_arcsec: float
     """Root mean square of what the best rival takes away on data it has not seen."""
-    place: FloatArray
-    """Abscissa of the picture, in the unit that `lives_in` says."""
-    curve_arcsec: FloatArray
-    shares: dict[str, float]
-    """Of each rival: held-out share of the rest's variance."""
 
 
 def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     """Look at a residual."""
     residual = fitted.residual / estimator.weight
     arcsec = beyond_noise(estimator, residual)
-    best = ("", 0.0, np.empty(0), np.empty(0))
-    shares: dict[str, float] = {}
-    odd = stretches(estimator) % 2 == 1
-    smooth = _smoothed(estimator, residual)
-    variance = float(np.mean(smooth**2)) + 1e-12
-    for name, number, places in _coordinates(estimator):
-        gain, curve = _gain(smooth, number, odd, len(places))
-        shares[name] = max(gain / variance, 0.0)
-        if gain > best[1]:
-            best = (name, gain, places, curve)
+    motion, index = estimator.motion, estimator.index
+    smooth, odd = _smoothed(estimator, residual), every_other(estimator.time_s)
+    direction = direction_of(motion)[index]
+    best = ("time", 0.0)
+    for name, each in coordinates(motion, index, estimator.data.ratio).items():
+        for both in (False, True)[: 1 + each.both_ways]:
+            gain = foretold(replace(each, both_ways=both), smooth, direction, odd)
+            best = max(best, (f"{name} and direction" if both else name, gain), key=lambda one: one[1])
     return Rest(
         arcsec,
         float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
         _standing(estimator, residual),
-        best[0] or "time",
+        best[0],
         float(np.sqrt(best[1])),
-        best[2],
-        best[3],
-        shares,
     )
 
 
@@ -177,76 +164,3 @@ def _standing(estimator: Estimator, residual: FloatArray) -> float:
 def _smoothed(estimator: Estimator, residual: FloatArray) -> FloatArray:
     period = estimator.data.period_s * len(estimator.data.full) / len(estimator.data.points)
     return np.asarray(uniform_filter1d(residual, max(1, round(0.1 / period))))
-
-
-def _gain(values: FloatArray, number: IntArray, odd: BoolArray, bins: int) -> tuple[float, FloatArray]:
-    """Mean square that bin means from one half take away in the other, both ways round; and the bin means."""
-    before = after = 0.0
-    for train in (odd, ~odd):
-        count = np.bincount(number[train], minlength=bins)
-        mean = np.bincount(number[train], values[train], bins) / (count + 2.0)
-        test = values[~train]
-        before += float(np.sum(test**2))
-        after += float(np.sum((test - mean[number[~train]]) ** 2))
-    count = np.bincount(number, minlength=bins)
-    curve = np.bincount(number, values, bins) / np.maximum(count, 1)
-    return (before - after) / len(values), np.asarray(curve)
-
-
-def _coordinates(estimator: Estimator) -> Iterator[tuple[str, IntArray, FloatArray]]:
-    """Name, bin of each point, and the middle of each bin."""
-    motion, index = estimator.motion, estimator.index
-    motor = motion.motor_deg[index]
-    load = motor / estimator.data.ratio
-    direction = direction_of(motion)[index]
-    back = (direction < 0).astype(np.intp)
-    for name, angle, bins in (
-        ("motor angle", np.mod(motor, DEG_PER_TURN), 72),
-        ("load angle", np.mod(load, DEG_PER_TURN), 360),
-    ):
-        number = np.minimum((angle * (bins / DEG_PER_TURN)).astype(np.intp), bins - 1)
-        middle = np.asarray((np.arange(bins) + 0.5) * (DEG_PER_TURN / bins), dtype=np.float64)
-        yield name, number, middle
-        yield f"{name} and direction", number + bins * back, np.tile(middle, 2)
-    if float(np.ptp(load)) > 0.0:
-        yield "position", *_ranged(load, 400)
-    yield "time", *_ranged(estimator.time_s, 200, alternate=True)
-    since = since_reversal_deg(motion.motor_deg)[index]
-    number, middle = _ranged(np.log10(since + 0.05), 40)
-    angles = np.asarray(np.power(10.0, middle) - 0.05, dtype=np.float64)
-    yield "motor angle since the last reversal", number + 40 * back, np.tile(angles, 2)
-    speed = motion.motor_speed_deg_s
-    if speed is not None:
-        yield ("speed", *_quantiles(speed[index], 40))
-        yield "time since the last stop or start", *_ranged(np.log10(_since_change(estimator) + 0.02), 40)
-    if motion.motor_acceleration_deg_s2 is not None:
-        yield "acceleration", *_quantiles(motion.motor_acceleration_deg_s2[index], 40)
-    for channel, values in motion.measured.items():
-        if float(np.ptp(values)) > 0.0:
-            yield channel.title, *_quantiles(values[index], 40)
-
-
-def _ranged(values: FloatArray, bins: int, alternate: bool = False) -> tuple[IntArray, FloatArray]:
-    low, span = float(np.min(values)), max(float(np.ptp(values)), 1e-12)
-    number = np.minimum(((values - low) / span * bins).astype(np.intp), bins - 1)
-    if alternate:  # bins of time that are wider than the stretches that are held out
-        number = number // 8
-        bins = -(-bins // 8)
-    return number, np.asarray(low + (np.arange(bins) + 0.5) * (span / bins), dtype=np.float64)
-
-
-def _quantiles(values: FloatArray, bins: int) -> tuple[IntArray, FloatArray]:
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
-    if len(edges) < 2:
-        return np.zeros(len(values), dtype=np.intp), np.array([float(values[0])])
-    number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, len(edges) - 2)
-    return number.astype(np.intp), np.asarray(0.5 * (edges[1:] + edges[:-1]))
-
-
-def _since_change(estimator: Estimator) -> FloatArray:
-    motion = estimator.motion
-    assert motion.motor_speed_deg_s is not None
-    assert motion.time_s is not None
-    change = np.flatnonzero(np.diff(np.sign(motion.motor_speed_deg_s), prepend=np.nan) != 0.0)
-    last = change[np.searchsorted(change, np.arange(len(motion)), "right") - 1]
-    return np.asarray((motion.time_s - motion.time_s[last])[estimator.index])

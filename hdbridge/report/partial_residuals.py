@@ -91,7 +91,7 @@ def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
     if finding.effect is not None:
         own = finding.effect.coordinate(traces.motion, ratio).at(traces.rows)
         return own if own.varies() else time(traces.motion).at(traces.rows)
-    known = coordinates(traces, ratio)
+    known = coordinates(traces.motion, traces.rows, ratio)
     name = finding.lives_in.removesuffix(" and direction")
     if name in known:
         apart = known[name].both_ways and ("direction" in finding.lives_in or "reversal" in name)

@@ -70,9 +70,7 @@ def test_a_changed_encoder_cannot_be_told_from_the_first_motor_order(diagnosed: 
 def test_what_is_in_no_catalogue_is_unexplained_and_says_where(diagnosed: Diagnosed) -> None:
     first = diagnosed({"unknown": {"kind": "one_way", "size": 6.0}}).findings[0]
     assert first.cause == "unexplained"
-    assert first.lives_in
-    assert first.curve_arcsec is not None
-    assert len(first.curve_arcsec) > 10
+    assert "direction" in first.lives_in
 
 
 def test_two_effects_at_once(diagnosed: Diagnosed) -> None:
