@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray, refreshed
+from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
 from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.shapes import free_shapes, leaves, moved, shape_value, tangent, unit
@@ -75,7 +75,7 @@ class Solution:
     chi_square: float
     """With what was known beforehand."""
     columns: tuple[Column, ...]
-    """The nuisances', the effects' coefficients, then shapes."""
+    """The nuisances', the effects' coefficients (first of those without free shape), then shapes."""
     residual: FloatArray
     """Shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
@@ -86,30 +86,21 @@ class Solution:
     @cached_property
     def jacobian(self) -> FloatArray:
         """Derivatives by all columns, shape (m, p)."""
-        fixed, moving = self._point.fixed, self._point
-        both = np.empty((len(self.residual), len(self.columns)))
-        order = self._order
-        split = fixed.matrix.shape[1]
-        for at, source in enumerate(order):
-            part = fixed.matrix[:, source] if source < split else moving.matrix[:, source - split]
-            both[:, at] = part if self._point.inside[source] else 0.0
-        if len(order) < len(self.columns):
-            both[:, len(order) :] = self._fit.tangents(self.effects, central=True)[1]
-        return both
+        linear = np.concatenate([self._point.fixed.matrix, self._point.matrix], axis=1)
+        linear[:, ~self._point.inside] = 0.0
+        if linear.shape[1] == len(self.columns):
+            return linear
+        return np.concatenate([linear, self._fit.tangents(self.effects, central=True)[1]], axis=1)
 
     @cached_property
     def information(self) -> FloatArray:
         """Jacobian' K^-1 Jacobian and what was known beforehand, shape (p, p)."""
-        shapes = self.jacobian[:, len(self._order) :]
-        cross = self.jacobian.T @ self._fit.terms.weighting.apply(shapes)
-        size = len(self._order)
-        result = np.empty((len(self.columns),) * 2)
-        kept = self._point.inside[self._order]
-        result[:size, :size] = self._point.gram[np.ix_(self._order, self._order)] * np.outer(kept, kept)
-        result[:, size:] = cross
-        result[size:, :] = cross.T
-        result[np.arange(size, len(result)), np.arange(size, len(result))] += self.known[size:, 0]
-        return result
+        kept = self._point.inside
+        size = len(kept)
+        cross = self.jacobian.T @ self._fit.terms.weighting.apply(self.jacobian[:, size:])
+        linear = self._point.gram * np.outer(kept, kept)
+        shapes = cross[size:] + np.diag(self.known[size:, 0])
+        return np.block([[linear, cross[:size]], [cross[:size].T, shapes]])
 
     @cached_property
     def known(self) -> FloatArray:
@@ -130,14 +121,9 @@ class Solution:
                 result[at] = known.information, known.information * (known.mean - value)
         return result
 
-    @property
-    def _order(self) -> IntArray:
-        """Where the linear columns stand in the point's Gram matrix."""
-        return self._fit.order(self._point)
-
     def free(self) -> int:
         """Parameters that do anything in the data."""
-        linear = (self._point.inside & (np.diag(self._point.gram) > 0.0))[self._order]
+        linear = self._point.inside & (np.diag(self._point.gram) > 0.0)
         idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
         # Of a spring that the record does not load far enough, neither a zone nor where it begins is seen.
         partly = {each.effect for each, seen in zip(self.columns, linear, strict=False) if not seen}
@@ -366,22 +352,12 @@ class Separable:
         """Whether what effects carry of each other is what they were fitted with."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
-    def order(self, point: _Point) -> IntArray:
-        """Where the nuisances and the effects' coefficients, in their order, stand among the columns."""
-        at = len(self.terms.nuisances.names)
-        places: dict[int, range] = {}
-        for place in (*point.fixed.places, *point.moving):
-            count = len(point.effects[place].coefficients())
-            places[place] = range(at, at + count)
-            at += count
-        rest = [each for place in range(len(point.effects)) for each in places[place]]
-        return np.array([*range(len(self.terms.nuisances.names)), *rest], dtype=np.intp)
-
     def _solution(self, here: _Point) -> Solution:
         columns = [Column(-1, name) for name in self.terms.nuisances.names]
         edge = []
-        for place, effect in enumerate(here.effects):
-            columns += [Column(place, str(number)) for number in range(len(effect.coefficients()))]
+        for place in (*here.fixed.places, *here.moving):
+            count = len(here.effects[place].coefficients())
+            columns += [Column(place, str(number)) for number in range(count)]
         for place, effect in enumerate(here.effects):
             for each in free_shapes(effect, self.terms.moves):
                 columns.append(Column(place, each.name, True, each.logarithmic))
