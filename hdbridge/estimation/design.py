@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
-from hdbridge.effects.base import Memoryless, measured_by_all
+from hdbridge.effects import Effect, FloatArray, IntArray, Start
+from hdbridge.effects.base import Memoryless
 from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import Blocks
-from hdbridge.estimation.samples import Samples
+from hdbridge.estimation.samples import Samples, motion_at
 
 PART_SAMPLES = 50_000
 
@@ -47,7 +47,7 @@ class Design:
         blocks = self.blocks
         near = np.zeros(len(blocks), dtype=bool)
         for number, chain in enumerate(self.samples.chains):
-            turning, _ = branches(chain.motion.motor_deg)
+            turning, _ = branches(self.samples.motor_deg[chain.rows])
             place = np.array(turning) + chain.rows.start
             turn = place[np.maximum(np.searchsorted(place, blocks.middle, "left") - 1, 0)]
             since = np.abs(self.samples.motor_deg[blocks.middle] - self.samples.motor_deg[turn])
@@ -80,11 +80,11 @@ class Design:
         every = np.empty((len(self.samples), width)) if exact else None
         for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
             if every is not None:
-                every[chain.rows] = effect.columns(chain.motion, start)
+                every[chain.rows] = effect.columns(self.samples.along(chain), start)
             else:
                 picked, middles = self.sketch[number]
                 inside = self.blocks.chain == number
-                result[inside] = effect.columns(_picked(chain.motion, picked), start)[middles]
+                result[inside] = effect.columns(motion_at(self.samples.along(chain), picked), start)[middles]
         return result if every is None else self.blocks.mean(every)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
@@ -98,7 +98,7 @@ class Design:
         last = 0
         for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
             picked, middles = self.sketch[number]
-            motion = _picked(chain.motion, picked)
+            motion = motion_at(self.samples.along(chain), picked)
             turning, signs = branches(motion.motor_deg, Start.VIRGIN)
             inside = self.blocks.chain == number
             turn[inside] = last + np.searchsorted(turning, middles, "left")
@@ -127,7 +127,7 @@ class Design:
         left = self.samples.error_arcsec.copy()
         for chain, start in zip(self.samples.chains, self.starts, strict=True):
             for effect in effects:
-                left[chain.rows] -= effect.predict(chain.motion, start)
+                left[chain.rows] -= effect.predict(self.samples.along(chain), start)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
         sizes = np.diff(np.append(self.blocks.first, len(index)))
@@ -136,10 +136,16 @@ class Design:
 
     def _in_parts(self, effect: Effect) -> FloatArray:
         """Without memory a sample's columns do not depend on the others, so a part at a time will do."""
-        motion = _joined([chain.motion for chain in self.samples.chains])
-        result = np.empty((len(self.blocks), len(effect.coefficients())))
+        motion = self.samples.motion
+        return self.averaged(
+            len(effect.coefficients()), lambda index: effect.columns(motion_at(motion, index))
+        )
+
+    def averaged(self, width: int, values: Callable[[IntArray], FloatArray]) -> FloatArray:
+        """Block averages of ``values`` (i, width) of samples (i,), a part of them at a time; (b, width)."""
+        result = np.empty((len(self.blocks), width))
         for part, index in self.blocks.parts(PART_SAMPLES):
-            result[part] = self.blocks.mean_of_part(part, effect.columns(_picked(motion, index)))
+            result[part] = self.blocks.mean_of_part(part, values(index))
         return result
 
 
@@ -148,44 +154,25 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
 
     Orders need not be whole numbers: 1 / N is once per load turn, k (1 + 1/N) the flexspline's.
     """
-    blocks, motor = design.blocks, design.samples.motor_deg
-    result = np.empty((len(blocks), 2 * len(orders)))
     rate = np.deg2rad(np.asarray(orders, dtype=np.float64))
-    for part, index in blocks.parts(PART_SAMPLES):
-        angles = np.outer(motor[index], rate)
-        both = np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(index), -1)
-        result[part] = blocks.mean_of_part(part, both)
-    return result
+
+    def waves(index: IntArray) -> FloatArray:
+        angles = np.outer(design.samples.motor_deg[index], rate)
+        return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(index), -1)
+
+    return design.averaged(2 * len(orders), waves)
 
 
 def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray]]:
     result = []
     for number, chain in enumerate(samples.chains):
         middles = blocks.middle[blocks.chain == number] - chain.rows.start
-        turning, _ = branches(chain.motion.motor_deg, Start.VIRGIN)
-        first_moves = np.flatnonzero(np.diff(chain.motion.motor_deg))[:1]
+        motor_deg = samples.motor_deg[chain.rows]
+        turning, _ = branches(motor_deg, Start.VIRGIN)
+        first_moves = np.flatnonzero(np.diff(motor_deg))[:1]
         picked = np.union1d(np.concatenate([middles, np.array(turning), first_moves]), []).astype(np.intp)
         result.append((picked, np.searchsorted(picked, middles)))
     return result
-
-
-def _picked(motion: Motion, index: IntArray) -> Motion:
-    return Motion(
-        motion.motor_deg[index],
-        None if motion.time_s is None else motion.time_s[index],
-        {channel: values[index] for channel, values in motion.measured.items()},
-    )
-
-
-def _joined(motions: Sequence[Motion]) -> Motion:
-    if len(motions) == 1:
-        return motions[0]
-    times = [each.time_s for each in motions if each.time_s is not None]
-    return Motion(
-        np.concatenate([each.motor_deg for each in motions]),
-        np.concatenate(times) if len(times) == len(motions) else None,
-        measured_by_all([each.measured for each in motions]),
-    )
 
 
 def clusters(blocks: Blocks, span_s: float) -> IntArray:

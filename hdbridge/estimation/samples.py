@@ -41,7 +41,6 @@ class Chain:
     """Consecutive segments through which the elastic state is carried."""
 
     rows: slice
-    motion: Motion
     start: Start | None
     """None where it has to be found by fit."""
 
@@ -51,9 +50,8 @@ class Samples:
     """Segments laid end to end; arrays of shape (n,)."""
 
     ratio: float
-    time_s: FloatArray
-    motor_deg: FloatArray
-    """The driving angle."""
+    motion: Motion
+    """What drove the axis: the driving angle, time, and the channels that all segments have."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
@@ -75,18 +73,40 @@ class Samples:
 
     def __len__(self) -> int:
         """Number of samples."""
-        return len(self.time_s)
+        return len(self.motion)
+
+    @property
+    def motor_deg(self) -> FloatArray:
+        """The driving angle."""
+        return self.motion.motor_deg
+
+    @property
+    def time_s(self) -> FloatArray:
+        """The record's clock."""
+        assert self.motion.time_s is not None
+        return self.motion.time_s
+
+    def along(self, chain: Chain) -> Motion:
+        """What drove one of the chains."""
+        return motion_at(self.motion, chain.rows)
 
     def delayed(self, delay_s: float) -> Samples:
         """The same if the load was read so much later than the motor: with the motor as it was then."""
         motor = self.motor_deg.copy()
-        chains = []
         for chain in self.chains:
             time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
             motor[chain.rows] = np.interp(time - delay_s, time, angle)
-            chains.append(replace(chain, motion=replace(chain.motion, motor_deg=motor[chain.rows])))
         error = self.error_arcsec + (self.motor_deg - motor) / self.ratio * ARCSEC_PER_DEG
-        return replace(self, motor_deg=motor, error_arcsec=error, chains=tuple(chains))
+        return replace(self, motion=replace(self.motion, motor_deg=motor), error_arcsec=error)
+
+
+def motion_at(motion: Motion, rows: slice | IntArray) -> Motion:
+    """A motion at some of its samples."""
+    return Motion(
+        motion.motor_deg[rows],
+        None if motion.time_s is None else motion.time_s[rows],
+        {channel: values[rows] for channel, values in motion.measured.items()},
+    )
 
 
 def gather(
@@ -117,17 +137,19 @@ def gather(
     begins = sorted({0, *cuts, *(index for index, each in enumerate(segments) if each.start is not None)})
     sizes = np.cumsum([0, *(len(each) for each in segments)]).tolist()
     chains: list[Chain] = []
-    for first, last in zip(begins, [*begins[1:], len(segments)], strict=True):
+    driving: list[FloatArray] = []
+    for first, last in pairwise([*begins, len(segments)]):
         known = segments[first].start
-        motion = _motion(segments[first:last])
+        driving.append(_driving(segments[first:last]))
         rows = slice(sizes[first], sizes[last])
-        chains.append(Chain(rows, motion, start if known is None and first == 0 else known))
+        chains.append(Chain(rows, start if known is None and first == 0 else known))
     time = np.concatenate([each.time_s for each in segments])
     measured = np.concatenate([_measured(each) for each in segments])
     load = np.concatenate([each.load_deg for each in segments])
     kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
-    speed = np.concatenate([_rate(time[each.rows], each.motion.motor_deg) for each in chains])
-    turned = np.concatenate([_has_turned(time[each.rows], each.motion.motor_deg) for each in chains])
+    both = [(time[each.rows], angle) for each, angle in zip(chains, driving, strict=True)]
+    speed = np.concatenate([_rate(*each) for each in both])
+    turned = np.concatenate([_has_turned(*each) for each in both])
     zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
     if not ratio > 0:
         raise InputError(f"{segments[0].name}: the ratio is {ratio:g}; expected more than 0")
@@ -139,8 +161,7 @@ def gather(
         error[zero == index] -= np.median(error[zero == index])
     return Samples(
         ratio=ratio,
-        time_s=time,
-        motor_deg=np.concatenate([each.motion.motor_deg for each in chains]),
+        motion=Motion(np.concatenate(driving), time, measured_by_all([each.measured for each in segments])),
         load_deg=load,
         error_arcsec=error * ARCSEC_PER_DEG,
         speed_deg_s=speed,
@@ -165,19 +186,13 @@ def _measured(segment: Segment) -> FloatArray:
     return segment.motor_deg if segment.position_deg is None else segment.position_deg
 
 
-def _motion(segments: Sequence[Segment]) -> Motion:
-    """The motion of a chain; channels only where every segment has them."""
-
-    def joined(name: str) -> FloatArray | None:
-        parts = [getattr(each, name) for each in segments]
-        return None if any(part is None for part in parts) else np.concatenate(parts)
-
-    motor = np.concatenate([each.motor_deg for each in segments])
-    commanded = all(each.commanded for each in segments)
-    return Motion(
-        driving_angle(motor, joined("position_deg"), commanded),
-        np.concatenate([each.time_s for each in segments]),
-        measured_by_all([each.measured for each in segments]),
+def _driving(segments: Sequence[Segment]) -> FloatArray:
+    """The driving angle of a chain."""
+    seen = [each.position_deg for each in segments if each.position_deg is not None]
+    return driving_angle(
+        np.concatenate([each.motor_deg for each in segments]),
+        np.concatenate(seen) if len(seen) == len(segments) else None,
+        all(each.commanded for each in segments),
     )
 
 

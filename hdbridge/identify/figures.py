@@ -55,7 +55,7 @@ def laps_arcsec(samples: Samples) -> float | None:
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
     sweep = samples.usable & (samples.kind == KINDS.index(Kind.SWEEP))
     for chain in samples.chains:
-        turning, signs = branches(chain.motion.motor_deg)
+        turning, signs = branches(samples.motor_deg[chain.rows])
         for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
             rows = np.arange(chain.rows.start + first + 1, chain.rows.start + last + 1)
             rows = rows[sweep[rows]]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.effects import Channel, Effect, FloatArray, Start
+from hdbridge.effects import Effect, FloatArray, Start
 from hdbridge.errors import InputError
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.design import Design, harmonics
@@ -102,7 +102,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     weight = design.blocks.count
     effects: list[Effect] = []
     for effect in options.effects:
-        missing = [each.value for each in effect.channels if not _has(samples, each)]
+        missing = [each.value for each in effect.channels if each not in samples.motion.available()]
         if missing:
             warnings.append(f"{effect.name}: not fitted, the record has no {', '.join(missing)}")
             continue
@@ -236,7 +236,3 @@ def _hold_what_is_unknown(
         solution = problem.fitted(state.precision(), LINEAR_ONLY)
         cov = covariance(solution, state.precision(), blocks)
     return solution, cov
-
-
-def _has(samples: Samples, channel: Channel) -> bool:
-    return all(channel in chain.motion.available() for chain in samples.chains)

@@ -68,7 +68,7 @@ def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
 
     full = replace(
         seen.diagnosis.full,
-        motion=table.chains[0].motion,
+        motion=table.motion,
         error_arcsec=table.error_arcsec,
         usable=table.usable,
         sigma_arcsec=np.full(len(table), NOISE_ARCSEC),
