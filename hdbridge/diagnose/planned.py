@@ -12,8 +12,9 @@ from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.observed import gather
 from hdbridge.estimation.terms import Effort
 from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import AxisView, MotionLimits, Procedure, Sample
+from hdbridge.procedures.moves import AxisView, MotionLimits
 from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import legs_of
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
@@ -31,12 +32,15 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
     """
     view = AxisView(model.ratio, limits)
     tasks = plan.tasks(view)
-    times: list[float] = []
     places: list[float] = []
     legs: list[Segment] = []
     for task in tasks.tasks:
-        _walk(task.procedure, view, times, places, legs)
-    time = np.array(times)
+        for move, path in legs_of(task.procedure, view, places[-1] if places else 0.0):
+            count, first = max(1, round(path.duration_s / PERIOD_S)), len(places)
+            places += [path.at(path.duration_s * i / count) for i in range(1, count + 1)]
+            end_s = (len(places) - 1) * PERIOD_S
+            legs.append(Segment(kind=move.kind, start_s=first * PERIOD_S, end_s=end_s, notes={}))
+    time = np.arange(len(places), dtype=np.float64) * PERIOD_S
     motor = np.array(places) * model.ratio
     start = Start.FORWARD
     motion = Motion(motor, time_s=time)
@@ -58,29 +62,3 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
         "identifiability": {name: each.as_dict() for name, each in found.items()},
         "notes": list(tasks.notes),
     }
-
-
-def _walk(
-    procedure: Procedure[object], view: AxisView, times: list[float], places: list[float], legs: list[Segment]
-) -> None:
-    """Go through a procedure on an ideal axis, sample by sample."""
-    steps = procedure.moves(view)
-    place = places[-1] if places else 0.0
-    now = times[-1] + PERIOD_S if times else 0.0
-    try:
-        move = next(steps)
-        while True:
-            path = move.path(place, view.limits)
-            count = max(1, round(path.duration_s / PERIOD_S))
-            begin = now
-            samples = []
-            for i in range(1, count + 1):
-                place = path.at(path.duration_s * i / count)
-                times.append(now)
-                places.append(place)
-                samples.append(Sample(now, place, place * view.ratio, place * view.ratio, place, 0.0))
-                now += PERIOD_S
-            legs.append(Segment(kind=move.kind, start_s=begin, end_s=now - PERIOD_S, notes={}))
-            move = steps.send(samples)
-    except StopIteration:
-        return

@@ -29,10 +29,8 @@ def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
     scaled = matrix / np.outer(scale, scale)
     factor, solved, failed = dposv(scaled, right / spread, lower=1)
     if failed or np.min(np.diag(factor)) ** 2 < SUSPECT:
-        values, vectors = np.linalg.eigh(scaled)
-        kept = values > SEEN * max(float(values[-1]), 1e-300)
-        inner = vectors[:, kept].T @ (right / spread)
-        solved = vectors[:, kept] @ (inner / (values[kept] if right.ndim == 1 else values[kept, np.newaxis]))
+        directions = seen_directions(scaled)
+        solved = directions @ (directions.T @ (right / spread))
     return np.asarray(solved / spread).reshape(right.shape)
 
 

@@ -114,7 +114,6 @@ def gather(
     ratio: float,
     start: Start | None = None,
     slow_deg_s: float | None = None,
-    independent_zeros: bool = False,
 ) -> Samples:
     """Lay segments end to end. InputError where there is too little, or the ratio is not this gear's.
 
@@ -127,7 +126,7 @@ def gather(
         raise InputError(
             f"{total} samples in {len(segments)} segments; expected at least {MINIMUM_SAMPLES}: record more"
         )
-    numbers = list(range(len(segments))) if independent_zeros else [each.zero for each in segments]
+    numbers = [each.zero for each in segments]
     names = {number: index for index, number in enumerate(dict.fromkeys(numbers))}
     cuts = [
         index

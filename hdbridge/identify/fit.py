@@ -57,7 +57,7 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
     """
     options = options or FitOptions()
     warnings: list[str] = []
-    samples = gather(segments, ratio, options.start, options.slow_deg_s, options.independent_zeros)
+    samples = gather(segments, ratio, options.start)
     usable = int(np.count_nonzero(samples.usable))
     if usable < MINIMUM_USABLE:
         raise InputError(

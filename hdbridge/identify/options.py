@@ -24,10 +24,6 @@ class FitOptions:
     """Orders below this are left out however certain they are."""
     start: Start | None = None
     """Elastic state at the first sample: `Start.FORWARD` after the bench's pre-conditioning; None: by fit."""
-    slow_deg_s: float | None = None
-    """Load speed up to which samples are used; by default that of the slow legs."""
-    independent_zeros: bool = False
-    """Every segment has a zero of its own."""
     active: TransmissionModel | None = None
     """The model that the new one has to beat, and whose shapes it falls back on."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -89,10 +89,7 @@ def select(
     split = 2 * len(candidates)
     own = np.diag(information)[:split]
     # What is in the fit anyway is eliminated once; the search works on what is left of the candidates.
-    cross = information[split:, :split]
-    explained = solve_symmetric(information[split:, split:], cross)
-    information = information[:split, :split] - cross.T @ explained
-    right = right[:split] - explained.T @ right[split:]
+    information, right = given(information, right, range(split), range(split, len(right)))
     needed = threshold(len(candidates), family_wise)
     inside: list[int] = []
     for _ in range(2 * len(candidates)):
@@ -128,6 +125,16 @@ def select(
     )
 
 
+def given(
+    information: FloatArray, right: FloatArray, own: Collection[int], others: Collection[int]
+) -> System:
+    """Information and right side of some columns with others eliminated."""
+    mine, rest = np.array([*own], dtype=np.intp), np.array([*others], dtype=np.intp)
+    cross = information[np.ix_(rest, mine)]
+    explained = solve_symmetric(information[np.ix_(rest, rest)], cross)
+    return information[np.ix_(mine, mine)] - cross.T @ explained, right[mine] - explained.T @ right[rest]
+
+
 def _scores(
     inside: Sequence[int],
     pairs: Sequence[IntArray],
@@ -137,12 +144,10 @@ def _scores(
     only: int | None = None,
 ) -> dict[int, tuple[float, float, float]]:
     """For each candidate: fall in chi square, amplitude, and the share of it that those inside leave over."""
-    active = np.concatenate([np.zeros(0), *(pairs[index] for index in inside)]).astype(np.intp)
+    active = [each for index in inside for each in pairs[index].tolist()]
     wanted = range(len(pairs)) if only is None else [only]
-    columns = np.concatenate([np.zeros(0), *(pairs[index] for index in wanted)]).astype(np.intp)
-    explained = solve_symmetric(information[np.ix_(active, active)], information[np.ix_(active, columns)])
-    left = information[np.ix_(columns, columns)] - information[np.ix_(columns, active)] @ explained
-    score = right[columns] - explained.T @ right[active]
+    columns = [each for index in wanted for each in pairs[index].tolist()]
+    left, score = given(information, right, columns, active)
     result = {}
     for at, index in enumerate(wanted):
         two = slice(2 * at, 2 * at + 2)

@@ -15,7 +15,7 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.identify.orders import NOT_APART, Order, System, correlation, threshold
+from hdbridge.identify.orders import NOT_APART, Order, System, correlation, given, threshold
 from hdbridge.units import DEG_PER_TURN
 
 BINS_PER_TURN = 128
@@ -96,9 +96,8 @@ def spectrum(
     for index, order in enumerate(orders):
         own = [2 * index, 2 * index + 1]
         others = [each for each in inside if each not in own] + always
-        explained = solve_symmetric(information[np.ix_(others, others)], information[np.ix_(others, own)])
-        left = information[np.ix_(own, own)] - information[np.ix_(own, others)] @ explained
-        cosine, sine = solve_symmetric(left, right[own] - explained.T @ right[others]).tolist()
+        left, moment = given(information, right, own, others)
+        cosine, sine = solve_symmetric(left, moment).tolist()
         floor = 1e-9 * np.diag(information)[own]
         error = float(np.max(1.0 / np.sqrt(np.maximum(np.diag(left), floor))))
         alike = tuple(b if a == order else a for a, b, _ in resolved.aliases if order in {a, b})

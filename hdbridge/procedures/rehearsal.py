@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from hdbridge.errors import InputError
-from hdbridge.procedures.moves import AxisView, Procedure, Sample
+from hdbridge.procedures.moves import AxisView, Move, Path, Procedure, Sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,28 +27,39 @@ def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.
     """
     limits = axis.limits
     duration, legs = 0.0, 0
-    place = lowest = highest = start_deg
+    lowest = highest = start_deg
+    for _, path in legs_of(procedure, axis, start_deg):
+        lowest, highest = min(lowest, path.lowest_deg), max(highest, path.highest_deg)
+        for edge in (path.lowest_deg, path.highest_deg):
+            if not limits.position_min_deg <= edge <= limits.position_max_deg:
+                raise InputError(
+                    f"this would move the load to {edge:.6g} deg; the axis file "
+                    f"allows {limits.position_min_deg:g} to {limits.position_max_deg:g} (limits): "
+                    "nothing was moved; choose fewer or smaller steps, or another start"
+                )
+        duration += path.duration_s
+        legs += 1
+    return Rehearsal(duration, lowest, highest, legs)
+
+
+def legs_of(
+    procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0
+) -> Iterator[tuple[Move, Path]]:
+    """Each move of a procedure on an ideal axis, and the path that it takes."""
+    now, place = 0.0, start_deg
     steps = procedure.moves(axis)
     try:
         move = next(steps)
         while True:
-            path = move.path(place, limits)
-            lowest, highest = min(lowest, path.lowest_deg), max(highest, path.highest_deg)
-            for edge in (path.lowest_deg, path.highest_deg):
-                if not limits.position_min_deg <= edge <= limits.position_max_deg:
-                    raise InputError(
-                        f"this would move the load to {edge:.6g} deg; the axis file "
-                        f"allows {limits.position_min_deg:g} to {limits.position_max_deg:g} (limits): "
-                        "nothing was moved; choose fewer or smaller steps, or another start"
-                    )
+            path = move.path(place, axis.limits)
+            yield move, path
             place = path.at(path.duration_s)
             motor = place * axis.ratio
             samples = [
-                Sample(duration + share * path.duration_s, place, motor, motor, place, 0.0)
+                Sample(now + share * path.duration_s, place, motor, motor, place, 0.0)
                 for share in (0.0, 0.5, 1.0)
             ]
-            duration += path.duration_s
-            legs += 1
+            now += path.duration_s
             move = steps.send(samples)
     except StopIteration:
-        return Rehearsal(duration, lowest, highest, legs)
+        return
