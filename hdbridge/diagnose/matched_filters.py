@@ -74,9 +74,8 @@ def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
     data = estimator.data
-    assert data.full.motion.time_s is not None
     first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
-    yield (float(data.full.motion.time_s[first]),)
+    yield (float(data.full.time_s[first]),)
 
 
 def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
@@ -138,8 +137,7 @@ def tones(
     A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
     """
     data = estimator.data
-    time_s = data.full.motion.time_s
-    assert time_s is not None
+    time_s = data.full.time_s
     slot = np.round((time_s - time_s[0]) / data.period_s).astype(np.int64)
     length = int(slot[-1]) + 1
     if length > 4 * len(time_s) + 1000 or length < 64:

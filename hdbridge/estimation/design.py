@@ -175,8 +175,9 @@ def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray
     return result
 
 
-def clusters(blocks: Blocks, span_s: float) -> IntArray:
-    """A number per block that changes where a chain does, or after every ``span_s`` of measured time."""
+def clusters(blocks: Blocks, number: int) -> IntArray:
+    """Blocks in about so many stretches of measured time, each of one chain; a number per block."""
     gone = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(blocks.time_s), 0.0, 1.0))])
+    span_s = max(float(gone[-1]) / number, 1e-9)
     cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
     return np.concatenate([[0], np.cumsum(cut)]).astype(np.intp)

@@ -18,7 +18,7 @@ from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.noise import White
-from hdbridge.estimation.observed import Observed, Series
+from hdbridge.estimation.observed import Observed
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
@@ -132,7 +132,7 @@ class Estimator:
         self.index: IntArray = np.flatnonzero(points.usable)
         self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
         self.observed: FloatArray = points.error_arcsec[self.index]
-        self.time_s: FloatArray = _time(points)[self.index]
+        self.time_s: FloatArray = points.time_s[self.index]
         self.zero: IntArray = points.zero[self.index]
         self.load_angles = 0
         """How often the predicted load angle was exchanged."""
@@ -198,11 +198,6 @@ class Estimator:
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Columns in units of the noise."""
         return np.asarray(columns * self.weight[:, np.newaxis])
-
-    def zero_columns(self) -> FloatArray:
-        """One column per absolute zero, shape (m, zeros)."""
-        own: FloatArray = (self.zero[:, np.newaxis] == np.arange(self.data.zeros)).astype(np.float64)
-        return own
 
     def free_loop(self, start: Start) -> FloatArray:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
@@ -309,7 +304,8 @@ class Estimator:
         """A zero for each absolute zero, and what else every fit may use."""
         names = [f"zero{i}" for i in range(self.data.zeros)]
         names += [f"nuisance{i}" for i in range(self.nuisance.shape[1])]
-        columns = np.hstack([self.zero_columns(), self.nuisance])
+        zeros = self.zero[:, np.newaxis] == np.arange(self.data.zeros)
+        columns = np.hstack([zeros.astype(np.float64), self.nuisance])
         return Nuisances(columns, tuple(names), np.zeros(len(names)))
 
     def _sign(self, effect: Effect) -> float:
@@ -336,8 +332,3 @@ class Estimator:
 def _smooth(values: FloatArray) -> FloatArray:
     """A channel without the noise of its readings, of which parabolas through `SMOOTH` keep a sixth."""
     return np.asarray(savgol_filter(values, SMOOTH, 2)) if len(values) > SMOOTH else values
-
-
-def _time(series: Series) -> FloatArray:
-    assert series.motion.time_s is not None
-    return series.motion.time_s

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from hdbridge.observations.driving import reversals
 from hdbridge.observations.kinematics import kinematics
 from hdbridge.observations.reading import Reading, quantum_deg, reading_of
 from hdbridge.records.record import Record
+from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
 
 MOST_POINTS = 100_000
@@ -39,25 +39,6 @@ SETTLE_S = 0.15
 """After a fast move the load is left this much time to come to rest."""
 FAST_KINDS = frozenset({"move", "precondition", "step"})
 """Legs whose motion serves only to get somewhere: the load's own dynamics are not what is asked about."""
-
-
-class Leg(Protocol):
-    """A stretch of a recording; `hdbridge.records.recording.Segment` is one."""
-
-    @property
-    def kind(self) -> str:
-        """What the axis did."""
-        ...
-
-    @property
-    def start_s(self) -> float:
-        """Time of the first sample."""
-        ...
-
-    @property
-    def end_s(self) -> float:
-        """Time of the last sample."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +62,12 @@ class Series:
     def __len__(self) -> int:
         """Number of points."""
         return len(self.error_arcsec)
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Time of each point on the record's clock."""
+        assert self.motion.time_s is not None
+        return self.motion.time_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +115,7 @@ class Observed:
 def gather(
     record: Record,
     ratio: float,
-    legs: Sequence[Leg] = (),
+    legs: Sequence[Segment] = (),
     independent_zeros: bool = False,
     expected: Callable[[Motion], FloatArray] | None = None,
 ) -> Observed:
@@ -197,7 +184,7 @@ class _Facts:
 
 
 def _series(
-    record: Record, ratio: float, legs: Sequence[Leg], independent: bool
+    record: Record, ratio: float, legs: Sequence[Segment], independent: bool
 ) -> tuple[Series, tuple[str, ...], _Facts]:
     time = record.time_s
     steps = np.diff(time)
@@ -259,7 +246,7 @@ def _series(
 
 
 def _kinds(
-    time: FloatArray, speed: FloatArray, fresh: BoolArray, legs: Sequence[Leg]
+    time: FloatArray, speed: FloatArray, fresh: BoolArray, legs: Sequence[Segment]
 ) -> tuple[IntArray, IntArray, tuple[str, ...]]:
     """Kind and number of the leg of each sample; without legs by whether it stands, is slow or fast."""
     if legs:

@@ -30,8 +30,7 @@ STRETCHES = 100
 def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> FloatArray:
     """Covariance of the solution's columns, shape (p, p)."""
     model = inverse_symmetric(solution.information)
-    gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
-    number = clusters(blocks, max(gone / STRETCHES, 1e-9))
+    number = clusters(blocks, STRETCHES)
     count = int(number[-1]) + 1
     # Turns are noise (each has one stretch to itself), not parameters: they have no scores of their own.
     main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]

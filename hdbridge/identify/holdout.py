@@ -22,6 +22,8 @@ from hdbridge.identify.result import HeldOut
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
+STRETCHES = 40
+"""Of time, of which a fold takes every fourth."""
 BRIEF = Effort(steps=5)
 """From the whole record's minimum it is not far to that of most of it."""
 RECORDINGS = "recordings"
@@ -71,8 +73,7 @@ def held_out(
         return HeldOut(
             None, None, math.nan, "nothing was held out: there is too little data to leave any out"
         )
-    gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
-    stretch = blocks.chain if over == RECORDINGS else clusters(blocks, max(gone / 40, 1e-9))
+    stretch = blocks.chain if over == RECORDINGS else clusters(blocks, STRETCHES)
     number = len(np.unique(fold[used]))
 
     def total(values: FloatArray) -> FloatArray:
@@ -127,8 +128,7 @@ def folds(problem: Problem) -> tuple[IntArray, str]:
     lowest = float(np.min(blocks.motor_deg))
     turns = float(np.ptp(blocks.motor_deg)) / DEG_PER_TURN
     by_turn = np.floor((blocks.motor_deg - lowest) / DEG_PER_TURN).astype(np.intp) % FOLDS
-    gone = float(np.sum(np.clip(np.diff(blocks.time_s), 0.0, 1.0)))
-    by_time = clusters(blocks, max(gone / (10 * FOLDS), 1e-9)) % FOLDS
+    by_time = clusters(blocks, STRETCHES) % FOLDS
     if turns < 2 * FOLDS:
         return (blocks.chain % FOLDS, RECORDINGS) if _alike(blocks) else (by_time, "stretches of time")
     local = np.isin(blocks.kind, [KINDS.index(each) for each in (Kind.SINE, Kind.REVERSAL)])
