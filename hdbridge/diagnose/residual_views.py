@@ -25,9 +25,8 @@ if TYPE_CHECKING:
 
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
-BINS: Final = {"load angle": 360, "position": 400, "time": 25}
-"""Where other bins foretell more than are good to look at: of time so few that each has stretches of either
-half."""
+COARSE: Final = 16
+"""Bins of time: wide enough that each has stretches of either half."""
 SHRUNK: Final = 2.0
 """Points with a mean of zero that each bin has in addition: a mean of few points foretells nothing."""
 
@@ -55,6 +54,8 @@ class ResidualViews:
         squares = [max(float(np.mean(each**2)), 1e-300) for each in both]
 
         def share(coordinate: Coordinate, which: int) -> float:
+            if coordinate.name == "time":
+                coordinate = replace(coordinate, bins=COARSE)
             gain = foretold(coordinate, both[which], self.direction, odd)
             return max(gain / squares[which], 0.0)
 
@@ -112,7 +113,6 @@ def every_other(time_s: FloatArray) -> BoolArray:
 
 def foretold(coordinate: Coordinate, values: FloatArray, direction: FloatArray, odd: BoolArray) -> float:
     """Mean square of ``values`` (m,) that bin means of one half of the points take away in the other."""
-    coordinate = replace(coordinate, bins=BINS.get(coordinate.name, coordinate.bins))
     number = coordinate.numbers()
     bins = int(np.max(number)) + 1
     if coordinate.both_ways:

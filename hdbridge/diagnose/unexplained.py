@@ -21,6 +21,9 @@ from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.stretches import of_length
 
+BINS = {"load angle": 360, "position": 400, "time": 25}
+"""Of angles as many as a narrow bump or a wave of the motor's orders asks for; of time no more than there are
+stretches of either half for."""
 BLOCK_S = 0.2
 EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
@@ -52,7 +55,8 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     best = ("time", 0.0)
     for name, each in coordinates(motion, index, estimator.data.ratio).items():
         for both in (False, True)[: 1 + each.both_ways]:
-            gain = foretold(replace(each, both_ways=both), smooth, direction, odd)
+            bins = BINS.get(name, each.bins)
+            gain = foretold(replace(each, both_ways=both, bins=bins), smooth, direction, odd)
             best = max(best, (f"{name} and direction" if both else name, gain), key=lambda one: one[1])
     return Rest(
         arcsec,
