@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.diagnose.search import Search
-from hdbridge.effects import CATALOGUE, MEASURED, Effect, Part, Start, aliases_of, unmet
+from hdbridge.effects import CATALOGUE, Effect, Part, Start, aliases_of, unmet
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import orthonormal
-from hdbridge.observations.reading import third_deviation
 
 
 def plausible_only(search: Search, fitted: Fitted) -> Fitted:
@@ -85,9 +84,9 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
             driven = [each for each in trial.hypothesis.effects if type(each) is kind]
             if any(each.violations() for each in driven):
                 continue
-            if worse < scales.twin * own + scales.noisy * sum(
-                _lost_to_noise(estimator, each) for each in driven
-            ):
+            start = trial.hypothesis.start
+            lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
+            if worse < scales.twin * own + scales.noisy * float(lost):
                 return trial
     return fitted
 
@@ -151,16 +150,3 @@ def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...
         ):
             return trial
     return fitted
-
-
-def _lost_to_noise(estimator: Estimator, effect: Effect) -> float:
-    """Chi square that an effect leaves because its channel was measured with noise."""
-    motion = estimator.motion
-    shifted = {
-        each: motion.measured[each] + third_deviation(np.diff(motion.measured[each], 3))
-        for each in MEASURED
-        if each in effect.needs()
-    }
-    moved = replace(motion, measured={**motion.measured, **shifted})
-    change = (effect.predict(moved) - effect.predict(motion))[estimator.index]
-    return float(np.sum((estimator.weight * change) ** 2))

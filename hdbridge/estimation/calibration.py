@@ -17,7 +17,7 @@ import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.estimation.scales import Scales
-from hdbridge.estimation.shapes import shape_value
+from hdbridge.estimation.shapes import on_scale, shape_value
 from hdbridge.estimation.terms import Prior
 
 SHARE: Final = 0.04
@@ -53,9 +53,8 @@ class CalibratedPart:
         shapes = {each.name: each for each in effect.shape}
         total = 0.0
         for name, (mean, deviation) in self.parameters.items():
-            value = float(coefficients[int(name)]) if name.isdecimal() else shape_value(effect, name)
-            if name in shapes and shapes[name].logarithmic:
-                value = math.log(value)
+            shape = shapes.get(name)
+            value = on_scale(effect, shape) if shape else float(coefficients[int(name)])
             total += ((value - mean) / deviation) ** 2
         return total
 

@@ -13,7 +13,6 @@ what is left is no function of the shapes alone, and what it carries is exchange
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +22,7 @@ import numpy as np
 from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
 from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.shapes import free_shapes, leaves, moved, shape_value, tangent, unit
+from hdbridge.estimation.shapes import free_shapes, leaves, moved, on_scale, shape_value, tangent, unit
 from hdbridge.estimation.terms import Column, Effort, Prior, Terms
 
 DAMPING = 1e-4
@@ -113,11 +112,8 @@ class Solution:
             known = prior.get((each.effect, each.name)) if each.effect >= 0 else None
             if known is not None:
                 effect = self.effects[each.effect]
-                if each.shape:
-                    value = shape_value(effect, each.name)
-                    value = math.log(value) if each.logarithmic else value
-                else:
-                    value = float(effect.coefficients()[int(each.name)])
+                shape = next((one for one in effect.shape if each.shape and one.name == each.name), None)
+                value = on_scale(effect, shape) if shape else float(effect.coefficients()[int(each.name)])
                 result[at] = known.information, known.information * (known.mean - value)
         return result
 
@@ -294,10 +290,7 @@ class Separable:
         for (place, name), known in self.terms.prior.items():
             shape = next((each for each in effects[place].shape if each.name == name), None)
             if shape is not None:
-                value = shape_value(effects[place], name)
-                total += (
-                    known.information * ((math.log(value) if shape.logarithmic else value) - known.mean) ** 2
-                )
+                total += known.information * (on_scale(effects[place], shape) - known.mean) ** 2
         return total
 
     def _system(
@@ -313,10 +306,8 @@ class Separable:
         for at, (place, shape) in enumerate(where):
             known = self.terms.prior.get((place, shape.name))
             if known:
-                value = shape_value(here.effects[place], shape.name)
-                value = math.log(value) if shape.logarithmic else value
                 inner[at, at] += known.information
-                slope[at] += known.information * (known.mean - value)
+                slope[at] += known.information * (known.mean - on_scale(here.effects[place], shape))
         gram = here.gram[np.ix_(here.inside, here.inside)]
         return inner - cross.T @ solve_symmetric(gram, cross), slope
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -85,6 +86,12 @@ def shape_value(effect: Effect, name: str) -> float:
         return float(getattr(effect, name))
     parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
     return float(parts[0][name])
+
+
+def on_scale(effect: Effect, shape: Shape) -> float:
+    """A shape parameter as it is stepped and known beforehand: its logarithm where it has one."""
+    value = shape_value(effect, shape.name)
+    return math.log(value) if shape.logarithmic else value
 
 
 def leaves(effect: Effect, shape: Shape, move: float) -> bool:
