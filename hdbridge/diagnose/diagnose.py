@@ -26,6 +26,7 @@ from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import Search, Trail
+from hdbridge.diagnose.systematic import confounded
 from hdbridge.diagnose.unexplained import (
     Rest,
     acts,
@@ -334,6 +335,8 @@ class _Judge:
         for kind, _ in lookalikes(effect, self.estimator.data.ratio):
             if kind.channels - available and kind.name not in aliases:
                 aliases.append(kind.name)
+        beside = confounded(self.estimator, fitted, place)
+        aliases += [each.name for each in beside if each.name not in aliases]
         return tuple(aliases), margin
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:

@@ -11,6 +11,7 @@ from scipy.stats import t as student
 
 from hdbridge.diagnose.acceptance import BLOCKS_S
 from hdbridge.diagnose.result import Parameter
+from hdbridge.diagnose.systematic import systematic
 from hdbridge.effects import Effect, FloatArray, IntArray, Moves
 from hdbridge.estimation.calibration import NORMAL_95
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -51,7 +52,8 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     wanders, and `PARTS` of the whole record for what the hypothesis gets wrong from one part of a bench to
     the next. Few parts tell a variance badly, so Student's quantile stands for the normal one, with as many
     degrees of freedom as parts carry the parameter, less one (Bester, Conley and Hansen 2011; effective
-    number of clusters as Carter, Schnepel and Steigerwald 2017).
+    number of clusters as Carter, Schnepel and Steigerwald 2017). What no residual shows is added
+    (`systematic`).
     """
     tangent, residual = fitted.tangent, fitted.residual
     gram = tangent.T @ tangent + np.diag(fitted.information)
@@ -80,7 +82,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
             best = at_least(number, normal=True)
     for parts in PARTS:
         best = at_least(np.arange(len(residual)) * parts // len(residual), normal=False)
-    return np.asarray(best)
+    return np.asarray(best + systematic(estimator, fitted))
 
 
 def parameters_of(
@@ -170,9 +172,10 @@ def polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parame
     along = np.array([cosine, sine]) / max(amplitude, 1e-12)
     across = np.array([-along[1], along[0]])
     half = NORMAL_95 * math.sqrt(max(float(along @ spread @ along), 0.0))
-    turn = math.degrees(
-        min(NORMAL_95 * math.sqrt(max(float(across @ spread @ across), 0.0)) / max(amplitude, 1e-12), math.pi)
-    )
+    sideways = NORMAL_95 * math.sqrt(max(float(across @ spread @ across), 0.0))
+    # The tangents from zero to the ellipse; any phase where zero is in it.
+    nearest = math.sqrt(max(amplitude**2 - half**2, 0.0))
+    turn = math.degrees(math.atan(sideways / nearest)) if nearest else 180.0
     return {
         f"{prefix}amplitude_arcsec": Parameter(
             amplitude, "arcsec", max(amplitude - half, 0.0), amplitude + half, is_size=True

@@ -117,7 +117,7 @@ class Finding:
                 "arcsec rms"
             )
         sizes = [each for each in self.parameters.values() if each.is_size]
-        if sizes and all(each.low <= 0.0 <= each.high for each in sizes):
+        if sizes and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes):
             return "zero is in the 95 % interval of everything that says how large it is"
         return ""
 

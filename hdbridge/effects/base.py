@@ -320,6 +320,10 @@ class Effect(BaseModel, ABC):
         """As it goes into a model of this ratio."""
         return self
 
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """How a real one may differ from the law here, arcsec, a column per standard deviation, (n, k)."""
+        return np.empty((len(motion), 0))
+
     # --- what it is in a file
 
     def parameters(self) -> dict[str, Any]:

@@ -32,6 +32,11 @@ STRAIGHT = 20.0
 this part of itself."""
 
 
+EXPONENT = 0.2
+"""Standard deviation of the exponent of speed over shear speed: that of greases is from 2/3 to 1 (Cross
+1965)."""
+
+
 class VelocityWindup(Linear):
     """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; none of it at rest.
 
@@ -106,6 +111,13 @@ class VelocityWindup(Linear):
         """Dry and viscous, shape (n, 2)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         return -np.column_stack([np.sign(speed), speed / (1.0 + np.abs(speed) / self.shear_deg_s)])
+
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """The shear's exponent, which is one here, shape (n, 1)."""
+        speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
+        share = np.abs(speed) / self.shear_deg_s
+        bent = share * np.log(np.maximum(share, 1e-300)) / (1.0 + share) ** 2
+        return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; speed comes with the moment."""

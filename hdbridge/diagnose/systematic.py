@@ -1,0 +1,94 @@
+"""Systematic errors of parameters: what moves them and leaves nothing in the residual.
+
+No sandwich over blocks sees them, for they are the same in the whole record. Each is a column with a
+standard deviation of its own, and moves the parameters as the fit takes it over: the form of a law, as its
+effect says it may differ, and what only a measured channel's noise distinguishes from a finding (a mass off
+centre winds the gear up once per turn, as a run-out of the load encoder goes once per turn).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from hdbridge.diagnose.lookalikes import lookalikes
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, aliases_of, unmet
+from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.linear import seen_directions
+
+
+class Confounded(NamedTuple):
+    """Another cause that may have taken a part of a finding, or added to it, unseen."""
+
+    name: str
+    shift: FloatArray
+    """Of the fit's parameters by one standard deviation of what is left of it unseen, shape (p, k)."""
+
+
+def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
+    """Causes of which one of typical size beside the effect at ``place`` would not be seen."""
+    effects, scales = fitted.hypothesis.effects, estimator.scales
+    known = {each.place for each in estimator.calibrated}
+    if place in known:
+        return
+    for other, columns, noise in _alike(estimator, fitted, place):
+        theirs = [at for at, each in enumerate(effects) if each.name == other.name]
+        if known & set(theirs):
+            continue  # its calibration distinguishes the two
+        own = [i for i, each in enumerate(fitted.parameters) if each.effect not in theirs]
+        tangent = fitted.tangent[:, own]
+        directions = seen_directions(tangent.T @ tangent + np.diag(fitted.information[own]))
+        shift = directions @ (directions.T @ (tangent.T @ columns))
+        left = columns - tangent @ shift
+        claimed = scales.noisy * noise * np.sum(columns**2, axis=0)
+        seen, axes = np.linalg.eigh(left.T @ left - np.diag(claimed))
+        if seen[0] < scales.enter + scales.penalty:
+            moved = np.zeros((fitted.count(), len(seen)))
+            moved[own] = shift @ axes / np.sqrt(1.0 + np.maximum(seen, 0.0))
+            yield Confounded(other.name, moved)
+
+
+def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
+    """What systematic errors add to the covariance of all parameters, shape (p, p)."""
+    start, motion = fitted.hypothesis.start, estimator.data.full.motion
+    added = np.zeros((fitted.count(), fitted.count()))
+    directions = seen_directions(fitted.tangent.T @ fitted.tangent + np.diag(fitted.information))
+    for place, effect in enumerate(fitted.hypothesis.effects):
+        form = estimator.weighted(estimator.at_points(effect.law_discrepancy(motion, start)))
+        shift = directions @ (directions.T @ (fitted.tangent.T @ form))
+        added += shift @ shift.T
+        own = fitted.places(place)
+        for each in confounded(estimator, fitted, place):
+            added[np.ix_(own, own)] += each.shift[own] @ each.shift[own].T
+    return added
+
+
+def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[Effect, FloatArray, float]]:
+    """Look-alikes by a measured channel: one of them, its weighted columns of typical size, and the share of
+    the channel's noise in their squares.
+    """
+    effect, ratio = fitted.hypothesis.effects[place], estimator.data.ratio
+    start, available = fitted.hypothesis.start, estimator.motion.available()
+
+    def columns(one: Effect, typical_arcsec: float) -> FloatArray:
+        values = estimator.columns(one, start)
+        values = values[:, np.ptp(values, axis=0) > 0.0]
+        return estimator.weighted(
+            values * (typical_arcsec / np.maximum(np.max(np.abs(values), axis=0), 1e-9))
+        )
+
+    def noise(one: Effect) -> float:
+        square = float(np.sum(estimator.weighted(estimator.columns(one, start)) ** 2))
+        return float(np.sum(estimator.channel_noise(one, start))) / max(square, 1e-300)
+
+    for kind, piece in lookalikes(effect, ratio):
+        proposed = [each for each in kind.proposals(estimator.data, ()) if not unmet([each], available)]
+        if proposed:
+            typical = type(piece).candidate(ratio).largest_piece_arcsec()
+            yield proposed[0], columns(proposed[0], typical), noise(proposed[0])
+    look = effect.unmeasured(ratio)
+    if look is not None and look.name in aliases_of(effect.name) and look.name in CATALOGUE:
+        typical = type(look).candidate(ratio).largest_piece_arcsec()
+        yield look, columns(look, typical), noise(effect)

@@ -1,0 +1,89 @@
+"""Intervals hold what leaves nothing in a residual: a law of another form, a look-alike that hides beside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+from hdbridge.diagnose import Diagnosis
+from hdbridge.diagnose.parameters import covariance, parameters_of
+from hdbridge.diagnose.precise import precisely
+from hdbridge.diagnose.result import Parameter
+from hdbridge.effects import Effect, LoadOrders, Start, VelocityWindup
+from hdbridge.effects.orders import orders_from
+from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.observed import gather
+from hdbridge.model import TransmissionModel
+from hdbridge.records.record import Record
+
+Columns = Callable[..., dict[str, Any]]
+LEAST = 0.9
+"""Share of truths that intervals have to hold."""
+
+
+def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:
+    """Of an effect that is fitted to a record together with the model."""
+    estimator = Estimator(gather(Record(record), 50.0))
+    hypothesis = Hypothesis((*model.effects, effect), Start.FORWARD)
+    precise = precisely(estimator, estimator.fit(hypothesis))
+    return parameters_of(estimator, precise, len(model.effects), covariance(estimator, precise))
+
+
+def holds(parameter: Parameter, truth: float) -> bool:
+    if parameter.unit == "deg":
+        truth = parameter.value + math.remainder(truth - parameter.value, 360.0)
+    return parameter.low <= truth <= parameter.high
+
+
+def enough(inside: list[bool]) -> bool:
+    """Whether so few are inside less than once in a thousand runs, were the share as low as `LEAST`."""
+    return sum(inside) >= binom.ppf(1e-3, len(inside), LEAST)
+
+
+def test_a_drag_that_falls_off_by_another_power_of_the_speed_is_within_its_intervals(
+    columns: Columns, model: TransmissionModel
+) -> None:
+    """The plant's falls off with the power 0.8 of the speed, the law's with the first."""
+    inside: list[bool] = []
+    for seed in range(41, 46):
+        rng = np.random.default_rng(seed)
+        coulomb, viscous, shear = rng.uniform(1.0, 2.5), rng.uniform(0.02, 0.05), rng.uniform(300.0, 600.0)
+        record = columns({"velocity_windup": {"coulomb": coulomb, "viscous": viscous, "shear": shear}}, seed)
+        told = parameters(record, model, VelocityWindup.candidate(50.0))
+        inside += [
+            holds(told["coulomb_arcsec"], coulomb),
+            holds(told["viscous_arcsec_s_per_deg"], viscous),
+            holds(told["shear_deg_s"], shear),
+        ]
+    assert enough(inside), inside
+
+
+def test_a_run_out_beside_an_unknown_spring_is_as_little_known_as_it_is(
+    columns: Columns, model: TransmissionModel
+) -> None:
+    """Under one mass a spring's wind-up goes once per turn as the run-out does: only their sum is seen."""
+    inside: list[bool] = []
+    for seed in range(51, 55):
+        rng = np.random.default_rng(seed)
+        size, phase, compliance = rng.uniform(5.0, 12.0), rng.uniform(-180.0, 180.0), rng.uniform(0.5, 1.5)
+        effects = {
+            "load_order": {"orders": [(1, size, phase), (2, 4.0, 10.0)]},
+            "compliance": {"c1": compliance, "c2": compliance, "t1": 1e3},
+        }
+        record = columns(effects, seed, torque_nm=9.0)
+        told = parameters(record, model, LoadOrders(ratio=50.0, orders=orders_from([1, 2])))
+        inside += [holds(told["order_1_amplitude_arcsec"], size), holds(told["order_1_phase_deg"], phase)]
+        twice = told["order_2_amplitude_arcsec"]
+        assert twice.low < 4.0 < twice.high < 4.5  # no spring goes twice per turn
+    assert enough(inside), inside
+
+
+def test_a_run_out_that_a_spring_may_hide_has_it_as_an_alias(diagnosed: Callable[..., Diagnosis]) -> None:
+    run_out = {"load_order": {"orders": [(1, 8.0, 60.0), (2, 4.0, 10.0)]}}
+    (found,) = diagnosed(run_out, torque_nm=9.0).findings
+    assert found.cause == LoadOrders.name
+    assert "compliance" in found.aliases
