@@ -329,7 +329,7 @@ class _Judge:
                 aliases.append(name)
             else:
                 margin = min(margin, worse)
-        alike = waves_alike(self.estimator, effect, fitted.hypothesis.start)
+        alike = waves_alike(self.estimator, [effect], fitted.hypothesis.start)
         aliases += [each for each in alike if each not in aliases]
         available = self.estimator.motion.available()
         for kind, _ in lookalikes(effect, self.estimator.data.ratio):

@@ -63,7 +63,8 @@ def identifiability(
             INFLATION * math.sqrt(estimator.scales.penalty * rest.shape[1] + estimator.scales.enter) / size,
             estimator.scales.floor_arcsec,
         )
-        waves = set(waves_alike(estimator, example, fitted.hypothesis.start))
+        own = [*type(example).proposals(estimator.data, ())]  # any of them may be the one
+        waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
         alike = [
             name
             for name in names

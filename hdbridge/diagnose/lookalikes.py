@@ -4,7 +4,7 @@ and what another convention tells without a change of the model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -103,20 +103,18 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
     return result
 
 
-def waves_alike(estimator: Estimator, effect: Effect, start: Start) -> Iterator[str]:
-    """Other kinds of waves that have hardly parted from those of an effect, anywhere in the record.
+def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -> Iterator[str]:
+    """Other kinds of waves that have hardly parted from any of some effects of one kind, in all the record.
 
     Over the same angle it is enough that both may have the orders. On an arc of a turn different orders
     cancel each other, so what counts there is how large they are, not what they do.
     """
     data, most = estimator.data, estimator.scales.in_step
-    squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
-    if not squares:
+    effects = [each for each in effects if each.waves()]
+    if not effects:
         return
-    does = estimator.columns(effect, start) @ effect.coefficients()
-    does -= np.mean(does)
-    angle = effect.coordinate(data.motion, data.ratio).name
-    for name in aliases_of(effect.name):
+    angle = effects[0].coordinate(data.motion, data.ratio).name
+    for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
         proposed = [] if kind is None else [*kind.proposals(data, ())]
         near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
@@ -124,13 +122,24 @@ def waves_alike(estimator: Estimator, effect: Effect, start: Start) -> Iterator[
             continue
         if near[0].coordinate(data.motion, data.ratio).name == angle:
             orders = {turns for each in near for turns, _, _ in each.waves()}
-            both = sum(value for turns, value in squares.items() if turns in orders)
-            if both > most * sum(squares.values()):
+            if any(_share_in(each, orders) > most for each in effects):
                 yield name
             continue
         seen = orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
-        if float(np.sum((seen.T @ does) ** 2)) > most * float(does @ does):
-            yield name
+        for each in effects:
+            does = estimator.columns(each, start) @ each.coefficients()
+            does -= np.mean(does)
+            if float(np.sum((seen.T @ does) ** 2)) > most * float(does @ does):
+                yield name
+                break
+
+
+def _share_in(effect: Effect, orders: Container[float]) -> float:
+    """Of its waves, the share of the squares that is in some orders."""
+    squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
+    return sum(each for turns, each in squares.items() if turns in orders) / max(
+        sum(squares.values()), 1e-300
+    )
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
