@@ -172,6 +172,10 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         cycles = nearest
     grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
     demand_deg = np.interp(grid, cycles, target)
+    if grid[-1] > cycles[-1]:
+        # The motion goes on to the end of its cycle: the last row lies within that.
+        speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
+        demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
     recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).astype(np.int64).tolist()
     approach = _approach(truth, axis, demand_deg, cycle_s)
     return Commands((*approach, *recorded), len(approach), cycles, time_s, cycle_s)

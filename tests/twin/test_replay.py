@@ -120,3 +120,15 @@ def test_a_dead_time_delays_torque_and_motion_alike() -> None:
         seen[dead_ms] = np.array(rows)
     shift = round(0.002 / truth.substep_s)
     assert np.allclose(seen[2.0][shift:], seen[0.0][:-shift], atol=1e-3)
+
+
+def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
+    """A recording that ends in motion, between two cycles."""
+    axis, truth = demo()
+    time_s = 0.01 * np.arange(60) + 0.00037 * np.arange(60)
+    target_deg = 300.0 * np.maximum(time_s - 0.1, 0.0)
+    columns = {"time_s": time_s, "motor_target_deg": target_deg}
+    record = Record(columns | {"motor_position_deg": target_deg, "load_position_deg": target_deg / 50.0})
+    told = replay_directly(Recording(record, ratio=50.0), axis, truth).motor_target_deg
+    assert told is not None
+    assert np.max(np.abs(told - target_deg)) < 0.06, "motor degrees: a count and its rounding"
