@@ -154,7 +154,8 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     """The figures, by kind of leg and over all, with traces and spectra.
 
     Both records have the same rows. What the two encoders' zeros are apart is taken off in each part of the
-    measured record. InputError where the rows do not agree, or there is no command.
+    measured record, and so is by what command and motor are apart wherever it rests: zeros, too. InputError
+    where the rows do not agree, or there is no command.
     """
     if len(measured) != len(simulated):
         raise InputError(
@@ -171,9 +172,13 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     for part in parts:
         offset = np.median(real.by_name[LOAD_ERROR][part] - twin.by_name[LOAD_ERROR][part])
         twin.by_name[LOAD_ERROR][part] += offset
-    groups = _groups(measured.time_s, legs)
     moves = _moving(real, parts)
     calm = ~moves & (_since_motion_s(real.time_s, moves, parts) > CALM_S)
+    for part in parts:
+        if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
+            apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
+            twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
+    groups = _groups(measured.time_s, legs)
     rows = [
         row
         for kind, inside in groups.items()

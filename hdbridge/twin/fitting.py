@@ -125,14 +125,20 @@ def fit(
     parameters = free_parameters(begun, more)
     prior = np.array(coordinates(begun, parameters))
     with Replays(rough, workers) as replays:
+        most = scales(rough, *replays([start]))
         begun = _at_best_frequency(replays, begun)
         progress(0.1)
-        starts = [solve(replays, each, parameters, prior, 8) for each in _filters(begun)]
+        starts = [solve(replays, each, parameters, prior, 8, most=most) for each in _filters(begun)]
         first = min(starts, key=lambda each: each.misfit)
     progress(0.4)
     with Replays(data, workers) as replays:
-        second = solve(replays, first.truth, parameters, prior, 12, lambda share: progress(0.4 + 0.3 * share))
-        best = solve(replays, second.truth, parameters, prior, 12, lambda share: progress(0.7 + 0.2 * share))
+        most = scales(data, *replays([start]))
+        second = solve(
+            replays, first.truth, parameters, prior, 12, lambda share: progress(0.4 + 0.3 * share), most=most
+        )
+        best = solve(
+            replays, second.truth, parameters, prior, 12, lambda share: progress(0.7 + 0.2 * share), most=most
+        )
         for name in LAST:
             wider = (*parameters, BY_NAME[name])
             if value_in(begun, BY_NAME[name]) is None or name in more:
@@ -193,11 +199,13 @@ def solve(
     progress: Progress = lambda _: None,
     known: dict[str, float] | None = None,
     everything: bool = False,
+    most: dict[str, float] | None = None,
 ) -> Fitted:
     """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
 
     ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
-    what the start leaves. Held-out legs count only where ``everything`` is to count.
+    what the start leaves, ``most`` at most: a channel that has become worse does not count for less. Held-out
+    legs count only where ``everything`` is to count.
     """
     data = replays.data
     out = 0.0 if everything else data.out
@@ -208,6 +216,8 @@ def solve(
     if known is None:
         (left,) = replays([start])
         known = scales(data, left)
+        if most is not None:
+            known = {name: min(scale, most[name]) for name, scale in known.items()}
     scale = known
     done = 0
 

@@ -51,6 +51,8 @@ class Piece:
     """Kind of each of its legs."""
     out: FloatArray
     """For each row 1 where its leg is held out, else 0."""
+    rest: FloatArray
+    """For each row 1 where the command has stood for a while, else 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,17 +150,44 @@ def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
 def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
     """Measured minus simulated, by channel, over all rows; zero where a row does not count.
 
-    The load's angle has no common zero: each piece's mean difference is taken off.
+    What zeros are apart is taken off in each piece: the load's angle has none in common with the motor's, and
+    a command that is off by as much wherever the axis rests is told by another zero. Of the load's angle what
+    it does not share with the motor counts: a motor that is late takes the load along.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
     for piece, shown in zip(data.pieces, traces_of(data, truth), strict=True):
         for name in CHANNELS:
-            weight = piece.counts[name]
             off = piece.measured[name] - shown[name]
-            if name == LOAD and weight.any():
-                off = off - np.median(off[weight > 0.0])
-            found[name].append(off * weight)
+            if name == FOLLOWING and piece.rest.any():
+                off = off - np.median(off[piece.rest > 0.0])
+            found[name].append(off * piece.counts[name])
+    found[LOAD] = _not_taken_along(data, found[FOLLOWING], found[LOAD])
     return {name: np.concatenate(each) for name, each in found.items()}
+
+
+def _not_taken_along(
+    data: Data, following: Sequence[FloatArray], load: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """The load's residuals by piece, without what the motor's have brought about, and without their zeros.
+
+    How large their share is the residuals themselves show: one where the loops are not as the axis's are and
+    both shafts are late, about zero where the motor's residuals are its encoder's rounding.
+    """
+    inside = [piece.counts[LOAD] > 0.0 for piece in data.pieces]
+    ahead = [-each * ARCSEC_PER_DEG / data.axis.gear.ratio for each in following]
+    motor, shaft = (
+        np.concatenate([each[i] - np.mean(each[i]) for each, i in zip(whole, inside, strict=True) if i.any()])
+        if any(i.any() for i in inside)
+        else np.zeros(0)
+        for whole in (ahead, load)
+    )
+    size = float(motor @ motor)
+    share = min(max(float(motor @ shaft) / size, 0.0), 1.0) if size > 0.0 else 0.0
+    left = []
+    for off, taken, i in zip(load, ahead, inside, strict=True):
+        alone = off - share * taken
+        left.append((alone - np.median(alone[i])) * i if i.any() else np.zeros(len(off)))
+    return left
 
 
 def counted(data: Data) -> dict[str, FloatArray]:
@@ -183,11 +212,15 @@ def noise_floor(data: Data) -> dict[str, float]:
 
 
 def scales(data: Data, found: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Scale of each channel from its residuals, robustly; no less than its noise."""
+    """Scale of each channel from its residuals in motion, robustly; no less than its noise.
+
+    Not from those at rest: where a recording rests half of the time, they would be the scale.
+    """
     floor, counts = noise_floor(data), counted(data)
+    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
     given = {}
     for name in CHANNELS:
-        inside = found[name][counts[name] > 0.0]
+        inside = found[name][moving & (counts[name] > 0.0)]
         spread = MAD_TO_SIGMA * float(np.median(np.abs(inside))) if len(inside) else 0.0
         given[name] = max(floor[name], spread)
     return given
@@ -248,7 +281,7 @@ def _piece(
         TORQUE: np.where(stuck, 0.0, 1.0) if torque is not None else 0.0 * everywhere,
         LOAD: np.where(known > UNKNOWN_DEG, 1.0, 0.0),
     }
-    return Piece(commands, measured, counts, leg, kinds, out)
+    return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
 
 
 def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:

@@ -1,0 +1,107 @@
+"""What a replay leaves of a recording: of each channel what is that channel's own."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.exercised import record_of
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import FOLLOWING_ERROR, LOAD_ERROR, compare
+from hdbridge.twin.fitting import solve
+from hdbridge.twin.misfit import prepare, residuals, scales
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, coordinates, with_values
+from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replays import Replays
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS = AxisConfig.load(DEMO)
+TRUTH = Truth.load(DEMO)
+ZERO_COUNTS = 45
+
+
+def moves(bench: Exercise) -> None:
+    bench.hold(1.2)
+    bench.move(400.0, 600.0, 6000.0)
+    bench.hold(1.2)
+    bench.move(-400.0, 600.0, 6000.0)
+    bench.hold(1.2)
+
+
+@cache
+def recorded() -> Recording:
+    return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
+
+
+def told_by_another_zero() -> Recording:
+    """The command as a controller tells it whose zero is not the drive's."""
+    columns = dict(recorded().record.columns)
+    columns["motor_target_deg"] = columns["motor_target_deg"] + ZERO_COUNTS * 360.0 / 8000
+    return Recording(Record(columns), axis="demo", ratio=50.0)
+
+
+def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
+    """Rms of the residuals by channel."""
+    found = residuals(prepare(recording or recorded(), AXIS, truth), truth)
+    return {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in found.items()}
+
+
+def test_another_zero_of_the_command_is_no_following_error() -> None:
+    assert left(TRUTH, told_by_another_zero())[FOLLOWING] == pytest.approx(left(TRUTH)[FOLLOWING], rel=0.05)
+
+
+def test_nor_is_it_in_a_comparison() -> None:
+    for recording in (recorded(), told_by_another_zero()):
+        simulated = replay_directly(recording, AXIS, TRUTH)
+        row = compare(recording.record, simulated, (), 50.0).row(FOLLOWING_ERROR)
+        assert row is not None
+        assert row.difference < 0.1, "motor degrees: two counts"
+
+
+def test_a_motor_that_is_late_says_nothing_of_the_load_error() -> None:
+    """The load comes along: 3 ms at 600 degrees per second are 130 arcsec of it."""
+    late = with_values(TRUTH, {"servo dead time": 3.0})
+    assert left(late)[FOLLOWING] > 10.0 * left(TRUTH)[FOLLOWING]
+    assert left(late)[LOAD] < 13.0
+
+
+@pytest.mark.parametrize(("name", "factor"), [("gear stiffness", 0.5), ("load inertia", 2.0)])
+def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float) -> None:
+    value = {
+        "gear stiffness": TRUTH.gear.stiffness_nm_per_rad,
+        "load inertia": TRUTH.load_.inertia_kg_m2,
+    }[name]
+    wrong = with_values(TRUTH, {name: factor * value})
+    simulated = replay_directly(recorded(), AXIS, wrong)
+    row = compare(recorded().record, simulated, (), 50.0).row(LOAD_ERROR)
+    assert row is not None
+    assert left(wrong)[LOAD] > 0.7 * row.difference
+    assert left(wrong)[LOAD] > 3.0 * left(TRUTH)[LOAD]
+
+
+def test_rest_does_not_scale_what_is_left_in_motion() -> None:
+    """Most of this recording is rest, where hardly anything is left."""
+    data = prepare(recorded(), AXIS, TRUTH)
+    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
+    assert moving.mean() < 0.5
+    off = residuals(data, with_values(TRUTH, {"servo dead time": 3.0}))
+    size = float(np.median(np.abs(off[FOLLOWING][moving])))
+    assert scales(data, off)[FOLLOWING] == pytest.approx(1.4826 * size)
+
+
+def test_a_channel_that_a_fit_has_made_worse_counts_as_before() -> None:
+    data = prepare(recorded(), AXIS, TRUTH)
+    worse = with_values(TRUTH, {"gear stiffness": 0.3 * TRUTH.gear.stiffness_nm_per_rad})
+    parameters = (BY_NAME["gear stiffness"],)
+    prior = np.array(coordinates(TRUTH, parameters))
+    with Replays(data, 1) as replays:
+        most = scales(data, *replays([TRUTH]))
+        assert scales(data, *replays([worse]))[LOAD] > 1.3 * most[LOAD]
+        assert solve(replays, worse, parameters, prior, 0, most=most).scales[LOAD] == most[LOAD]
