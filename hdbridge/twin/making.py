@@ -13,8 +13,9 @@ from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.fitting import Fitted, fit
-from hdbridge.twin.misfit import CHANNELS, MAD_TO_SIGMA, coarse, held_out_legs, noise_floor, prepare
+from hdbridge.twin.misfit import CHANNELS, MAD_TO_SIGMA, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
+from hdbridge.twin.noise import noise_in_motion
 from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import legs_of, replay_directly
 from hdbridge.twin.replays import Replays
@@ -45,7 +46,7 @@ def fit_twin(
         sets = alike(fitted)
         findings = name_causes(replays, start, fitted, sets)
         (left,) = replays([fitted.truth])
-        rest = unexplained(data, left, noise_floor(data))
+        rest = unexplained(data, left, noise_in_motion(data))
     truth = with_knowledge(fitted)
     before, after = (_compared(whole, axis, each) for each in (start, truth))
     progress(1.0)

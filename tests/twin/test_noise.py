@@ -1,0 +1,85 @@
+"""The noise that a twin is held against is that of the recording in motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.exercised import record_of
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.recording import Recording
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import CHANNELS, Data, noise_floor, prepare
+from hdbridge.twin.naming import unexplained
+from hdbridge.twin.noise import noise_in_motion
+from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
+"""Some ten times the rounding."""
+
+
+def moves(bench: Exercise) -> None:
+    bench.move(400.0, 600.0, 6000.0)
+    bench.hold(0.6)
+    bench.move(-400.0, 600.0, 6000.0)
+    bench.hold(0.6)
+
+
+@cache
+def recorded() -> Data:
+    truth = Truth.load(DEMO)
+    return prepare(Recording(record_of(truth, moves), axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
+
+
+def noisy(where: str) -> Data:
+    """The recording with white noise on each channel, in motion or at rest only."""
+    rng = np.random.default_rng(1)
+    pieces = []
+    for piece in recorded().pieces:
+        rows = piece.rest == (1.0 if where == "rest" else 0.0)
+        assert 0 < rows.sum() < len(rows)
+        measured = {
+            name: column + rows * NOISE[name] * rng.standard_normal(len(column))
+            for name, column in piece.measured.items()
+        }
+        pieces.append(replace(piece, measured=measured))
+    return replace(recorded(), pieces=tuple(pieces))
+
+
+def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
+    found = noise_in_motion(noisy("motion"))
+    for name in CHANNELS:
+        assert found[name] == pytest.approx(NOISE[name], rel=0.25), name
+
+
+def test_noise_at_rest_says_nothing_of_it() -> None:
+    assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(recorded()), rel=0.1)
+
+
+def test_no_noise_is_less_than_the_rounding() -> None:
+    still = [
+        replace(each, measured={name: 0.0 * column for name, column in each.measured.items()})
+        for each in recorded().pieces
+    ]
+    assert noise_in_motion(replace(recorded(), pieces=tuple(still))) == noise_floor(recorded())
+
+
+def test_what_is_left_within_the_noise_of_the_motion_is_explained() -> None:
+    data = noisy("motion")
+    left = {
+        name: np.concatenate(
+            [
+                (one.measured[name] - other.measured[name]) * one.counts[name]
+                for one, other in zip(data.pieces, recorded().pieces, strict=True)
+            ]
+        )
+        for name in CHANNELS
+    }
+    assert unexplained(data, left, noise_in_motion(data)) == ()
+    assert {each.channel for each in unexplained(data, left, noise_floor(data))} == set(CHANNELS)
