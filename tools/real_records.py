@@ -83,12 +83,23 @@ def joint_axis() -> AxisConfig:
 
 
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
-    """A joint's four recordings with their commands; the torque, told at the output, as the motor's."""
+    """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
+
+    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the simulated
+    drive's zero, and so has a short way.
+    """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
         record = Record.read_csv(path)
         torque = record.columns["motor_torque_nm"] / NOTHING.ratio
+        turns_deg = 360.0 * float(np.round(record.motor_position_deg[0] / 360.0))
         columns = {**record.columns, "motor_torque_nm": torque}
+        for name, way_deg in (
+            ("motor_target_deg", turns_deg),
+            ("motor_position_deg", turns_deg),
+            ("load_position_deg", turns_deg / NOTHING.ratio),
+        ):
+            columns[name] = columns[name] - way_deg
         recordings.append(Recording(Record(columns, record.source), ratio=NOTHING.ratio))
     return recordings
 
