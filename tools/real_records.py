@@ -85,8 +85,8 @@ def joint_axis() -> AxisConfig:
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
     """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
 
-    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the simulated
-    drive's zero, and so has a short way.
+    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the zero of
+    the simulated drive, and so has a short way.
     """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
