@@ -46,6 +46,7 @@ from hdbridge.estimation.calibration import calibrated
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.observed import gather
 from hdbridge.estimation.scales import Scales
+from hdbridge.estimation.stretches import about_zeros
 from hdbridge.model import TransmissionModel
 from hdbridge.observations.cuts import observed
 from hdbridge.observations.foreign import check_once, check_records, zeros_apart_arcsec
@@ -378,23 +379,13 @@ class _Judge:
 
     def _as_given(self) -> FloatArray:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""
-        best: FloatArray | None = None
-        for start in Start:
-            error = self._about_zeros(self.estimator.told(self.model.effects, start))
-            if best is None or float(error @ error) < float(best @ best):
-                best = error
-        assert best is not None
-        return best
+        tried = (self._about_zeros(self.estimator.told(self.model.effects, start)) for start in Start)
+        return min(tried, key=lambda error: float(error @ error))
 
     def _about_zeros(self, told_arcsec: FloatArray) -> FloatArray:
         """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
         estimator = self.estimator
-        error: FloatArray = estimator.observed - told_arcsec
-        for zero in range(estimator.data.zeros):
-            rows = estimator.zero == zero
-            if np.any(rows):
-                error[rows] -= np.average(error[rows], weights=estimator.weight[rows] ** 2)
-        return error
+        return about_zeros(estimator.observed - told_arcsec, estimator.zero, estimator.weight**2)
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator

@@ -52,18 +52,13 @@ def _as_fitted(fitted: Fitted) -> _Linear:
 
 def _gain(estimator: Estimator, before: _Linear, after: _Linear) -> Gain | None:
     """From weighted tangents and residuals, each of a best fit or near it."""
-    stretch = stretches(estimator)
+    stretch = counted(of_number(estimator.time_s, STRETCHES))
     samples = np.bincount(stretch).astype(np.float64)
     largest = float(np.max(np.bincount(stretch % FOLDS)))
     if len(samples) < FOLDS or len(stretch) - largest < after[0].shape[1]:
         return None
     squares = [_errors(estimator, each, stretch) for each in (before, after)]
     return Gain(OVER, FOLDS, samples, squares[0], squares[1])
-
-
-def stretches(estimator: Estimator) -> IntArray:
-    """Number of the stretch of time of each point."""
-    return counted(of_number(estimator.time_s, STRETCHES))
 
 
 def _errors(estimator: Estimator, linear: _Linear, stretch: IntArray) -> FloatArray:

@@ -87,6 +87,11 @@ class Design:
                 result[inside] = effect.columns(motion_at(self.samples.along(chain), picked), start)[middles]
         return result if every is None else self.blocks.mean(every)
 
+    def told(self, effects: Sequence[Effect], exact: bool = True) -> FloatArray:
+        """What effects say together, shape (b,)."""
+        parts = (self.columns(each, exact) @ each.coefficients() for each in effects)
+        return np.asarray(sum(parts, start=np.zeros(len(self.blocks))))
+
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
         """What a count further at the turn before would change, arcsec (b,), and which turn that is.
 

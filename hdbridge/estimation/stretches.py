@@ -26,3 +26,9 @@ def counted(number: IntArray) -> IntArray:
 def sums(rows: FloatArray, number: IntArray) -> FloatArray:
     """Sums of rows (n, p) by their number, shape (numbers, p)."""
     return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
+
+
+def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
+    """What is left (n,) about the weighted mean of each absolute zero; as it is where that weighs nothing."""
+    total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
+    return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])

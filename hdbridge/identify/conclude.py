@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, Part
+from hdbridge.effects import FloatArray, Part
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.intervals import NORMAL_95, nested_half_widths
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
 from hdbridge.estimation.samples import KINDS, Samples
 from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.stretches import about_zeros
 from hdbridge.identify.covariance import of_effect
 from hdbridge.identify.figures import laps_arcsec, standing_arcsec
 from hdbridge.identify.holdout import held_out
@@ -51,7 +52,7 @@ def conclude(
     fitted_rms = math.sqrt(float(blocks.count @ solution.residual**2) / samples_used + inside)
     # Samples were put right by the delay, which no model holds.
     measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
-    written = _about_zeros(design, measured - _sum(design, effects))
+    written = about_zeros(measured - design.told(effects), blocks.zero, blocks.count)
     residual_rms = math.sqrt(float(blocks.count @ written**2) / samples_used + inside)
     ones = np.ones(len(blocks))
     figures = NoiseFigures(
@@ -65,10 +66,7 @@ def conclude(
     )
     further = _further(solution, cov)
     zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
-    clean = solution.residual + sum(
-        (_predicted(design, each) for each in solution.effects if each.part is Part.ORDERS),
-        start=np.zeros(len(blocks)),
-    )
+    clean = solution.residual + design.told([each for each in solution.effects if each.part is Part.ORDERS])
     shown = blocks.moving if np.count_nonzero(blocks.moving) > 0.5 * len(blocks) else blocks.count > 0
     lines = spectrum(
         state.candidates,
@@ -80,7 +78,7 @@ def conclude(
         options.family_wise,
     )
     _describe_limits(selection, lines, outliers, samples, warnings)
-    active = _sum(design, options.active.effects if options.active else ())
+    active = design.told(options.active.effects if options.active else ())
     return FitResult(
         model=TransmissionModel(samples.ratio, effects, uncertainty),
         intervals=tuple(intervals),
@@ -119,7 +117,7 @@ def _traces(design: Design, solution: Solution, zeros: Sequence[float], left_arc
         kind=tuple(each.value for each in KINDS),
         kind_index=blocks.kind[used],
         error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
-        predicted_arcsec=_sum(design, solution.effects)[used],
+        predicted_arcsec=design.told(solution.effects)[used],
         residual_arcsec=left_arcsec[used],
     )
 
@@ -132,22 +130,6 @@ def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) 
     mean = np.add.reduceat(blocks.weight * residual, blocks.first) / np.maximum(blocks.count, 1.0)
     off = residual - np.repeat(mean, sizes)
     return float(blocks.weight @ off**2) / max(float(np.sum(blocks.count)), 1.0)
-
-
-def _predicted(design: Design, effect: Effect) -> FloatArray:
-    return np.asarray(design.columns(effect) @ effect.coefficients())
-
-
-def _sum(design: Design, effects: tuple[Effect, ...]) -> FloatArray:
-    return sum((_predicted(design, each) for each in effects), start=np.zeros(len(design.blocks)))
-
-
-def _about_zeros(design: Design, left_arcsec: FloatArray) -> FloatArray:
-    """What is left of each block about the mean of its absolute zero, shape (b,)."""
-    blocks = design.blocks
-    total = np.bincount(blocks.zero, blocks.count * left_arcsec, design.samples.zeros)
-    count = np.bincount(blocks.zero, blocks.count, design.samples.zeros)
-    return np.asarray(left_arcsec - (total / np.maximum(count, 1e-300))[blocks.zero])
 
 
 def _chosen(

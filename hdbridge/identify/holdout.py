@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hdbridge.effects import BoolArray, FloatArray, IntArray
+from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.gain import Gain
@@ -16,6 +16,7 @@ from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.samples import KINDS
 from hdbridge.estimation.segment import Kind
 from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.stretches import about_zeros, sums
 from hdbridge.estimation.terms import Effort
 from hdbridge.identify.problem import Problem
 from hdbridge.identify.result import HeldOut
@@ -63,10 +64,15 @@ def held_out(
         # The active model has no nuisances of its own: it is given those that suit it best.
         rest = _least_squares(shift, problem.observed - active_arcsec, precision)
         either = (problem.observed - active_arcsec - shift @ rest, fit.residual)
-        told = (active_arcsec, _told(problem, fit))
+        # As far as a model can hold them.
+        valid = [each for each in fit.effects if not each.violations()]
+        told = (active_arcsec, problem.design.told(valid, exact=False))
+        # About the zeros that the rest of the data have; about its own where a zero is in this fold alone.
+        lost = ~np.isin(blocks.zero, blocks.zero[~out])
         for row in (0, 1):
-            added[row, out] = _about_zeros(blocks, either[row], out, known=False)[out]
-            alone[row, out] = _about_zeros(blocks, measured_arcsec - told[row], out, known=True)[out]
+            added[row, out] = about_zeros(either[row], blocks.zero, blocks.count * lost)[out]
+            left = measured_arcsec - told[row]
+            alone[row, out] = about_zeros(left, blocks.zero, blocks.count * (lost | ~out))[out]
         used |= out
     weight = blocks.count * used
     if not np.sum(weight):
@@ -76,12 +82,9 @@ def held_out(
     stretch = blocks.chain if over == RECORDINGS else clusters(blocks, STRETCHES)
     number = len(np.unique(fold[used]))
 
-    def total(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(stretch, values))
-
     def gain(left: FloatArray) -> Gain:
-        before, after = (total(weight * (each**2 + inside_variance)) for each in left)
-        return Gain(over, number, total(weight), before, after)
+        rows = np.stack([weight, *(weight * (each**2 + inside_variance) for each in left)], axis=1)
+        return Gain(over, number, *sums(rows, stretch).T)
 
     fitted = math.sqrt(float(weight @ solution.residual**2) / float(np.sum(weight)) + inside_variance)
     result = HeldOut(gain(alone), gain(added), fitted, "")
@@ -89,31 +92,6 @@ def held_out(
     words = "improves on" if result.improves else "does not improve on"
     figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"
     return replace(result, text=f"{words} {against}: {figures} on {over} left out")
-
-
-def _told(problem: Problem, fit: Solution) -> FloatArray:
-    """What the effects of a fit predict, as far as a model can hold them, shape (b,)."""
-    design = problem.design
-    valid = [each for each in fit.effects if not each.violations()]
-    parts = (design.columns(each, exact=False) @ each.coefficients() for each in valid)
-    return np.asarray(sum(parts, start=np.zeros(len(design.blocks))))
-
-
-def _about_zeros(blocks: Blocks, left_arcsec: FloatArray, out: BoolArray, *, known: bool) -> FloatArray:
-    """About the zeros that the data outside ``out`` have; about its own where a zero is in ``out`` alone.
-
-    ``known`` is False where the former have been taken off already.
-    """
-    result = left_arcsec.copy()
-    for zero in range(int(np.max(blocks.zero)) + 1):
-        rows = blocks.zero == zero
-        inside = rows & ~out
-        lost = not np.any(inside)
-        if lost or known:
-            chosen = rows if lost else inside
-            weight = np.maximum(blocks.count[chosen], 1e-9)
-            result[rows] -= np.average(left_arcsec[chosen], weights=weight)
-    return result
 
 
 def folds(problem: Problem) -> tuple[IntArray, str]:
