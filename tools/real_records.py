@@ -1,6 +1,7 @@
 """The figures of docs/real-records.md, from the measured records (which are not part of the project).
 
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py      # ten minutes of CPU
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those: four minutes
 
 The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-command`, `damper/sine.csv` and
 `damper/earthquake.csv`.
@@ -59,6 +60,13 @@ def main() -> None:
     if named is None:
         sys.exit("HDBRIDGE_REAL_RECORDS is not set; expected the folder of the measured records")
     folder = Path(named)
+    if sys.argv[1:] != ["twins"]:
+        _causes(folder)
+    _twins(folder)
+
+
+def _causes(folder: Path) -> None:
+    """What is said of the robot's joints, and of the damper."""
     for name, joint in product(("cobot", "cobot-command"), (4, 5)):
         records = [Record.read_csv(each) for each in sorted(folder.glob(f"{name}/joint{joint}-*.csv"))]
         print(f"{name}, joint {joint}, all recordings")
@@ -74,7 +82,6 @@ def main() -> None:
             law = Hysteresis(offset_arcsec=95.0, width_deg=16.0 * scale, exponent=2.2)
             print(f"damper, {name}, {scale:g} deg/mm")
             _print(diagnose(record, TransmissionModel(50.0, (law,))))
-    _twins(folder)
 
 
 def joint_axis() -> AxisConfig:
@@ -85,8 +92,8 @@ def joint_axis() -> AxisConfig:
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
     """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
 
-    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the zero of
-    the simulated drive, and so has a short way.
+    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the zero
+    of the simulated drive, and so has a short way.
     """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
@@ -110,7 +117,7 @@ def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dic
     others = [each for number, each in enumerate(recordings) if number != out]
     found = diagnose(others, NOTHING, independent_zeros=True)
     start = translate(axis, found.model).truth
-    twin = fit_twin(others, axis, start)
+    twin = fit_twin(others, axis, start, workers=1)
     truths = {"usual values": translate(axis).truth, "with the model": start, "twin": twin.truth}
     return twin, {name: held_against(recordings[out], truth) for name, truth in truths.items()}
 
@@ -131,11 +138,15 @@ def _twins(folder: Path) -> None:
             print(f"twin of joint {joint} without recording {out + 1}")
             for name, each in compared.items():
                 rows = [row for signal in SIGNALS if (row := each.row(signal)) is not None]
+                told = ", ".join(f"{row.channel} {row.difference:.3g} of {row.measured:.3g}" for row in rows)
+                print(f"  {name}: {told}", flush=True)
                 for row in rows:
                     left.setdefault((row.channel, "measured"), []).append(row.measured)
                     left.setdefault((row.channel, name), []).append(row.difference)
             for finding in twin.findings:
                 print(f"  {finding.text}")
+            for rest in twin.unexplained:
+                print(f"  unexplained: {rest.channel}, {rest.times_noise:.3g} times its noise")
             for alike in twin.alike:
                 print(f"  not told apart: {', '.join(alike.names)}")
         for (signal, name), values in left.items():
