@@ -133,59 +133,38 @@ def gather(
     count = len(record)
     for part in record.parts() if independent_zeros or prepared.cuts else (record,):
         part.check_ratio(ratio)
-    full, kinds, facts = _series(record, ratio, legs, independent_zeros)
-    motion = full.motion
-    turns = facts.reversals
+    seen = _as_recorded(record, ratio, legs, independent_zeros)
+    full, motion = seen.full, seen.motion
     remarks = list(prepared.remarks)
-    if not facts.commanded:
+    if not seen.commanded:
         remarks.append("no command (motor_target_deg): the encoder's own counts drive the hysteresis")
     still = motion.motor_speed_deg_s == 0.0 if motion.motor_speed_deg_s is not None else np.zeros(count, bool)
     standstill = float(np.mean(still)) > 0.02 and int(np.sum(still)) > 50
     if not standstill:
         remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
-    if turns < 2:
+    if seen.reversals < 2:
         remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
     known = expected(motion) if expected is not None else 0.0
     sigma = noise_arcsec(
         full.error_arcsec - known,
         still,
-        facts.motor_count,
-        facts.load_count,
-        facts.commanded,
+        seen.motor_count_arcsec,
+        seen.load_count_arcsec,
+        seen.commanded,
         record.starts,
     )
-    full = replace(full, sigma_arcsec=sigma)
-    runs = _runs(count, record.starts)
-    return Observed(
-        ratio=ratio,
-        points=_averaged(full, runs),
-        full=full,
-        runs=runs,
-        kinds=kinds,
-        zeros=int(full.zero[-1]) + 1,
-        commanded=facts.commanded,
-        motor_count_arcsec=facts.motor_count,
-        load_count_arcsec=facts.load_count,
-        period_s=facts.period_s,
+    seen = replace(
+        seen,
+        full=replace(full, sigma_arcsec=sigma),
         standstill=standstill,
-        reversals=turns,
         travel_deg=prepared.travel_deg(independent_zeros),
         remarks=tuple(remarks),
     )
+    return seen.over(_runs(count, record.starts))
 
 
-@dataclass(frozen=True, slots=True)
-class _Facts:
-    commanded: bool
-    motor_count: float
-    load_count: float
-    period_s: float
-    reversals: int
-
-
-def _series(
-    record: Record, ratio: float, legs: Sequence[Segment], independent: bool
-) -> tuple[Series, tuple[str, ...], _Facts]:
+def _as_recorded(record: Record, ratio: float, legs: Sequence[Segment], independent: bool) -> Observed:
+    """Every sample as a point; its noise is not known yet."""
     time = record.time_s
     steps = np.diff(time)
     period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
@@ -235,14 +214,22 @@ def _series(
     series = Series(
         motion, error, np.ones(len(time)), usable, zero.astype(np.intp), leg.astype(np.intp), kind
     )
-    facts = _Facts(
-        target is not None,
-        reading.resolution_deg / ratio * ARCSEC_PER_DEG,
-        quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
-        period,
-        sum(reversals(piece[0], reading.jitter_deg) for piece in pieces),
+    return Observed(
+        ratio=ratio,
+        points=series,
+        full=series,
+        runs=np.arange(len(time), dtype=np.intp),
+        kinds=names,
+        zeros=int(zero[-1]) + 1,
+        commanded=target is not None,
+        motor_count_arcsec=reading.resolution_deg / ratio * ARCSEC_PER_DEG,
+        load_count_arcsec=quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
+        period_s=period,
+        standstill=False,
+        reversals=sum(reversals(piece[0], reading.jitter_deg) for piece in pieces),
+        travel_deg=0.0,
+        remarks=(),
     )
-    return series, names, facts
 
 
 def _kinds(
