@@ -38,6 +38,9 @@ STEP = 0.03
 A motor that sticks a substep earlier makes residuals jump; in a smaller step that would be all of it."""
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where the resonance of the load is looked for: a fit finds only the nearest of its minima."""
+FIT_S = 60.0
+"""A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
+there is time: a thousand replays of a quarter of an hour would take hours."""
 NINETY_FIVE = 1.96
 LAST = ("velocity feed-forward",)
 """Fitted last, if that earns it: most drives feed the whole speed forward, and otherwise it looks like a dead
@@ -119,7 +122,7 @@ def fit(
 
     InputError where it has no command.
     """
-    data = prepare(recording, axis, start)
+    data = coarse(prepare(recording, axis, start), FIT_S)
     rough = coarse(data)
     begun = start_of(start, data)
     parameters = free_parameters(begun, more)
