@@ -1,4 +1,4 @@
-"""Findings within the model's own parts: the elastic law, its parameters, the orders of the motor.
+"""Findings within the model's own parts: the elastic law, its parameters, the orders of the motor, a spring.
 
 Calibrations are a few per cent off as a rule, and that is no finding: the change has to be larger than that.
 """
@@ -14,7 +14,7 @@ from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
-from hdbridge.diagnose.search import Trail
+from hdbridge.diagnose.search import Search, Trail
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
 from hdbridge.estimation.calibration import variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -22,9 +22,10 @@ from hdbridge.model import TransmissionModel
 
 
 def findings(
-    estimator: Estimator, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
+    search: Search, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
 ) -> list[Finding]:
     """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
+    estimator = search.estimator
     result: list[Finding] = []
     for place, (given, now) in enumerate(zip(model.effects, precise.hypothesis.effects, strict=False)):
         if given.part is Part.LOOP:
@@ -34,7 +35,7 @@ def findings(
         elif given.part is Part.ORDERS:
             found = _orders(estimator, precise, place, given, now, spread)
         else:
-            found = None
+            found = _freed(search, trail.fitted, precise, place, given, spread)
         if found is not None:
             result.append(found)
     return result
@@ -202,6 +203,31 @@ def _orders(
         robust=float(np.sum(estimator.weight**2) * 0.5 * float(values @ values)),
         effect=causes[0],
         note="a change of orders that the model has: its synchronous part takes it over",
+    )  # fmt: skip
+
+
+def _freed(
+    search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
+) -> Finding | None:
+    """Any other part that the data have pulled out of its calibration (`hdbridge.estimation.calibration`)."""
+    estimator, own, now = search.estimator, precise.places(place), precise.hypothesis.effects[place]
+    if not len(own) or np.all(precise.information[own] != 0.0):
+        return None
+    start = precise.hypothesis.start
+    change = estimator.columns(now, start) @ now.coefficients()
+    change -= estimator.columns(given, start) @ given.coefficients()
+    peak = 0.5 * float(np.ptp(change))
+    if peak < estimator.scales.floor_arcsec:
+        return None
+    aliases = tuple(search.instead_of_change(fitted, place, given))
+    return Finding(
+        now.name, 0.9, aliases, parameters_of(estimator, precise, place, spread),
+        held_out_change(estimator, precise, own, change), next_experiment(now.name, aliases), peak,
+        robust=float(np.sum((estimator.weight * (change - np.mean(change))) ** 2)), effect=now,
+        note="a change of what the model has: " + (
+            "it is left as it was, for the record does not distinguish it from another cause"
+            if aliases else "its own parameters take it over"
+        ),
     )  # fmt: skip
 
 

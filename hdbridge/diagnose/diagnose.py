@@ -164,7 +164,8 @@ class _Judge:
         honest = as_named(estimator, fitted, self.model.effects, {each.cause for each in findings})
         if honest is not fitted:
             fitted, spread = honest, covariance(estimator, honest)
-        sound = supported(estimator, fitted, self.model.effects)
+        alone = {each.cause for each in findings if each.left_alone}
+        sound = supported(estimator, fitted, self.model.effects, alone)
         fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
         named = {each.cause for each in findings if not each.within}
         chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
@@ -218,7 +219,7 @@ class _Judge:
             for place in range(base, len(fitted.hypothesis.effects))
         ]
         findings += changes.findings(
-            estimator, self.model, replace(self.trail, fitted=fitted), precise, spread
+            self.search, self.model, replace(self.trail, fitted=fitted), precise, spread
         )
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)

@@ -21,16 +21,19 @@ def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], name
     return fitted
 
 
-def supported(estimator: Estimator, fitted: Fitted, given: Sequence[Effect]) -> tuple[Effect, ...]:
+def supported(
+    estimator: Estimator, fitted: Fitted, given: Sequence[Effect], alone: Container[str] = ()
+) -> tuple[Effect, ...]:
     """The hypothesis's effects, but those of the baseline as ``given`` where the record cannot tell them.
 
-    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record.
+    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record;
+    a change of those to be left ``alone`` may be another cause's doing.
     """
     start = fitted.hypothesis.start
     one_way = estimator.data.reversals < 2
     result = list(fitted.hypothesis.effects)
     for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
-        if new.part is Part.LOOP and one_way:
+        if new.name in alone or (new.part is Part.LOOP and one_way):
             result[place] = old
         elif old.part is Part.ORDERS and len(old.coefficients()):
             change = new.fitted(new.coefficients() - old.coefficients())

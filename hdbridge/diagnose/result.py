@@ -105,10 +105,18 @@ class Finding:
         """Whether it is a change of a part that the model has already."""
         return self.signs is None and self.cause != "unexplained"
 
+    @property
+    def left_alone(self) -> bool:
+        """Whether it may be a change of a part of the model or another cause: the model keeps its own."""
+        own = self.effect is not None and self.effect.part is None and self.effect.changes is None
+        return self.within and own and bool(self.aliases)
+
     def refusal(self) -> str:
         """Why it is not offered as an improvement of the model, in words; empty where nothing is against."""
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
+        if self.left_alone:
+            return "the record does not distinguish a change of it from " + ", ".join(self.aliases)
         if self.gain is None:
             return "nothing was held out: the record is too short to leave any of it out"
         if self.gain.recovered <= 0.0:

@@ -304,6 +304,21 @@ class Search:
         """Chi square and what the parameters have to earn."""
         return fitted.chi_square + self.scales.penalty * fitted.free()
 
+    def instead_of_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
+        """Other causes that explain as well what a changed part of the model explains, with that part as
+        ``given``.
+        """
+        known = self.estimator.calibrated
+        self.estimator.calibrated = tuple(each.as_given() if each.place == place else each for each in known)
+        try:
+            held = self.estimator.fit(fitted.hypothesis.instead(place, given))
+            rivals = self.rivals(held, given.name)
+        finally:
+            self.estimator.calibrated = known
+        excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
+        as_well = 20.0 * excess + 0.01 * (held.chi_square - fitted.chi_square)
+        return [name for name, trial in rivals if self.cost(trial) < self.cost(fitted) + as_well]
+
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
         """Other causes in the place of one that was taken out, each fitted at its best; best first."""
         self.forget()

@@ -30,7 +30,8 @@ class Confounded(NamedTuple):
 def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
     """Causes of which one of typical size beside the effect at ``place`` would not be seen."""
     effects, scales = fitted.hypothesis.effects, estimator.scales
-    known = {each.place for each in estimator.calibrated}
+    held = zip(fitted.parameters, fitted.information.tolist(), strict=True)
+    known = {each.effect for each, information in held if information}  # as calibrated, not changed
     if place in known:
         return
     for other, columns, noise in _alike(estimator, fitted, place):

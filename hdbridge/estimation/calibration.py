@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -26,6 +26,8 @@ SHAPE_SHARE: Final = 0.06
 """The same of a shape, which shows less: of a width, or of how far an exponent is above one."""
 PEAK_ARCSEC: Final = 0.1
 """... and of a coefficient at least so much at its peak in this record."""
+EXACT: Final = 1e-3
+"""Share of such a deviation that no record distinguishes from none."""
 NORMAL_95: Final = 1.96
 
 
@@ -40,11 +42,20 @@ class CalibratedPart:
     logarithmic shape.
     """
     scales: Scales
+    fixed: bool = False
+    """Whether it cannot have changed."""
 
     @property
     def change_cost(self) -> float:
         """Chi square that the part's change costs."""
+        if self.fixed:
+            return math.inf
         return self.scales.enter + self.scales.penalty * len(self.parameters)
+
+    def as_given(self) -> CalibratedPart:
+        """The part where it is taken for exactly what the model file says."""
+        exact = {name: (mean, EXACT * deviation) for name, (mean, deviation) in self.parameters.items()}
+        return replace(self, parameters=exact, fixed=True)
 
     def strain(self, effects: Sequence[Effect]) -> float:
         """Chi square by which the part is away from its calibration."""

@@ -211,7 +211,7 @@ class Estimator:
         counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
             hypothesis, moves, effort, self.nuisance.shape[1],
-            self.load_angles if counted else 0, self.loop_sign, bool(self.calibrated),
+            self.load_angles if counted else 0, self.loop_sign, tuple(each.fixed for each in self.calibrated),
         )  # fmt: skip
         if key in self._fits:
             self._fits.move_to_end(key)

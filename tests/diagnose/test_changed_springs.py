@@ -1,0 +1,70 @@
+"""A known spring that has changed is found as such, or told as what else it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hdbridge.diagnose import diagnose
+from hdbridge.model import TransmissionModel
+from hdbridge.records.record import Record
+
+Columns = Callable[..., dict[str, Any]]
+KNOWN, NOW = 1.5, 2.4
+"""Arcsec per Nm."""
+
+
+@pytest.fixture
+def known(model: TransmissionModel) -> TransmissionModel:
+    """The model with a straight spring."""
+    zones = ", ".join(f"c{zone}_arcsec_per_nm: {KNOWN}" for zone in (1, 2, 3))
+    return TransmissionModel.from_text(
+        model.dump().replace(
+            "effects:\n",
+            "effects:\n  - effect: compliance\n"
+            f"    parameters: {{{zones}, torque1_nm: 1000.0, torque2_nm: 2000.0, torque: load_torque_nm}}\n",
+        )
+    )
+
+
+def spring_of(model: TransmissionModel) -> float:
+    (spring,) = (each for each in model.effects if each.name == "compliance")
+    return float(spring.parameters()["c1_arcsec_per_nm"])
+
+
+def test_a_spring_that_has_changed_is_found_and_the_model_takes_it_over(
+    columns: Columns, known: TransmissionModel
+) -> None:
+    """Under a torque that goes with nothing else."""
+    record = columns()
+    torque_nm = 6.0 * np.sin(2.0 * np.pi * record["time_s"] / 37.0)
+    record["load_torque_nm"] = torque_nm + 0.01 * np.random.default_rng(1).normal(size=len(torque_nm))
+    record["load_position_deg"] = record["load_position_deg"] + NOW * torque_nm / 3600.0
+    result = diagnose(Record(record), known)
+    (found,) = result.findings
+    assert (found.cause, found.aliases) == ("compliance", ())
+    size = found.parameters["c1_arcsec_per_nm"]
+    assert size.low < NOW < size.high
+    assert spring_of(result.model) == pytest.approx(NOW, rel=0.02)
+    assert not found.refusal()
+
+
+def test_a_change_that_a_run_out_may_be_is_left_alone(columns: Columns, known: TransmissionModel) -> None:
+    """Under a mass off centre the torque goes once per turn, as a run-out does."""
+    record = columns({"compliance": {"c1": NOW, "c2": NOW, "t1": 1e3}}, torque_nm=9.0)
+    result = diagnose(Record(record), known)
+    assert len(result.findings) == 1
+    names = {result.findings[0].cause, *result.findings[0].aliases}
+    assert {"compliance", "load_order"} <= names
+    assert spring_of(result.model) == pytest.approx(KNOWN, rel=0.1)
+    size = result.findings[0].parameters["c1_arcsec_per_nm"]
+    assert size.low < KNOWN < NOW < size.high
+
+
+def test_a_spring_within_its_calibration_is_no_finding(columns: Columns, known: TransmissionModel) -> None:
+    spring = {"c1": 1.03 * KNOWN, "c2": 1.03 * KNOWN, "t1": 1e3}
+    result = diagnose(Record(columns({"compliance": spring}, torque_nm=6.0)), known)
+    assert not result.findings
