@@ -9,6 +9,7 @@ The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-comma
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -92,14 +93,15 @@ def joint_axis() -> AxisConfig:
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
     """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
 
-    The joint's zero is some thirty motor turns away. Whole turns are taken off: a replay begins at the zero
-    of the simulated drive, and so has a short way.
+    The joint's zero is some thirty motor turns away. Whole turns are taken off, for a replay begins at the
+    zero of the simulated drive. Its way there goes backwards, as the recordings do: so friction holds the
+    axis in the same sense before them.
     """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
         record = Record.read_csv(path)
         torque = record.columns["motor_torque_nm"] / NOTHING.ratio
-        turns_deg = 360.0 * float(np.round(record.motor_position_deg[0] / 360.0))
+        turns_deg = 360.0 * math.ceil(record.motor_position_deg[0] / 360.0)
         columns = {**record.columns, "motor_torque_nm": torque}
         for name, way_deg in (
             ("motor_target_deg", turns_deg),

@@ -19,6 +19,7 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.twin.replay import Commands, commands_of, legs_of, run
+from hdbridge.twin.stretches import stretches
 from hdbridge.units import ARCSEC_PER_DEG
 
 FINENESS = 64
@@ -32,6 +33,8 @@ LONGEST_LEG_S = 2.0
 """A longer leg counts as several: residuals further apart than this have nothing to do with each other."""
 COARSE_S = 15.0
 """The first steps of a fit are made on pieces that take the axis about so long."""
+WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
+"""Kinds of leg that are no reason to take a piece."""
 HELD_OUT = 4
 MAD_TO_SIGMA = 1.4826
 
@@ -97,11 +100,11 @@ def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
 
 
 def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
-    """The recording's parts; InputError where it has no command or is of another ratio."""
+    """The recording's parts, long ones in stretches; InputError without a command or with another ratio."""
     recording.record.check_ratio(axis.gear.ratio)
     legs, held = legs_of(recording), held_out_legs(recording)
     pieces = []
-    for part in recording.record.parts():
+    for part in (each for whole in recording.record.parts() for each in stretches(whole, legs)):
         commands = commands_of(part, axis, base)
         numbers, kinds = _legs(part, [(each.kind, each.start_s, each.end_s) for each in legs])
         out = np.zeros(len(part))
@@ -119,7 +122,7 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     for again in range(2):
         for piece in left:
             length_s = len(piece.commands.counts) * piece.commands.cycle_s
-            new = not kinds.issuperset(piece.kind)
+            new = not kinds.union(WITHOUT_MOTION).issuperset(piece.kind)
             if any(piece is each for each in taken) or (taken and duration_s + length_s > wanted_s):
                 continue
             if new or again:

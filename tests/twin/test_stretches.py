@@ -1,0 +1,52 @@
+"""A long part of a recording is fitted in stretches, some of each kind of motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import coarse, prepare
+from hdbridge.twin.stretches import stretches
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+CYCLE_S = 0.01
+LEGS = (
+    Segment(kind="standstill", start_s=0.0, end_s=4.0),
+    Segment(kind="sweep", start_s=4.0, end_s=100.0),
+    *(Segment(kind="step", start_s=100.0 + 2.0 * k, end_s=102.0 + 2.0 * k) for k in range(15)),
+)
+
+
+def recorded(duration_s: float = 130.0) -> Recording:
+    time_s = CYCLE_S * np.arange(round(duration_s / CYCLE_S))
+    motor_deg = 90.0 * np.sin(2.0 * np.pi * time_s / 40.0)
+    columns = {"time_s": time_s, "motor_target_deg": motor_deg, "motor_position_deg": motor_deg}
+    return Recording(Record({**columns, "load_position_deg": motor_deg / 50.0}), LEGS, ratio=50.0)
+
+
+def test_stretches_are_all_rows_in_order_and_begin_with_legs() -> None:
+    record = recorded().record
+    cut = stretches(record, LEGS)
+    assert np.array_equal(np.concatenate([each.time_s for each in cut]), record.time_s)
+    assert all(5.0 <= each.time_s[-1] - each.time_s[0] + CYCLE_S <= 16.0 for each in cut)
+    firsts = [float(each.time_s[0]) for each in cut]
+    assert [each for each in firsts if each >= 100.0] == pytest.approx([100.0, 106.0, 112.0, 118.0, 124.0])
+
+
+def test_a_short_part_stays_whole() -> None:
+    record = recorded(25.0).record
+    assert stretches(record, LEGS) == [record]
+
+
+def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
+    data = prepare(recorded(), AxisConfig.load(DEMO), Truth.load(DEMO))
+    taken = coarse(data, 40.0)
+    assert taken.duration_s <= 40.0
+    assert {"sweep", "step"} <= set(taken.kinds)
+    assert data.duration_s > 130.0
