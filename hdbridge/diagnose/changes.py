@@ -224,7 +224,7 @@ def _freed(
         now.name, 0.9, aliases, parameters_of(estimator, precise, place, spread),
         held_out_change(estimator, precise, own, change), next_experiment(now.name, aliases), peak,
         robust=float(np.sum((estimator.weight * (change - np.mean(change))) ** 2)), effect=now,
-        note="a change of what the model has: " + (
+        left_alone=bool(aliases), note="a change of what the model has: " + (
             "it is left as it was, for the record does not distinguish it from another cause"
             if aliases else "its own parameters take it over"
         ),

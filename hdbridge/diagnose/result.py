@@ -68,6 +68,8 @@ class Finding:
     """Of something unexplained: root mean square that is left beyond the noise."""
     taken_arcsec: float = 0.0
     """Of a change within the model: root mean square that it takes away in the fit itself."""
+    left_alone: bool = False
+    """Whether it may be a change of a part of the model or another cause: the model keeps its own."""
     lives_in: str = ""
     """Of something unexplained: the coordinate over which it shows."""
     note: str = ""
@@ -104,12 +106,6 @@ class Finding:
     def within(self) -> bool:
         """Whether it is a change of a part that the model has already."""
         return self.signs is None and self.cause != "unexplained"
-
-    @property
-    def left_alone(self) -> bool:
-        """Whether it may be a change of a part of the model or another cause: the model keeps its own."""
-        own = self.effect is not None and self.effect.part is None and self.effect.changes is None
-        return self.within and own and bool(self.aliases)
 
     def refusal(self) -> str:
         """Why it is not offered as an improvement of the model, in words; empty where nothing is against."""
