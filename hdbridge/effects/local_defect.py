@@ -37,6 +37,10 @@ OTHER_SPEED = 1.5
 """It must have been met so often, and in both directions or at speeds that differ by this factor."""
 
 
+FORM = 0.07
+"""Share of its height by which a real one differs from the formula."""
+
+
 class LocalDefect(Linear):
     """height (1 + cos(pi u)) / 2 for |u| < 1, u = (theta_M / N - centre, wrapped) / half width."""
 
@@ -116,10 +120,17 @@ class LocalDefect(Linear):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A bump of one arcsec, shape (n, 1)."""
+        return self._bump(motion, self.half_width_deg)[:, np.newaxis]
+
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """A sharper top, or a wider foot, shape (n, 2)."""
+        widths = (0.5 * self.half_width_deg, 2.0 * self.half_width_deg)
+        return FORM * self.height_arcsec * np.column_stack([self._bump(motion, each) for each in widths])
+
+    def _bump(self, motion: Motion, half_width_deg: float) -> FloatArray:
         turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
         away = np.abs(turns - np.round(turns)) * DEG_PER_TURN
-        bump = 0.5 + 0.5 * np.cos(np.pi * np.minimum(away / self.half_width_deg, 1.0))
-        return np.asarray(bump)[:, np.newaxis]
+        return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.minimum(away / half_width_deg, 1.0)))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; it has no state."""
