@@ -27,9 +27,13 @@ from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
 from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
+from hdbridge.sim.heat import Heat
 from hdbridge.sim.loops import Loops, Seen, Slow
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.state import STATES
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 LEAST_ROOM: Final = 16
 """Entries for which a list of numbers has room at least; each power of two is compiled apart."""
@@ -113,6 +117,29 @@ class CompiledLoops:
         """See `Loops`."""
         return self._methods.follow(self._record, demand_deg, demand_deg_s, substeps, slow)
 
+    def follow_all(
+        self,
+        demand_deg: FloatArray,
+        demand_deg_s: FloatArray,
+        substeps: IntArray,
+        heat: Heat,
+        limit_nm: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Closed loop over many cycles: for each what `Loops.follow` says, and the temperature after it.
+
+        ``heat`` is led through them.
+        """
+        seen, body_c = np.empty((len(substeps), 11)), np.empty(len(substeps))
+        record = np.zeros(1, _layout_of(Plant, LEAST_ROOM, Heat))
+        _fill(record[0], heat)
+        self._methods.follow_all(
+            self._record, record, demand_deg, demand_deg_s, substeps, limit_nm, seen, body_c
+        )
+        for name, hint in _attributes(Heat).items():
+            if hint in _NUMBERS:
+                setattr(heat, name, hint(record[0][name]))
+        return seen, body_c
+
     def coast(self, brake_nm: float, substeps: int, slow: Slow) -> Seen:
         """See `Loops`."""
         return self._methods.coast(self._record, brake_nm, substeps, slow)
@@ -122,6 +149,7 @@ class _Methods(NamedTuple):
     power_on: Callable[..., float]
     begin_demand: Callable[..., None]
     follow: Callable[..., Seen]
+    follow_all: Callable[..., None]
     coast: Callable[..., Seen]
 
 
@@ -143,12 +171,32 @@ def _methods() -> _Methods:
         assert version
         return loops[0].follow(demand_deg, demand_deg_s, substeps, slow)
 
+    def follow_all(
+        loops: Any,
+        heat: Any,
+        demand_deg: Any,
+        demand_deg_s: Any,
+        substeps: Any,
+        limit_nm: float,
+        seen: Any,
+        body_c: Any,
+    ) -> None:
+        assert version
+        dt_s = loops[0].dt_s
+        for cycle in range(len(substeps)):
+            slow = (heat[0].body_c, heat[0].rub, limit_nm, 0.0)
+            told = loops[0].follow(demand_deg[cycle], demand_deg_s[cycle], substeps[cycle], slow)
+            for place in range(11):
+                seen[cycle, place] = told[place]
+            heat[0].warm(told[9], told[10], substeps[cycle] * dt_s)
+            body_c[cycle] = heat[0].body_c
+
     def coast(loops: Any, brake_nm: float, substeps: int, slow: Any) -> Any:
         assert version
         return loops[0].coast(brake_nm, substeps, slow)
 
     compiled = numba.njit(cache=True, fastmath=False)
-    return _Methods(*(compiled(each) for each in (power_on, begin_demand, follow, coast)))
+    return _Methods(*(compiled(each) for each in (power_on, begin_demand, follow, follow_all, coast)))
 
 
 def _version() -> int:
@@ -189,8 +237,8 @@ def _room(value: Any) -> int:
 
 
 @cache
-def _layout_of(plant: Any, room: int) -> Any:
-    """The numpy type of `Loops` with this plant. One object for all of them: numba finds it at once then."""
+def _layout_of(plant: Any, room: int, whole: type = Loops) -> Any:
+    """The numpy type of a class, the `Loops` with this plant. One object for all: numba finds it at once."""
 
     def layout(declared: Any) -> Any:
         if declared in _NUMBERS:
@@ -209,7 +257,7 @@ def _layout_of(plant: Any, room: int) -> Any:
         _CLASSES[numba.from_dtype(record)] = cls
         return record
 
-    return layout(Loops)
+    return layout(whole)
 
 
 def _fill(record: Any, value: Any) -> None:

@@ -10,12 +10,18 @@ from __future__ import annotations
 import copy
 import importlib.util
 import os
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+
+import numpy as np
 
 from hdbridge.sim.loops import Loops, Seen, Slow
 
 if TYPE_CHECKING:
+    from hdbridge.sim.heat import Heat
     from hdbridge.sim.plant import Plant
+
+FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 PAYS_AFTER_CYCLES: Final = 25_000
 """Control cycles of 4 ms that take as much longer in Python as loading the compiled loops takes (1.2 s)."""
@@ -32,6 +38,20 @@ class AnyLoops(Protocol):
     def begin_demand(self, demand_deg: float) -> None: ...
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen: ...
     def coast(self, brake_nm: float, substeps: int, slow: Slow) -> Seen: ...
+
+
+@runtime_checkable
+class EvenLoops(AnyLoops, Protocol):
+    """`Loops` that go through many cycles by themselves; see `compiled.CompiledLoops`."""
+
+    def follow_all(
+        self,
+        demand_deg: FloatArray,
+        demand_deg_s: FloatArray,
+        substeps: IntArray,
+        heat: Heat,
+        limit_nm: float,
+    ) -> tuple[FloatArray, FloatArray]: ...
 
 
 class _Waiting:

@@ -8,13 +8,30 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
 
 from hdbridge.sim import fast
 from hdbridge.sim.encoder import Losses, fixed_errors
-from hdbridge.sim.gear import warmth_factor
+from hdbridge.sim.heat import Heat
 from hdbridge.sim.loops import Loops, Seen, Slow
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+FloatArray = fast.FloatArray
+
+
+class Cycles(NamedTuple):
+    """What a machine tells at the end of each of many cycles, as its properties do."""
+
+    motor_counts: FloatArray
+    load_counts: FloatArray
+    torque_nm: FloatArray
+    torque_permille: FloatArray
+    temperature_c: FloatArray
+    load_torque_nm: FloatArray
 
 
 class Machine:
@@ -31,7 +48,6 @@ class Machine:
         self._powered = False
         self._hold_counts: float | None = None
         self._hold_deg = 0.0
-        self._copper_loss_w = truth.temperature.copper_loss_w / truth.motor.rated_torque_nm**2
         motor, load = truth.motor.encoder, truth.load_.encoder
         self._motor_counts_per_deg = motor.direction * motor.counts_per_turn / DEG_PER_TURN
         self._motor_zero = motor.zero_counts
@@ -44,16 +60,10 @@ class Machine:
         self._limit_nm = self._rated_limit_nm = loops.servo.limit_nm
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
         self._sense_permille = 1000.0 * motor.direction
-        self._elapsed_s = 0.0
+        self._heat = Heat(truth)
         self._motor_errors, self._load_errors = fixed_errors(motor), fixed_errors(load)
         self._motor_losses = Losses(motor.losses) if motor.losses else None
         self._load_losses = Losses(load.losses) if load.losses else None
-        self._warmth = warmth_factor(truth, truth.temperature.friction_growth_per_k)
-        heat = truth.temperature
-        self._warmed_s = self._warmer = 0.0
-        self._weather = bool(heat.ambient_k_per_hour or heat.ambient_swing_k)
-        self._temperature_c = heat.ambient_c if heat.start_c is None else heat.start_c
-        self._friction = self._warmth.at(self._temperature_c) if self._warmth is not None else 1.0
         self._see(loops.seen())
 
     def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
@@ -88,6 +98,55 @@ class Machine:
         self._see(loops.follow(demand_deg, speed_deg_s, substeps, slow))
         self._finish(elapsed_s)
 
+    def follow_all(self, counts: Sequence[float], substeps: Sequence[int]) -> Cycles:
+        """Closed loop over many cycles, each from the demand before it; the same numbers as by `follow`.
+
+        ``counts`` has the demand at the begin and at the end of each cycle, ``substeps`` how many each has.
+        """
+        told = Cycles(*(np.empty(len(substeps)) for _ in Cycles._fields))
+        done = 0
+        while done < len(substeps):
+            if self._evenly(substeps):
+                self._follow_compiled(counts[done:], substeps[done:], Cycles(*(each[done:] for each in told)))
+                break
+            self.follow(counts[done], counts[done + 1], substeps[done])
+            told.motor_counts[done] = self.motor_counts
+            told.load_counts[done] = self.load_counts
+            told.torque_nm[done] = self.torque_nm
+            told.torque_permille[done] = self.torque_permille
+            told.temperature_c[done] = self.temperature_c
+            told.load_torque_nm[done] = self.load_torque_nm
+            done += 1
+        return told
+
+    def _evenly(self, substeps: Sequence[int]) -> bool:
+        """Whether the compiled loops can go on by themselves: nothing happens between the cycles."""
+        if not self._powered or self._hold_counts is not None or self._to_compile is not None:
+            return False
+        if self._motor_errors or self._load_errors or self._motor_losses or self._load_losses:
+            return False
+        return isinstance(self._loops, fast.EvenLoops) and min(substeps) > 0
+
+    def _follow_compiled(self, counts: Sequence[float], substeps: Sequence[int], told: Cycles) -> None:
+        per_deg, steps = self._motor_counts_per_deg, np.array(substeps, dtype=np.int64)
+        demand = np.array(counts, dtype=np.float64)
+        start_deg = (demand[:-1] - self._motor_zero) / per_deg
+        speed_deg_s = (demand[1:] - demand[:-1]) / per_deg / (steps * self.dt_s)
+        assert isinstance(self._loops, fast.EvenLoops)
+        seen, told.temperature_c[:] = self._loops.follow_all(
+            start_deg, speed_deg_s, steps, self._heat, self._limit_nm
+        )
+        noise = np.array([self._noise.gauss(0.0, self._noise_deg) if self._noise_deg else 0.0 for _ in steps])
+        self._see(tuple(seen[-1].tolist()))
+        self._noise_now_deg = float(noise[-1])
+        _, motor_deg, _, load_deg, body_deg, _, _, weight_nm, torque_nm, _, _ = seen.T
+        told.motor_counts[:] = np.floor(motor_deg * self._motor_counts_per_deg + self._motor_zero + 0.5)
+        read_deg = load_deg + body_deg + noise
+        told.load_counts[:] = np.floor(read_deg * self._load_counts_per_deg + self._load_zero + 0.5)
+        told.torque_nm[:] = self.truth.motor.encoder.direction * torque_nm
+        told.torque_permille[:] = np.round(self._sense_permille * torque_nm / self._rated_nm)
+        told.load_torque_nm[:] = weight_nm
+
     def coast(self, substeps: int, braked: bool) -> None:
         """Power stage off: friction, or the brake, slows the motor and holds it."""
         self._powered = False
@@ -109,7 +168,7 @@ class Machine:
         deg += self._body_deg
         deg += self._noise_now_deg
         counts = math.floor(deg * self._load_counts_per_deg + self._load_zero + 0.5)
-        return counts if self._load_losses is None else counts + self._load_losses.counts(self._elapsed_s)
+        return counts if self._load_losses is None else counts + self._load_losses.counts(self._heat.since_s)
 
     @property
     def velocity_counts_s(self) -> float:
@@ -140,7 +199,7 @@ class Machine:
     @property
     def temperature_c(self) -> float:
         """Temperature of motor and gear."""
-        return self._temperature_c
+        return self._heat.body_c
 
     @property
     def load_torque_nm(self) -> float:
@@ -153,7 +212,7 @@ class Machine:
     @property
     def elapsed_s(self) -> float:
         """Time since the axis was switched on."""
-        return self._elapsed_s
+        return self._heat.since_s
 
     @property
     def true_motor_deg(self) -> float:
@@ -172,7 +231,7 @@ class Machine:
 
     def _slow(self) -> Slow:
         """What the loops have to know for the next cycle."""
-        return self._temperature_c, self._friction, self._limit_nm, self._lost_deg()
+        return self._heat.body_c, self._heat.rub, self._limit_nm, self._lost_deg()
 
     def _see(self, seen: Seen) -> None:
         """What the loops say after a cycle."""
@@ -195,7 +254,7 @@ class Machine:
         """What the motor encoder has lost."""
         if self._motor_losses is None:
             return 0.0
-        return self._motor_losses.counts(self._elapsed_s) / self._motor_counts_per_deg
+        return self._motor_losses.counts(self._heat.since_s) / self._motor_counts_per_deg
 
     def _motor_reading(self, motor_deg: float) -> float:
         """The motor encoder at an angle, before it is rounded."""
@@ -209,19 +268,5 @@ class Machine:
         """What is slow against a control cycle: the temperature, and a new sample of the noise."""
         if self._noise_deg:
             self._noise_now_deg = self._noise.gauss(0.0, self._noise_deg)
-        if not elapsed_s:
-            return
-        heat = self.truth.temperature
-        self._elapsed_s += elapsed_s
-        copper_j = self._torque_squares * self._copper_loss_w * self.dt_s
-        loss_w = (copper_j + self._friction_j) / elapsed_s
-        goal_c = heat.ambient_c + heat.resistance_k_per_w * loss_w
-        if self._weather:
-            goal_c += heat.ambient_k_per_hour * self._elapsed_s / 3600.0
-            goal_c += heat.ambient_swing_k * math.sin(math.tau * self._elapsed_s / heat.ambient_period_s)
-        if elapsed_s != self._warmed_s:
-            self._warmed_s = elapsed_s
-            self._warmer = -math.expm1(-elapsed_s / heat.time_constant_s)
-        self._temperature_c += (goal_c - self._temperature_c) * self._warmer
-        if self._warmth is not None:
-            self._friction = self._warmth.at(self._temperature_c)
+        if elapsed_s:
+            self._heat.warm(self._torque_squares, self._friction_j, elapsed_s)

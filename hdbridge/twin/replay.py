@@ -26,7 +26,7 @@ from hdbridge.procedures.moves import AxisView, MotionLimits, Path, Sample, Step
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.lockstep import simulated_bench
-from hdbridge.sim.machine import Machine
+from hdbridge.sim.machine import Cycles, Machine
 from hdbridge.sim.truth import Truth
 
 LATENCY_CYCLES = 4
@@ -128,24 +128,18 @@ def run(
     """
     machine = Machine(truth, seed, may_compile=True)
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
-    n = len(commands.counts) - commands.lead
-    motor, load, torque, warmth, outer = (np.empty(n) for _ in range(5))
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
-    before = commands.counts[0] * fineness
-    for number, counts in enumerate(commands.counts, -commands.lead):
+    substeps = []
+    for _ in commands.counts:
         owed_s += cycle_s
-        substeps = int(owed_s / dt_s + 1e-6)
-        owed_s -= substeps * dt_s
-        demand = counts * fineness
-        machine.follow(before, demand, substeps)
-        before = demand
-        if number >= 0:
-            motor[number] = machine.motor_counts
-            load[number] = machine.load_counts
-            torque[number] = sense * machine.torque_nm if smooth else machine.torque_permille * permille_nm
-            warmth[number] = machine.temperature_c
-            outer[number] = machine.load_torque_nm
+        substeps.append(int(owed_s / dt_s + 1e-6))
+        owed_s -= substeps[-1] * dt_s
+    demand = [float(counts * fineness) for counts in (commands.counts[0], *commands.counts)]
+    told = Cycles(*(each[commands.lead :] for each in machine.follow_all(demand, substeps)))
+    motor, load = told.motor_counts, told.load_counts
+    torque = sense * told.torque_nm if smooth else told.torque_permille * permille_nm
+    warmth, outer = told.temperature_c, told.load_torque_nm
     encoder = axis.motor_encoder
     motor = encoder.direction * motor * 360.0 / (encoder.counts_per_turn * fineness)
     load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn

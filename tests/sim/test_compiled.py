@@ -264,3 +264,21 @@ def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
         ]
         assert all(hasattr(cls, method) for cls in kinds.classes)
     assert known <= set(compiled.STATES)
+
+
+def test_many_cycles_at_once_are_the_same_as_one_after_the_other() -> None:
+    noisy = {"motor__encoder__late_ms": 0.3, "load__encoder__noise_arcsec": 1.0}
+    made = truth(noisy | {"temperature__friction_growth_per_k": -0.01, "temperature__copper_loss_w": 40.0})
+    counts = [0.0] * 5 + [float(100 * k) for k in range(60)] + [5_900.0] * 20
+    substeps = [3 + k % 2 for k in range(len(counts) - 1)]
+    at_once, each = Machine(made, 7, may_compile=True), Machine(made, 7, may_compile=True)
+    told = at_once.follow_all(counts, substeps)
+    for cycle, steps in enumerate(substeps):
+        each.follow(counts[cycle], counts[cycle + 1], steps)
+        for name in told._fields:
+            assert getattr(told, name)[cycle] == getattr(each, name), (name, cycle)
+    each.follow(counts[-1], counts[-1] + 90.0, 4)
+    at_once.follow(counts[-1], counts[-1] + 90.0, 4)
+    assert {name: place.fget(each) for name, place in PLACES.items()} == {
+        name: place.fget(at_once) for name, place in PLACES.items()
+    }
