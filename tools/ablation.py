@@ -3,8 +3,12 @@
 python tools/ablation.py [--seed 1] [--records 40] [--only NAME ...] [--jobs 2] [--json FILE]
 
 The records come from formulas that share no code with the effects (tests/support/plant.py): each cause alone,
-two together, nothing under four elastic laws, and what the catalogue does not have. A number without which no
-figure is worse is not needed for these records: it can go, unless other records are named that need it.
+near the noise too, two together, nothing under four elastic laws, and what the catalogue does not have. A
+number without which no figure is worse is not needed for these records: it can go, unless other records are
+named that need it.
+
+A record is diagnosed again only with those numbers on which a comparison depends there (tools/whatif.py): all
+of them at once, and where that changes the answer, one half and the other, down to single ones.
 """
 
 from __future__ import annotations
@@ -24,19 +28,23 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
 from support import plant
 from support.trials import CAUSES, drawn
+from whatif import WhatIf
 
 from hdbridge.diagnose import diagnose
 from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
-PLAN = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
-"""Short: some 4,700 samples."""
+PLAN = plant.Plan(rate_hz=14.0, scale=0.2, load_turns=1.05, steps=14)
+"""Short: some 13,000 samples, a diagnosis of 2 to 10 s."""
 LAWS = ("plain", "memory", "bouc_wen", "dahl")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
 SAME = {"motor_encoder_eccentricity": "motor_order"}
 """Causes that no record of one mounting of the encoder distinguishes."""
 OF_THE_LOOP = {"hysteresis_memory", "hysteresis_parameters"}
+FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1"})
+"""Parameters of an effect that are no size of it."""
+Answer = list[str]
 
 
 @dataclass(frozen=True)
@@ -56,34 +64,91 @@ class Case:
 
 
 def cases(seed: int, count: int) -> Iterator[Case]:
-    """About ``count``: a half single causes, a fifth pairs, the rest empty, other laws and unknown."""
+    """About ``count``: two fifths single causes, an eighth of them small, a quarter two or three at once, the
+    rest empty, other laws and unknown.
+    """
     rng = np.random.default_rng(seed)
     names = [CAUSES[i] for i in rng.permutation(len(CAUSES))]
-    for number in range(count // 2):
+
+    def together(chosen: Sequence[str], least: float, most: float) -> tuple[dict[str, Any], dict[str, Any]]:
+        effects, axis = {}, {}
+        for each in chosen:
+            one, needs = drawn(each, rng)
+            effects |= one
+            axis |= needs
+        return _times(effects, float(rng.uniform(least, most))), axis
+
+    def numbered(number: int, *rest: Any) -> Case:
+        return Case(*rest, seed=seed * 1000 + number)
+
+    number = 0
+    for _ in range(2 * count // 5):
         cause = names[number % len(names)]
-        effects, axis = drawn(cause, rng)
-        yield Case(f"single:{cause}:{number}", (cause,), effects, axis, seed * 1000 + number)
-    for number in range(count // 5):
-        one, other = (str(each) for each in rng.choice(CAUSES, 2, replace=False))
-        (first, axis), (second, more) = drawn(one, rng), drawn(other, rng)
-        hidden = {**first, **second}
-        yield Case(f"pair:{one}+{other}", (one, other), hidden, {**axis, **more}, seed * 1000 + 300 + number)
-    for number in range(count // 5):
-        law = LAWS[number % len(LAWS)]
+        yield numbered(number, f"single:{cause}", (cause,), *together([cause], 0.5, 1.0))
+        number += 1
+    for _ in range(count // 8):
+        cause = names[number % len(names)]
+        yield numbered(number, f"single:{cause} small", (cause,), *together([cause], 0.2, 0.4))
+        number += 1
+    for at in range(count // 4):
+        several = tuple(str(each) for each in rng.choice(CAUSES, 3 if at % 4 == 3 else 2, replace=False))
+        yield numbered(number, f"pair:{'+'.join(several)}", several, *together(several, 0.5, 1.0))
+        number += 1
+    for at in range(count // 8):
+        law = LAWS[at % len(LAWS)]
         own = ("hysteresis_memory",) if law == "memory" else ()
         kind = "none" if law in LAWS[:2] else "other_law"
-        yield Case(f"{kind}:{law}:{number}", own, {}, {"law": law}, seed * 1000 + 500 + number)
-    for number in range(count // 8):
-        what = UNKNOWN[number % len(UNKNOWN)]
-        effects = {"unknown": {"kind": what, "size": float(rng.uniform(2.5, 5.0))}}
-        yield Case(f"unknown:{what}:{number}", (), effects, {}, seed * 1000 + 700 + number)
+        yield numbered(number, f"{kind}:{law}", own, {}, {"law": law})
+        number += 1
+    for at in range(count // 8):
+        what = UNKNOWN[at % len(UNKNOWN)]
+        effects = {"unknown": {"kind": what, "size": float(rng.uniform(1.5, 6.0))}}
+        yield numbered(number, f"unknown:{what}", (), effects, {})
+        number += 1
 
 
-def answers(case: Case, variants: Sequence[Scales]) -> list[list[str]]:
-    """The names that each variant gives, most important first."""
+def _times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, dict[str, Any]]:
+    """Effects of another size."""
+
+    def scaled(name: str, value: Any) -> Any:
+        if name == "orders":
+            return [(order, factor * amplitude, phase) for order, amplitude, phase in value]
+        return value if name in FORMS else factor * value
+
+    return {
+        cause: {name: scaled(name, value) for name, value in each.items()} for cause, each in effects.items()
+    }
+
+
+def walked(case: Case, chosen: Mapping[str, float]) -> tuple[Answer, dict[str, Answer], int]:
+    """The names as the numbers are, the other answers by the number without which they come, and the number
+    of those on which a comparison depends.
+    """
     record = Record(plant.record(plant.Truth(effects=dict(case.effects), **case.axis), PLAN, case.seed))
     model = TransmissionModel.from_text(plant.model_text(case.seed))
-    return [[each.cause for each in diagnose(record, model, scales=one).findings] for one in variants]
+
+    def answer(scales: Scales) -> Answer:
+        return [each.cause for each in diagnose(record, model, scales=scales).findings]
+
+    differing: set[str] = set()
+    both = {
+        name: WhatIf(getattr(Scales(), name), {name: neutral}, differing) for name, neutral in chosen.items()
+    }
+    as_it_is = answer(replace(Scales(), **both))
+    others: dict[str, Answer] = {}
+    groups = [sorted(differing)]
+    while groups:
+        group = groups.pop()
+        if not group:
+            continue
+        names = answer(replace(Scales(), **{name: chosen[name] for name in group}))
+        if names == as_it_is:
+            continue
+        if len(group) == 1:
+            others[group[0]] = names
+        half = len(group) // 2
+        groups += [group[:half], group[half:]] if half else []
+    return as_it_is, others, len(differing)
 
 
 def figures(judged: Sequence[tuple[Case, Sequence[str]]]) -> dict[str, int]:
@@ -122,7 +187,7 @@ def worse(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line, run every variant on every record, print a table."""
+    """Parse the command line, walk every record, print a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -132,31 +197,32 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    table = [each for each in fields(Scales) if "neutral" in each.metadata]
-    chosen = [each for each in table if not options.only or each.name in options.only]
-    variants = [Scales(), *(replace(Scales(), **{each.name: each.metadata["neutral"]}) for each in chosen)]
+    neutral = {
+        each.name: float(each.metadata["neutral"])
+        for each in fields(Scales)
+        if each.metadata["neutral"] != getattr(Scales(), each.name)
+        and (not options.only or each.name in options.only)
+    }
     given = list(cases(options.seed, options.records))
+    found = []
     with ProcessPoolExecutor(options.jobs) as pool:
-        found = []
-        for case, names in zip(given, pool.map(answers, given, [variants] * len(given)), strict=True):
-            found.append(names)
-            print(
-                f"{len(found)}/{len(given)} {case.name}: {', '.join(names[0]) or 'nothing'}",
-                file=sys.stderr,
-                flush=True,
-            )
-    base = figures([(case, names[0]) for case, names in zip(given, found, strict=True)])
+        for case, walk in zip(given, pool.map(walked, given, [neutral] * len(given)), strict=True):
+            found.append(walk)
+            changing = "".join(f"; without {name}: {', '.join(names)}" for name, names in walk[1].items())
+            words = f"{case.name}: {', '.join(walk[0]) or 'nothing'} ({walk[2]}){changing}"
+            print(words, file=sys.stderr, flush=True)
+    base = figures([(case, names) for case, (names, *_) in zip(given, found, strict=True)])
     print("as it is:", ", ".join(f"{name} {count}" for name, count in base.items()))
     result: dict[str, Any] = {"seed": options.seed, "records": len(given), "as_it_is": base, "scalars": {}}
     print("| scalar | value | neutral | answers that change | rows lost |\n|---|---|---|---|---|")
-    for number, each in enumerate(chosen, 1):
-        changed = sum(names[number] != names[0] for names in found)
-        after = figures([(case, names[number]) for case, names in zip(given, found, strict=True)])
+    for name, without in neutral.items():
+        answers = [others.get(name, names) for names, others, _ in found]
+        changed = sum(name in others for _, others, _ in found)
+        after = figures(list(zip(given, answers, strict=True)))
         lost = worse(base, after)
-        words = ", ".join(f"{name} {count}" for name, count in lost.items()) or "none"
-        value, neutral = getattr(Scales(), each.name), each.metadata["neutral"]
-        print(f"| `{each.name}` | {value:g} | {neutral:g} | {changed} | {words} |")
-        result["scalars"][each.name] = {"changed": changed, "lost": lost, "after": after}
+        words = ", ".join(f"{row} {count}" for row, count in lost.items()) or "none"
+        print(f"| `{name}` | {getattr(Scales(), name):g} | {without:g} | {changed} | {words} |")
+        result["scalars"][name] = {"changed": changed, "lost": lost, "after": after}
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     return 0

@@ -34,8 +34,8 @@ from hdbridge.records.recording import Recording
 
 RIDGE = 1.0
 FOLDS = 10
-FREE = frozenset({"constant", "within"})
-AGAINST = frozenset({"excess", "free_loop", "unexplained", "not_recovered"})
+FREE = frozenset({"constant"})
+AGAINST = frozenset({"excess", "unexplained", "not_recovered"})
 PRIOR = {"not_recovered": -2.5, "unexplained": -1.0}
 """What the ridge draws to where these records say little; else to nought."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)

@@ -58,13 +58,13 @@ def _law(
 
     if type(given) is not type(now):
         causes = causes_of(given, now)
-        if trail.law_gain < estimator.scales.law_gain or not causes:
+        if trail.law_gain < estimator.scales.enter + estimator.scales.penalty or not causes:
             return None
         old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
         apart = (old.residual - fitted.residual) / estimator.weight
         if (
-            float(np.sqrt(np.mean(apart**2))) < 0.25 * estimator.scales.law_arcsec
-            or float(np.max(np.abs(apart))) < 2.0 * estimator.scales.law_arcsec
+            float(np.sqrt(np.mean(apart**2))) < 0.25 * estimator.scales.floor_arcsec
+            or float(np.max(np.abs(apart))) < 2.0 * estimator.scales.floor_arcsec
         ):
             return None
         gain = held_out(estimator, fitted, old)
@@ -76,18 +76,11 @@ def _law(
             robust=trail.law_gain, effect=causes[0],
         )  # fmt: skip
     before, after = values(given), values(now)
-    change, peak = float(np.std(after - before)), 0.5 * float(np.ptp(after - before))
-    as_a_whole = change >= max(
-        estimator.scales.loop_arcsec, estimator.scales.loop_share * float(np.std(after))
-    )
+    peak = 0.5 * float(np.ptp(after - before))
     lawless = _lawless_arcsec(estimator, fitted)
-    if (
-        not as_a_whole
-        and not lawless
-        and (
-            peak < estimator.scales.loop_arcsec
-            or _away(estimator, precise, place, given, now, spread) < estimator.scales.calibrations
-        )
+    if not lawless and (
+        peak < estimator.scales.loop_arcsec
+        or _away(estimator, precise, place, given, now, spread) < estimator.scales.calibrations
     ):
         return None
     causes = causes_of(given, now)
@@ -121,9 +114,9 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 0.998))
     gained = (
         plain.chi_square - fitted.chi_square
-        > estimator.scales.law_gain + estimator.scales.penalty * searched.shape[1]
+        > estimator.scales.enter + estimator.scales.penalty * searched.shape[1]
     )
-    return apart if gained and apart > 2.0 * estimator.scales.law_arcsec else 0.0
+    return apart if gained and apart > 2.0 * estimator.scales.floor_arcsec else 0.0
 
 
 def _away(

@@ -223,8 +223,7 @@ class _Judge:
         )
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        free_loop = bool(estimator.nuisance.shape[1])
-        if free_loop:  # a model cannot hold a free-form loop: figures are without it
+        if estimator.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
             estimator.nuisance = estimator.nuisance[:, :0]
             fitted = estimator.fit(fitted.hypothesis)
         left = rest(estimator, fitted)
@@ -232,7 +231,7 @@ class _Judge:
         considered: list[str] = []
         if unknown:
             findings, considered = without_doubtful_loops(findings, left, estimator.scales)
-        findings = weighed(findings, Context(left.arcsec, excess, free_loop, unknown))
+        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
         if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             findings = [
                 replace(each, probability=min(each.probability, estimator.scales.one_way))
@@ -295,7 +294,7 @@ class _Judge:
         without = self.estimator.fit(fitted.hypothesis.without(place))
         judged = gate(self.estimator, fitted, place)
         gain = held_out(self.estimator, fitted, without)
-        aliases, margin = self._aliases(fitted, without, place)
+        aliases = self._aliases(fitted, without, place)
         own = without.chi_square - fitted.chi_square
         return Finding(
             cause=effect.name,
@@ -307,19 +306,14 @@ class _Judge:
             peak_arcsec=self.search.peak(fitted, place),
             robust=own,
             effect=effect,
-            signs=Signs(
-                judged.robust, judged.needed, margin / max(own, 1e-9), gain.recovered if gain else 0.0
-            ),
+            signs=Signs(judged.robust, judged.needed, gain.recovered if gain else 0.0),
         )
 
-    def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[tuple[str, ...], float]:
-        """Other causes that do nearly as well in its place, and by how much the best of the others is
-        worse.
-        """
+    def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
+        """Other causes that do nearly as well in its place."""
         effect = fitted.hypothesis.effects[place]
         own = without.chi_square - fitted.chi_square
         aliases: list[str] = []
-        margin = own
         count = fitted.free()
         # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - count, 1), 1.0)
@@ -329,8 +323,6 @@ class _Judge:
             )
             if worse < 20.0 * excess + 0.01 * own:
                 aliases.append(name)
-            else:
-                margin = min(margin, worse)
         alike = waves_alike(self.estimator, [effect], fitted.hypothesis.start)
         aliases += [each for each in alike if each not in aliases]
         available = self.estimator.motion.available()
@@ -339,7 +331,7 @@ class _Judge:
                 aliases.append(kind.name)
         beside = confounded(self.estimator, fitted, place)
         aliases += [each.name for each in beside if each.name not in aliases]
-        return tuple(aliases), margin
+        return tuple(aliases)
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         many = many_of_one(findings, self.estimator.scales)

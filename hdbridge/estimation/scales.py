@@ -72,9 +72,6 @@ class Scales:
 
     # Loops of another shape, and changes of the model's own parts.
     free_loop_arcsec: float = _scale(0.2, "arcsec rms", 0.0, "what two laws of one loop differ by")
-    law_gain: float = _scale(60.0, "chi square", 41.5, "a cause with three parameters")
-    law_arcsec: float = _scale(0.5, "arcsec", 0.0, "as the floor")
-    loop_share: float = _scale(0.12, "share of the loop, rms", 0.0, "three calibrations of 4 %")
     loop_arcsec: float = _scale(1.5, "arcsec", 0.5, "three times the floor")
     calibrated: float = _scale(0.04, "share of a parameter", 0.04, "what kelvins and weeks change")
     calibrations: float = _scale(4.0, "standard deviations", math.inf, "6 in 100,000 by chance")

@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.effects import Hysteresis
+from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
@@ -185,30 +186,30 @@ def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagno
 
 
 def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
-    signs = Signs(robust=robust / 10.0, needed=25.0, ahead=0.3, recovered=0.2)
+    signs = Signs(robust=robust / 10.0, needed=25.0, recovered=0.2)
     return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, signs=signs)
 
 
-ALONE = Context(left_arcsec=0.1, excess=1.0, free_loop=False, unexplained=False)
+ALONE = Context(left_arcsec=0.1, excess=1.0, unexplained=False)
 
 
 @pytest.mark.parametrize(
     "beside",
     [
-        Context(left_arcsec=2.0, excess=1.0, free_loop=False, unexplained=False),
+        Context(left_arcsec=2.0, excess=1.0, unexplained=False),
         replace(ALONE, excess=4.0),
         replace(ALONE, unexplained=True),
     ],
 )
 def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Context) -> None:
-    (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE)
-    (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside)
+    (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE, Scales())
+    (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside, Scales())
     assert doubtful.probability < alone.probability
 
 
 def test_better_seen_is_surer() -> None:
-    (weak,) = weighed([finding("creep", 400.0, 1.0)], ALONE)
-    (strong,) = weighed([finding("creep", 40000.0, 4.0)], ALONE)
+    (weak,) = weighed([finding("creep", 400.0, 1.0)], ALONE, Scales())
+    (strong,) = weighed([finding("creep", 40000.0, 4.0)], ALONE, Scales())
     assert weak.probability < strong.probability < 1.0
 
 

@@ -61,7 +61,7 @@ class Allowed:
     order_arcsec: float = Scales().order_arcsec
     """Least change of the orders that is one, at the load: as a diagnosis has it (`Scales`)."""
     loop_arcsec: float = Scales().loop_arcsec
-    loop_share: float = Scales().loop_share
+    loop_share: float = 3.0 * Scales().calibrated
     """The same for a loop: the larger of a size and of this share of what the loop does."""
     zero_arcsec: float = 5.0
     """Least change of the zero: the least that a warm-up does (`effects.zero_drift`)."""
