@@ -37,11 +37,22 @@ MOST_HELD: Final = 0.3
 
 
 def compliance(effect: Compliance, draft: Draft) -> Said:
-    """The spring in up to three stages. A torque at the motor is one at the load divided by the ratio."""
+    """The spring in up to three stages, as far as the effect's torque goes.
+
+    A torque at the motor is one at the load divided by the ratio.
+    """
     times = draft.ratio if effect.torque == "motor_torque_nm" else 1.0
     notes = []
-    stages = []
-    for softness in (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm):
+    stages: list[float] = []
+    zones = (
+        (0.0, effect.c1_arcsec_per_nm),
+        (effect.torque1_nm, effect.c2_arcsec_per_nm),
+        (effect.torque2_nm, effect.c3_arcsec_per_nm),
+    )
+    for begins_nm, softness in zones:
+        if begins_nm >= effect.limit_nm:
+            stages.append(stages[-1])
+            continue
         wanted = ARCSEC_PER_RAD * times / softness if softness else math.inf
         stages.append(min(wanted, draft.highest_stiffness_nm_per_rad))
         if stages[-1] < wanted:

@@ -337,6 +337,22 @@ def test_what_the_plant_cannot_do_is_said() -> None:
         assert rows[name].note
 
 
+def test_a_stage_of_the_spring_that_no_torque_reaches_is_left_out() -> None:
+    """A diagnosis names a linear spring so: the other stages begin beyond any torque."""
+    linear = Compliance(
+        c1_arcsec_per_nm=31.0,
+        c2_arcsec_per_nm=0.0,
+        c3_arcsec_per_nm=0.0,
+        torque1_nm=10_000.0,
+        torque2_nm=20_000.0,
+    )
+    made = translate(AXIS, TransmissionModel(AXIS.gear.ratio, (linear,)))
+    assert made.truth.gear.stiffening is None
+    assert made.truth.gear.stiffness_nm_per_rad == pytest.approx(206_264.8 / 31.0)
+    assert made.truth.substep_ms == translate(AXIS).truth.substep_ms
+    assert [row.note for row in made.rows] == [""]
+
+
 def test_of_an_effect_of_ones_own_it_is_said_that_it_has_no_counterpart() -> None:
     class Draught(Synchronous):
         """Not of the catalogue."""
