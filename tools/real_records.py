@@ -1,7 +1,7 @@
 """The figures of docs/real-records.md, from the measured records (which are not part of the project).
 
     HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU
-    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those: four minutes
+    HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those
 
 The folder holds `cobot/jointJ-R.csv`, the same with the command in `cobot-command`, `damper/sine.csv` and
 `damper/earthquake.csv`.
