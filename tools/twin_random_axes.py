@@ -34,6 +34,7 @@ from scipy.stats import beta
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
+from hdbridge.errors import SafetyStop
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
@@ -183,11 +184,20 @@ def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
     return Recording.joined(parts)
 
 
-def one(seed: int, *, checks: bool, workers: int) -> Outcome:
-    """Draw, bench, twin, judge."""
+def recorded(seed: int) -> tuple[Recording, Recording] | None:
+    """A random axis on both plans; None where its drive cannot follow them and stops."""
     axis, truth = draw(seed)
-    plan, another = Plan.load("dynamics"), Plan.model_validate(yaml.safe_load(ANOTHER))
-    recording, other = bench(axis, truth, plan, seed), bench(axis, truth, another, seed + 1000)
+    another = Plan.model_validate(yaml.safe_load(ANOTHER))
+    try:
+        return bench(axis, truth, Plan.load("dynamics"), seed), bench(axis, truth, another, seed + 1000)
+    except SafetyStop as stop:
+        print(f"{seed:4d} left out: {stop}", flush=True)
+        return None
+
+
+def one(seed: int, recording: Recording, other: Recording, *, checks: bool, workers: int) -> Outcome:
+    """Twin and judge."""
+    axis, truth = draw(seed)
     began_s = time.perf_counter()
     twin = fit_twin([recording], axis, usual(axis, truth), workers=workers)
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
@@ -213,7 +223,7 @@ def one(seed: int, *, checks: bool, workers: int) -> Outcome:
                 found.missed.append(f"{name} {true:.3g} not in {interval[0]:.3g}..{interval[1]:.3g}")
     if checks:
         for what, causes, changed in changed_plants(truth, seed):
-            again = bench(axis, changed, plan, seed + 3000)
+            again = bench(axis, changed, Plan.load("dynamics"), seed + 3000)
             answer = check(again, axis, twin.truth, workers=workers)
             found.checks.append((what, causes, {each.cause for each in answer.changes}))
     return found
@@ -264,7 +274,10 @@ def main() -> None:
     )
     found = []
     for seed in range(options.first, options.first + options.axes):
-        each = one(seed, checks=options.checks, workers=options.workers)
+        both = recorded(seed)
+        if both is None:
+            continue
+        each = one(seed, *both, checks=options.checks, workers=options.workers)
         found.append(each)
         print(line(each), flush=True)
         for miss in each.missed:
