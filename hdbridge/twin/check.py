@@ -32,7 +32,7 @@ CHECK_S = 40.0
 """A longer recording is checked on pieces that take about so long."""
 CONTENDERS = 3
 """So many causes are fitted in earnest; the others are behind by the linear reckoning already."""
-STEPS = 12
+STEPS = 6
 OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
 """Looked at in addition to what a fit changes."""
 

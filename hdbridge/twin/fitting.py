@@ -13,13 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import lsq_linear
+from scipy.stats import t
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, coarse, counted, prepare, scales
+from hdbridge.twin.noise import with_load_noise
 from hdbridge.twin.parameters import (
     BY_NAME,
     LOAD,
@@ -33,9 +35,15 @@ from hdbridge.twin.parameters import (
 from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
 
-STEP = 0.03
-"""Step of the Jacobian's central differences: of a logarithm, or of a parameter's spread where it is linear.
-A motor that sticks a substep earlier makes residuals jump; in a smaller step that would be all of it."""
+STEP = 0.1
+"""Step of the first Jacobian's central differences, in a parameter's spread."""
+RESPONSE = 30.0
+"""Norm of the scaled residuals' change that the later differences are made for. A motor that sticks a substep
+earlier makes residuals jump, by a norm of 2 or so (measured on random axes, steps of 0.01 against 0.1): in a
+smaller step that would be taken for information. Along what the motion hardly shows the step is so much
+larger."""
+FARTHEST = 0.3
+"""The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where the resonance of the load is looked for: a fit finds only the nearest of its minima."""
 FIT_S = 60.0
@@ -49,9 +57,18 @@ EARNED = 8.0
 """Half the drop of the scaled squares that such a parameter has to bring: exp(8) to one."""
 SURE = 4.0
 """... and its distance from where it was, in standard deviations."""
-FILTER_SHARES = (0.3, 0.9)
+FILTER_SHARES = (0.3, 0.6)
 """Shares of the lag that may be the command filter's, to begin with."""
-ROUGH_TRIES = 6
+DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
+"""Shares of the information's diagonal that are added to it (Marquardt)."""
+WORTH = 1.0
+"""A drop of half the squares by less is no evidence of anything."""
+RESCALED = 3
+"""After so many steps the scales are made anew: what a start leaves is no measure of the noise."""
+SETTLED = 2
+"""So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
+DRAWS = 12
+"""Simulated recordings that the intervals are held against."""
 OPTIONAL = (*LAST, "load friction", "temperature", "current limit", "motor encoder delay")
 """Not fitted unless asked for: the ordinary motion does not show them, or others can take their place."""
 SOFT = 4.0
@@ -131,27 +148,25 @@ def fit(
         most = scales(rough, *replays([start]))
         begun = _at_best_frequency(replays, begun)
         progress(0.1)
-        starts = [solve(replays, each, parameters, prior, 8, most=most) for each in _filters(begun)]
+        starts = [solve(replays, each, parameters, prior, 12, most=most) for each in _filters(begun)]
         first = min(starts, key=lambda each: each.misfit)
-    progress(0.4)
+    progress(0.3)
     with Replays(data, workers) as replays:
         most = scales(data, *replays([start]))
-        second = solve(
-            replays, first.truth, parameters, prior, 12, lambda share: progress(0.4 + 0.3 * share), most=most
-        )
         best = solve(
-            replays, second.truth, parameters, prior, 12, lambda share: progress(0.7 + 0.2 * share), most=most
-        )
+            replays, first.truth, parameters, prior, 16, lambda share: progress(0.3 + 0.6 * share),
+            most=most, near=first,
+        )  # fmt: skip
         for name in LAST:
             wider = (*parameters, BY_NAME[name])
             if value_in(begun, BY_NAME[name]) is None or name in more:
                 continue
             around = np.array(coordinates(begun, wider))
-            tried = solve(replays, best.truth, wider, around, 3, known=best.scales)
+            tried = solve(replays, best.truth, wider, around, 1, known=best.scales)
             off = abs(float(tried.place[-1] - around[-1])) / math.sqrt(float(tried.covariance[-1, -1]))
             if best.cost - tried.cost > EARNED * best.inflation and off > SURE:
                 best = tried
-        best = _roughened(replays, best)
+        best = _redrawn(replays, best)
     progress(1.0)
     return best
 
@@ -161,36 +176,42 @@ def _filters(truth: Truth) -> list[Truth]:
 
     Between the two a fit finds only the nearest of the misfit's minima.
     """
-    filter_ms, dead_ms = truth.servo.command_filter_ms, truth.servo.dead_time_ms
-    lag_ms = 2.0 * filter_ms + dead_ms
-    tried = [truth]
-    for share in FILTER_SHARES:
-        other_ms = 0.5 * share * lag_ms
-        values = {"command filter": other_ms, "servo dead time": lag_ms - 2.0 * other_ms}
-        tried.append(with_values(truth, values))
-    return tried
+    lag_ms = 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
+    return [
+        with_values(
+            truth, {"command filter": 0.5 * share * lag_ms, "servo dead time": (1.0 - share) * lag_ms}
+        )
+        for share in FILTER_SHARES
+    ]
 
 
-def _roughened(replays: Replays, fitted: Fitted) -> Fitted:
-    """The fit with wider intervals where the misfit is rough: its least place is known no better than that.
+def _redrawn(replays: Replays, fitted: Fitted) -> Fitted:
+    """The fit with intervals no narrower than how far it misses the parameters of simulated recordings.
 
-    A motor that sticks a substep earlier or later makes the misfit jump; what it is off a parabola within the
-    intervals is how much of it says nothing about the parameters.
+    Each is a rounded and noisy replay of a truth drawn from the covariance, to which the fit goes by one
+    linear step. So all counts that a smooth replay does not have: rounding that repeats itself while the
+    command is even, a motor that sticks a substep earlier, a valley that is curved.
     """
     rng = np.random.default_rng(0)
-    root = np.linalg.cholesky(fitted.covariance)
-    rows = np.concatenate([each * (1.0 - replays.data.out) > 0.0 for each in counted(replays.data).values()])
-    tried = [fitted.place + 0.5 * root @ rng.standard_normal(len(fitted.place)) for _ in range(ROUGH_TRIES)]
+    count = len(fitted.place)
     low, high = np.array([each.bounds for each in fitted.parameters]).T
-    tried = [np.clip(each, low, high) for each in tried]
-    found = replays([at_coordinates(fitted.truth, fitted.parameters, each.tolist()) for each in tried])
-    off = []
-    for place, left in zip(tried, found, strict=True):
-        soft = _soft(np.concatenate([left[name] / fitted.scales[name] for name in CHANNELS])[rows])
-        foretold = fitted.vector + fitted.jacobian @ (place - fitted.place)
-        off.append(0.5 * float(soft @ soft - foretold @ foretold))
-    rough = float(np.std(off))
-    return replace(fitted, covariance=fitted.covariance * (1.0 + 2.0 * rough / len(fitted.place)))
+    root = np.linalg.cholesky(fitted.covariance)
+    places = [np.clip(fitted.place + root @ rng.standard_normal(count), low, high) for _ in range(DRAWS)]
+    noisy = with_load_noise(fitted.truth, fitted.residuals[LOAD])
+    drawn = replays.drawn([at_coordinates(noisy, fitted.parameters, each.tolist()) for each in places])
+    rows = np.concatenate([each * (1.0 - replays.data.out) > 0.0 for each in counted(replays.data).values()])
+    spread = np.array([each.spread for each in fitted.parameters])
+    jacobian = fitted.jacobian
+    inverse = np.linalg.inv(jacobian.T @ jacobian + np.diag(spread**-2.0))
+    squares = np.zeros(count)
+    for place, left in zip(places, drawn, strict=True):
+        # What the smooth replay of the fit leaves of the drawn recording.
+        off = [(fitted.residuals[name] - left[name]) / fitted.scales[name] for name in CHANNELS]
+        step = -inverse @ (jacobian.T @ _soft(np.concatenate(off)[rows]))
+        squares += np.square(fitted.place + step - place)
+    few = float(t.ppf(0.975, DRAWS)) / NINETY_FIVE
+    larger = np.maximum(few * np.sqrt(squares / DRAWS / np.diag(fitted.covariance)), 1.0)
+    return replace(fitted, covariance=fitted.covariance * np.outer(larger, larger))
 
 
 def solve(
@@ -203,62 +224,85 @@ def solve(
     known: dict[str, float] | None = None,
     everything: bool = False,
     most: dict[str, float] | None = None,
+    near: Fitted | None = None,
 ) -> Fitted:
     """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
 
     ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
-    what the start leaves, ``most`` at most: a channel that has become worse does not count for less. Held-out
-    legs count only where ``everything`` is to count.
+    what every third step leaves, ``most`` at most: a channel that has become worse does not count for less.
+    Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
+    directions the first differences are made along.
     """
     data = replays.data
     out = 0.0 if everything else data.out
     rows = np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
     spread = np.array([each.spread for each in parameters])
     low, high = np.array([each.bounds for each in parameters]).T
-    place = np.clip(coordinates(start, parameters), low + 1e-9, high - 1e-9)
-    if known is None:
-        (left,) = replays([start])
-        known = scales(data, left)
-        if most is not None:
-            known = {name: min(scale, most[name]) for name, scale in known.items()}
-    scale = known
-    done = 0
+    place = np.clip(coordinates(start, parameters), low, high)
+    (found,) = replays([at_coordinates(start, parameters, place.tolist())])
+    scale = known if known is not None else _capped(scales(data, found), most)
 
     def vector(found: dict[str, FloatArray]) -> FloatArray:
         whole: FloatArray = np.concatenate([found[name] / scale[name] for name in CHANNELS])[rows]
         return whole
 
-    last: tuple[FloatArray, FloatArray, FloatArray] | None = None
+    def cost(place: FloatArray, found: dict[str, FloatArray]) -> float:
+        """Half the squares of the softened residuals and the prior's."""
+        soft, off = _soft(vector(found)), (place - prior) / spread
+        return 0.5 * float(soft @ soft + off @ off)
 
-    def slopes_at(place: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Jacobian and residuals; those of the place that was asked for last are kept."""
-        nonlocal last
-        if last is None or not np.array_equal(last[0], place):
-            last = (place.copy(), *_slopes(replays, start, parameters, place, vector))
-        return last[1], last[2]
-
-    def misfit(place: FloatArray) -> FloatArray:
-        (found,) = replays([at_coordinates(start, parameters, place.tolist())])
-        return np.concatenate([_soft(vector(found)), (place - prior) / spread])
-
-    def jacobian(place: FloatArray) -> FloatArray:
-        nonlocal done
-        slopes, now = slopes_at(place)
+    moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
+    idle = done = 0
+    while True:
+        slopes, now = _slopes(replays, start, parameters, place, moves, vector)
+        slopes, soft = slopes * _softening(now)[:, None], _soft(now)
+        if done == steps or idle == SETTLED:
+            break
+        moves = _moves(slopes, spread)
+        tried = _damped_steps(slopes, soft, place, prior, spread, (low, high))
+        left = replays([at_coordinates(start, parameters, each.tolist()) for each in tried])
+        before, after = cost(place, found), [cost(*each) for each in zip(tried, left, strict=True)]
+        best = int(np.argmin(after))
+        if after[best] < before:
+            place, found = tried[best], left[best]
+        idle = idle + 1 if before - after[best] < WORTH else 0
         done += 1
-        progress(min(done / steps, 1.0))
-        return np.concatenate([slopes * _softening(now)[:, None], np.diag(1.0 / spread)])
-
-    if steps:
-        place = least_squares(
-            misfit, place, jacobian, bounds=(low, high), x_scale=spread, max_nfev=steps, ftol=1e-6, xtol=1e-5
-        ).x
-    best = at_coordinates(start, parameters, place.tolist())
-    (found,) = replays([best])
-    slopes, now = slopes_at(place)
-    slopes, soft = slopes * _softening(now)[:, None], _soft(now)
+        if known is None and done % RESCALED == 0:
+            scale = _capped(scales(data, found), most)
+        progress(done / steps)
+    truth = at_coordinates(start, parameters, place.tolist())
     legs = np.concatenate([data.leg] * len(CHANNELS))[rows]
     covariance = _sandwich(slopes, soft, legs, spread)
-    return Fitted(best, parameters, place, covariance, scale, found, soft, slopes, 0.5 * float(soft @ soft))
+    return Fitted(truth, parameters, place, covariance, scale, found, soft, slopes, 0.5 * float(soft @ soft))
+
+
+def _capped(found: dict[str, float], most: dict[str, float] | None) -> dict[str, float]:
+    return found if most is None else {name: min(scale, most[name]) for name, scale in found.items()}
+
+
+def _damped_steps(
+    slopes: FloatArray,
+    left: FloatArray,
+    place: FloatArray,
+    prior: FloatArray,
+    spread: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+) -> list[FloatArray]:
+    """Places to go to by the linear reckoning, within the bounds, the boldest first (Levenberg, Marquardt).
+
+    All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
+    """
+    information = slopes.T @ slopes + np.diag(spread**-2.0)
+    gradient = slopes.T @ left + (place - prior) / spread**2
+    low, high = bounds
+    found = []
+    for damping in DAMPINGS:
+        root = np.linalg.cholesky(information + damping * np.diag(np.diag(information)))
+        # Least squares of which these are the normal equations.
+        target = -np.linalg.solve(root, gradient)
+        room = (np.minimum(low - place, -1e-12), np.maximum(high - place, 1e-12))
+        found.append(np.clip(place + lsq_linear(root.T, target, room).x, low, high))
+    return found
 
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:
@@ -280,21 +324,32 @@ def _slopes(
     base: Truth,
     parameters: Sequence[Parameter],
     place: FloatArray,
+    moves: FloatArray,
     vector: Callable[[dict[str, FloatArray]], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivative of the scaled residuals by each coordinate, and the residuals themselves."""
-    truths, ways = [at_coordinates(base, parameters, place.tolist())], []
-    for number, each in enumerate(parameters):
-        step = STEP * (each.spread if each.linear else 1.0)
-        ends = [min(max(place[number] + way, each.bounds[0]), each.bounds[1]) for way in (step, -step)]
-        ways.append(ends[0] - ends[1])
-        for end in ends:
-            moved = place.copy()
-            moved[number] = end
-            truths.append(at_coordinates(base, parameters, moved.tolist()))
-    here, *there = (vector(each) for each in replays(truths))
-    slopes = [(there[2 * number] - there[2 * number + 1]) / way for number, way in enumerate(ways)]
-    return np.stack(slopes, axis=1), here
+    """Derivative of the scaled residuals by each coordinate, and the residuals themselves.
+
+    By central differences along ``moves``, shape (moves, p), as far as the parameters' bounds allow.
+    """
+    low, high = np.array([each.bounds for each in parameters]).T
+    ends = [np.clip(place + way * move, low, high) for move in moves for way in (1.0, -1.0)]
+    places = [place, *ends]
+    here, *there = (
+        vector(each) for each in replays([at_coordinates(base, parameters, each.tolist()) for each in places])
+    )
+    moved = np.stack([one - other for one, other in zip(ends[::2], ends[1::2], strict=True)])
+    changes = np.stack([one - other for one, other in zip(there[::2], there[1::2], strict=True)])
+    slopes: FloatArray = (np.linalg.pinv(moved) @ changes).T
+    return slopes, here
+
+
+def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Along the principal directions of the information, each as far as residuals change by `RESPONSE`."""
+    scaled = slopes * spread
+    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
+    moves: FloatArray = (directions * far).T * spread
+    return moves
 
 
 def _soft(values: FloatArray) -> FloatArray:

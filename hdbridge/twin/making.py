@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
-
-import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.fitting import Fitted, fit
-from hdbridge.twin.misfit import CHANNELS, MAD_TO_SIGMA, coarse, held_out_legs, prepare
+from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
-from hdbridge.twin.noise import noise_in_motion
+from hdbridge.twin.noise import noise_in_motion, with_load_noise
 from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import legs_of, replay_directly
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import HELD_OUT, Twin
-from hdbridge.units import ARCSEC_PER_DEG
 
-ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
 NAMING_S = 60.0
 """Causes are named on pieces that take the axis about so long."""
 
@@ -68,24 +63,10 @@ def with_knowledge(fitted: Fitted) -> Truth:
         "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
         "noise": {name: float(f"{fitted.scales[name]:.6g}") for name in CHANNELS},
     }
-    truth = fitted.truth
-    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": round(_load_noise_arcsec(fitted), 4)})
+    truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(
         update={
-            "load_": truth.load_.model_copy(update={"encoder": encoder}),
             "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
             "provenance": {**truth.provenance, "versions": versions_here(), "fit": about},
         }
     )
-
-
-def _load_noise_arcsec(fitted: Fitted) -> float:
-    """The load encoder's noise: what differs from row to row and no replay has, without the rounding."""
-    left = fitted.residuals[LOAD]
-    inside = left != 0.0
-    steps = np.diff(left)[inside[1:] & inside[:-1]]
-    if not len(steps):
-        return fitted.truth.load_.encoder.noise_arcsec
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(steps))) / math.sqrt(2.0)
-    rounding = ARCSEC_PER_TURN / fitted.truth.load_.encoder.counts_per_turn / math.sqrt(12.0)
-    return math.sqrt(max(spread**2 - rounding**2, 0.0))

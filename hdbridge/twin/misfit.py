@@ -26,7 +26,8 @@ FINENESS = 64
 """The loops' encoder is so much finer in a smooth replay."""
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
-"""Motor travel after which the elastic state no longer depends on what went before the recording."""
+"""Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
+recording."""
 RINGING_S = 0.25
 """So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
 LONGEST_LEG_S = 2.0
@@ -132,13 +133,17 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
 
 
-def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
-    """What a smooth replay shows, by piece and channel, as `Piece.measured` has it."""
-    fine, fineness = smooth(truth)
+def traces_of(data: Data, truth: Truth, seed: int | None = None) -> list[dict[str, FloatArray]]:
+    """What a replay shows, by piece and channel, as `Piece.measured` has it.
+
+    A smooth one, or with a seed one that is rounded and noisy as a recording is.
+    """
+    fine, fineness = smooth(truth) if seed is None else (truth, 1)
     shown = []
-    for piece in data.pieces:
+    for number, piece in enumerate(data.pieces):
         commands = piece.commands
-        traces = run(commands, data.axis, fine, fineness=fineness, smooth=True)
+        draw = 0 if seed is None else len(data.pieces) * seed + number
+        traces = run(commands, data.axis, fine, draw, fineness=fineness, smooth=seed is None)
         wanted = _demand_deg(commands, data.axis)
         shown.append(
             {
@@ -150,15 +155,16 @@ def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
     return shown
 
 
-def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
+def residuals(data: Data, truth: Truth, seed: int | None = None) -> dict[str, FloatArray]:
     """Measured minus simulated, by channel, over all rows; zero where a row does not count.
 
     What zeros are apart is taken off in each piece: the load's angle has none in common with the motor's, and
     a command that is off by as much wherever the axis rests is told by another zero. Of the load's angle what
-    it does not share with the motor counts: a motor that is late takes the load along.
+    it does not share with the motor counts: a motor that is late takes the load along. With a ``seed``
+    the simulated recording is rounded and noisy.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
-    for piece, shown in zip(data.pieces, traces_of(data, truth), strict=True):
+    for piece, shown in zip(data.pieces, traces_of(data, truth, seed), strict=True):
         for name in CHANNELS:
             off = piece.measured[name] - shown[name]
             if name == FOLLOWING and piece.rest.any():
@@ -281,7 +287,9 @@ def _piece(
     }
     counts = {
         FOLLOWING: everywhere,
-        TORQUE: np.where(stuck, 0.0, 1.0) if torque is not None else 0.0 * everywhere,
+        TORQUE: np.where(stuck | (known <= UNKNOWN_DEG), 0.0, 1.0)
+        if torque is not None
+        else 0.0 * everywhere,
         LOAD: np.where(known > UNKNOWN_DEG, 1.0, 0.0),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))

@@ -1,4 +1,4 @@
-"""The noise that what a twin leaves is held against: that of the recording while the axis moves."""
+"""The noise of a recording: what a twin leaves is held against it, and its load encoder has as much."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import math
 
 import numpy as np
 
+from hdbridge.effects import FloatArray
+from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, MAD_TO_SIGMA, Data, noise_floor
+from hdbridge.units import ARCSEC_PER_DEG
 
+ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
 THIRD_DIFFERENCE = math.sqrt(20.0)
 """White noise is so much larger in third differences: the root of 1 + 9 + 9 + 1."""
 LEAST_ROWS = 8
@@ -34,3 +38,20 @@ def noise_in_motion(data: Data) -> dict[str, float]:
         )
         found[name] = max(floor[name], spread)
     return found
+
+
+def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
+    """The truth with the load encoder's noise: what differs from row to row and no replay has.
+
+    ``left_arcsec`` are the load's residuals, zero where a row does not count. The rounding is not in it.
+    """
+    encoder = truth.load_.encoder
+    inside = left_arcsec != 0.0
+    steps = np.diff(left_arcsec)[inside[1:] & inside[:-1]]
+    if not len(steps):
+        return truth
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(steps))) / math.sqrt(2.0)
+    rounding = ARCSEC_PER_TURN / encoder.counts_per_turn / math.sqrt(12.0)
+    noise_arcsec = round(math.sqrt(max(spread**2 - rounding**2, 0.0)), 4)
+    noisy = encoder.model_copy(update={"noise_arcsec": noise_arcsec})
+    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": noisy})})

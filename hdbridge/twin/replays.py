@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Self
 
@@ -40,10 +40,17 @@ class Replays:
             self._pool.shutdown(cancel_futures=True)
 
     def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
-        """The residuals of each truth, in order."""
+        """The residuals of each truth, in order, by smooth replays."""
         if self._pool is None:
             return [residuals(self.data, each) for each in truths]
         return list(self._pool.map(_residuals, truths))
+
+    def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
+        """The residuals of each truth, in order, by replays that are rounded and noisy as a recording is."""
+        seeds = range(1, len(truths) + 1)
+        if self._pool is None:
+            return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=True)]
+        return list(self._pool.map(_residuals, truths, seeds))
 
 
 def _begin(data: Data) -> None:
@@ -60,6 +67,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _residuals(truth: Truth) -> dict[str, FloatArray]:
+def _residuals(truth: Truth, seed: int | None = None) -> dict[str, FloatArray]:
     assert _data is not None
-    return residuals(_data, truth)
+    return residuals(_data, truth, seed)

@@ -19,7 +19,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
 from hdbridge.twin.fitting import solve
 from hdbridge.twin.making import with_knowledge
-from hdbridge.twin.misfit import CHANNELS, noise_floor, prepare, residuals
+from hdbridge.twin.misfit import CHANNELS, counted, noise_floor, prepare, residuals
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off
 from hdbridge.twin.replays import Replays
@@ -58,6 +58,26 @@ def test_a_replay_of_the_true_axis_leaves_rounding_and_noise() -> None:
     for name in CHANNELS:
         inside = left[name][left[name] != 0.0]
         assert np.median(np.abs(inside)) < 2.0 * floor[name], name
+
+
+def test_a_torque_counts_once_the_motor_has_left_what_was_before_the_recording() -> None:
+    data = prepare(recorded(), AXIS, TRUTH)
+    travelled_deg = np.cumsum(np.abs(np.diff(recorded().record.motor_position_deg, prepend=0.0)))
+    counts = counted(data)["motor torque"]
+    assert not counts[travelled_deg < 59.0].any()
+    assert counts[(travelled_deg > 61.0) & (travelled_deg < 0.9 * travelled_deg[-1])].any()
+
+
+def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
+    data = prepare(recorded(), AXIS, TRUTH)
+    with Replays(data, 1) as replays:
+        (smooth,) = replays([TRUTH])
+        one, other = (each["load error"] for each in replays.drawn([TRUTH, TRUTH]))
+    counts = counted(data)["load error"] > 0.0
+    noise_arcsec = noise_floor(data)["load error"]
+    assert np.std(smooth["load error"][counts]) == pytest.approx(noise_arcsec, rel=0.2)
+    for each in (one, one - other):  # two draws of noise
+        assert np.std(each[counts]) == pytest.approx(np.sqrt(2.0) * noise_arcsec, rel=0.2)
 
 
 def test_regressions_read_inertia_friction_and_lag_off_the_recording() -> None:
