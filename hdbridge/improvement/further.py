@@ -67,7 +67,8 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """The shortest experiment, not ``done`` yet, predicted to distinguish a cause from one of its ``rivals``.
+    """The experiment, not ``done`` yet, predicted to distinguish causes from most of their ``rivals``; of
+    several the shortest.
 
     Where none does but something is unexplained: the experiment that looks closer at what it depends on. None
     where the machine can learn no more by itself.
@@ -81,11 +82,18 @@ def choose(
         for each in diagnosis.findings
         for other in rivals.get(each.cause, ())
     ]
+    best: Choice | None = None
     for duration_s, plan in menu if pairs else ():
         report = plan_report(plan, model, view.limits)["identifiability"]
-        told = [f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)]
-        if told:
-            return Choice(plan, duration_s, tuple(dict.fromkeys(told)))
+        told = dict.fromkeys(
+            f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)
+        )
+        if len(told) > (len(best.tells) if best else 0):
+            best = Choice(plan, duration_s, tuple(told))
+        if len(told) == len(pairs):
+            break
+    if best:
+        return best
     for finding in diagnosis.findings:
         if finding.cause == "unexplained":
             name = machine_for_unexplained(finding.lives_in)
