@@ -15,7 +15,7 @@ from hdbridge.records.record import Record
 from support import plant
 
 SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
-"""Some 4,700 samples."""
+"""Some 15,000 samples."""
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
 
 
