@@ -27,7 +27,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
 from support import plant
-from support.trials import CAUSES, drawn
+from support.trials import CAUSES, LOOPS, drawn
 from whatif import WhatIf
 
 from hdbridge.diagnose import diagnose
@@ -41,7 +41,6 @@ LAWS = ("plain", "memory", "bouc_wen", "dahl")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
 SAME = {"motor_encoder_eccentricity": "motor_order"}
 """Causes that no record of one mounting of the encoder distinguishes."""
-OF_THE_LOOP = {"hysteresis_memory", "hysteresis_parameters"}
 FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1"})
 """Parameters of an effect that are no size of it."""
 Answer = list[str]
@@ -170,7 +169,7 @@ def figures(judged: Sequence[tuple[Case, Sequence[str]]]) -> dict[str, int]:
             rows["led_unknown"] += bool(named) and named[0] == "unexplained"
             rows["false_unknown"] += bool(causes)
         else:
-            allowed = hidden | (OF_THE_LOOP if case.kind == "other_law" else set())
+            allowed = hidden | (LOOPS if case.kind == "other_law" else set())
             rows[f"false_{case.kind}"] += bool(set(causes) - allowed)
     return rows
 

@@ -312,17 +312,7 @@ class _Judge:
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
         """Other causes that do nearly as well in its place."""
         effect = fitted.hypothesis.effects[place]
-        own = without.chi_square - fitted.chi_square
-        aliases: list[str] = []
-        count = fitted.free()
-        # Where more is left than noise, neither is the whole truth, and a margin counts for less.
-        excess = max(fitted.chi_square / max(len(fitted.residual) - count, 1), 1.0)
-        for name, trial in self.search.rivals(without, effect.name):
-            worse = (
-                trial.chi_square - fitted.chi_square + self.estimator.scales.penalty * (trial.free() - count)
-            )
-            if worse < 20.0 * excess + 0.01 * own:
-                aliases.append(name)
+        aliases = self.search.as_well(fitted, without, effect.name)
         alike = waves_alike(self.estimator, [effect], fitted.hypothesis.start)
         aliases += [each for each in alike if each not in aliases]
         available = self.estimator.motion.available()

@@ -311,13 +311,19 @@ class Search:
         known = self.estimator.calibrated
         self.estimator.calibrated = tuple(each.as_given() if each.place == place else each for each in known)
         try:
-            held = self.estimator.fit(fitted.hypothesis.instead(place, given))
-            rivals = self.rivals(held, given.name)
+            return self.as_well(
+                fitted, self.estimator.fit(fitted.hypothesis.instead(place, given)), given.name
+            )
         finally:
             self.estimator.calibrated = known
+
+    def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
+        """Other causes that do nearly as well in the place of one; ``without`` is the fit that lacks it."""
+        # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
-        as_well = 20.0 * excess + 0.01 * (held.chi_square - fitted.chi_square)
-        return [name for name, trial in rivals if self.cost(trial) < self.cost(fitted) + as_well]
+        margin = 20.0 * excess + 0.01 * (without.chi_square - fitted.chi_square)
+        most = self.cost(fitted) + margin
+        return [name for name, trial in self.rivals(without, cause) if self.cost(trial) < most]
 
     def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
         """Other causes in the place of one that was taken out, each fitted at its best; best first."""

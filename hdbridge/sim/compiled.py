@@ -27,13 +27,11 @@ from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
 from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
+from hdbridge.sim.fast import FloatArray, IntArray
 from hdbridge.sim.heat import Heat
 from hdbridge.sim.loops import Loops, Seen, Slow
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.state import STATES
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 LEAST_ROOM: Final = 16
 """Entries for which a list of numbers has room at least; each power of two is compiled apart."""

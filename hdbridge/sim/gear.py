@@ -217,9 +217,7 @@ def pieces_of(truth: Truth) -> list[Piece]:
 
 def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
     """A growth with temperature, if there is one."""
-    heat = truth.temperature
-    reference_c = heat.ambient_c if heat.reference_c is None else heat.reference_c
-    return WarmthFactor(per_k, reference_c) if per_k else None
+    return WarmthFactor(per_k, truth.temperature.unchanged_c) if per_k else None
 
 
 def _motor_orders(truth: Truth) -> Piece:

@@ -37,8 +37,7 @@ class Heat:
         heat = truth.temperature
         self._dt_s = truth.substep_s
         self._copper_loss_w = heat.copper_loss_w / truth.motor.rated_torque_nm**2
-        reference_c = heat.ambient_c if heat.reference_c is None else heat.reference_c
-        self._growth = WarmthFactor(heat.friction_growth_per_k, reference_c)
+        self._growth = WarmthFactor(heat.friction_growth_per_k, heat.unchanged_c)
         self._friction_grows = bool(heat.friction_growth_per_k)
         self._ambient_c = heat.ambient_c
         self._ambient_k_per_hour = heat.ambient_k_per_hour

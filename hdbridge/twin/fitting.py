@@ -254,7 +254,8 @@ def solve(
     moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
     idle = done = 0
     while True:
-        slopes, now = _slopes(replays, start, parameters, place, moves, vector)
+        now = vector(found)
+        slopes = _slopes(replays, start, parameters, place, moves, vector)
         slopes, soft = slopes * _softening(now)[:, None], _soft(now)
         if done == steps or idle == SETTLED:
             break
@@ -326,21 +327,20 @@ def _slopes(
     place: FloatArray,
     moves: FloatArray,
     vector: Callable[[dict[str, FloatArray]], FloatArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Derivative of the scaled residuals by each coordinate, and the residuals themselves.
+) -> FloatArray:
+    """Derivative of the scaled residuals by each coordinate.
 
     By central differences along ``moves``, shape (moves, p), as far as the parameters' bounds allow.
     """
     low, high = np.array([each.bounds for each in parameters]).T
     ends = [np.clip(place + way * move, low, high) for move in moves for way in (1.0, -1.0)]
-    places = [place, *ends]
-    here, *there = (
-        vector(each) for each in replays([at_coordinates(base, parameters, each.tolist()) for each in places])
-    )
+    there = [
+        vector(each) for each in replays([at_coordinates(base, parameters, each.tolist()) for each in ends])
+    ]
     moved = np.stack([one - other for one, other in zip(ends[::2], ends[1::2], strict=True)])
     changes = np.stack([one - other for one, other in zip(there[::2], there[1::2], strict=True)])
     slopes: FloatArray = (np.linalg.pinv(moved) @ changes).T
-    return slopes, here
+    return slopes
 
 
 def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:

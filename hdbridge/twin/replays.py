@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
 from typing import Any, Self
 
 from hdbridge.effects import FloatArray
@@ -39,18 +40,17 @@ class Replays:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
-        """The residuals of each truth, in order, by smooth replays."""
+    def __call__(
+        self, truths: Iterable[Truth], seeds: Iterable[int | None] = repeat(None)
+    ) -> list[dict[str, FloatArray]]:
+        """The residuals of each truth, in order, by smooth replays; by noisy ones where there are seeds."""
         if self._pool is None:
-            return [residuals(self.data, each) for each in truths]
-        return list(self._pool.map(_residuals, truths))
+            return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
+        return list(self._pool.map(_residuals, truths, seeds))
 
     def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
         """The residuals of each truth, in order, by replays that are rounded and noisy as a recording is."""
-        seeds = range(1, len(truths) + 1)
-        if self._pool is None:
-            return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=True)]
-        return list(self._pool.map(_residuals, truths, seeds))
+        return self(truths, range(1, len(truths) + 1))
 
 
 def _begin(data: Data) -> None:
@@ -67,6 +67,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _residuals(truth: Truth, seed: int | None = None) -> dict[str, FloatArray]:
+def _residuals(truth: Truth, seed: int | None) -> dict[str, FloatArray]:
     assert _data is not None
     return residuals(_data, truth, seed)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.springs import with_spring
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.estimation.calibration import calibrated
@@ -17,18 +18,6 @@ from hdbridge.records.record import Record
 SPRING_ARCSEC_PER_NM = 1.5
 RUN_OUT_ARCSEC = 6.0
 SEEDS = range(401, 407)
-
-
-def with_spring(model: TransmissionModel, compliance: float) -> TransmissionModel:
-    """The model, with a spring that its calibration found."""
-    zones = ", ".join(f"c{zone}_arcsec_per_nm: {compliance:.6g}" for zone in (1, 2, 3))
-    return TransmissionModel.from_text(
-        model.dump().replace(
-            "effects:\n",
-            "effects:\n  - effect: compliance\n"
-            f"    parameters: {{{zones}, torque1_nm: 1000.0, torque2_nm: 2000.0, torque: load_torque_nm}}\n",
-        )
-    )
 
 
 @pytest.fixture

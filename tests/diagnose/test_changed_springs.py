@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.springs import with_spring
 
 from hdbridge.diagnose import diagnose
 from hdbridge.model import TransmissionModel
@@ -20,14 +21,7 @@ KNOWN, NOW = 1.5, 2.4
 @pytest.fixture
 def known(model: TransmissionModel) -> TransmissionModel:
     """The model with a straight spring."""
-    zones = ", ".join(f"c{zone}_arcsec_per_nm: {KNOWN}" for zone in (1, 2, 3))
-    return TransmissionModel.from_text(
-        model.dump().replace(
-            "effects:\n",
-            "effects:\n  - effect: compliance\n"
-            f"    parameters: {{{zones}, torque1_nm: 1000.0, torque2_nm: 2000.0, torque: load_torque_nm}}\n",
-        )
-    )
+    return with_spring(model, KNOWN)
 
 
 def spring_of(model: TransmissionModel) -> float:

@@ -50,6 +50,11 @@ class TrueTemperature(Part):
     ambient_swing_k: float = Field(0.0, ge=0, le=100, description="amplitude of their going to and fro")
     ambient_period_s: float = Field(3_600.0, gt=0, le=1e6, description="period of that")
 
+    @property
+    def unchanged_c(self) -> float:
+        """The temperature at which nothing has grown."""
+        return self.ambient_c if self.reference_c is None else self.reference_c
+
 
 class Truth(Part):
     """The simulated axis."""

@@ -1,0 +1,17 @@
+"""A model that knows a spring of its axis."""
+
+from __future__ import annotations
+
+from hdbridge.model import TransmissionModel
+
+
+def with_spring(model: TransmissionModel, compliance: float) -> TransmissionModel:
+    """The model, with a straight spring that its calibration found, arcsec per Nm."""
+    zones = ", ".join(f"c{zone}_arcsec_per_nm: {compliance:.6g}" for zone in (1, 2, 3))
+    return TransmissionModel.from_text(
+        model.dump().replace(
+            "effects:\n",
+            "effects:\n  - effect: compliance\n"
+            f"    parameters: {{{zones}, torque1_nm: 1000.0, torque2_nm: 2000.0, torque: load_torque_nm}}\n",
+        )
+    )
