@@ -13,8 +13,8 @@ from hdbridge.diagnose.acceptance import BLOCKS_S
 from hdbridge.diagnose.result import Parameter
 from hdbridge.diagnose.systematic import systematic
 from hdbridge.effects import Effect, FloatArray, IntArray, Moves
-from hdbridge.estimation.calibration import NORMAL_95
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.stretches import of_length, sums

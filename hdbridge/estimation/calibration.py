@@ -1,9 +1,10 @@
 """What a model knows of an axis, as a prior of a fit: each part of it is as calibrated, or has changed.
 
 A part is what changes together: a loop, one order, a spring. As calibrated, its parameters are normally
-distributed about those of the model file, as wide as the 95 % intervals there, or by `SHARE` where it has
-none. A part that the data pull further away than a change costs has changed and is free. So what the data
-cannot distinguish from a new cause stays with the model, and a loop that is another one is still found.
+distributed about those of the model file, as wide as the 95 % intervals there, or where it has none by
+`Scales.calibrated`. A part that the data pull further away than a change costs has changed and is free. So
+what the data cannot distinguish from a new cause stays with the model, and a loop that is another one is
+still found.
 """
 
 from __future__ import annotations
@@ -16,19 +17,13 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.effects import Effect, FloatArray
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.shapes import on_scale, shape_value
 from hdbridge.estimation.terms import Prior
 
-SHARE: Final = 0.04
-"""Standard deviation of a calibrated coefficient, as a share of it: what some kelvin and weeks change."""
-SHAPE_SHARE: Final = 0.06
-"""The same of a shape, which shows less: of a width, or of how far an exponent is above one."""
-PEAK_ARCSEC: Final = 0.1
-"""... and of a coefficient at least so much at its peak in this record."""
 EXACT: Final = 1e-3
 """Share of such a deviation that no record distinguishes from none."""
-NORMAL_95: Final = 1.96
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +75,7 @@ def calibrated(
     return tuple(
         CalibratedPart(place, parameters, scales)
         for place, effect in enumerate(effects)
-        for parameters in _parts(effect, half_widths.get(effect.name, {}), columns(effect))
+        for parameters in _parts(effect, half_widths.get(effect.name, {}), columns(effect), scales)
     )
 
 
@@ -100,11 +95,11 @@ def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:
 
 
 def _parts(
-    effect: Effect, halves: Mapping[str, Any], columns: FloatArray
+    effect: Effect, halves: Mapping[str, Any], columns: FloatArray, scales: Scales
 ) -> Iterator[dict[str, tuple[float, float]]]:
     peaks = np.max(np.abs(columns), axis=0, initial=0.0)
     # What the record does not see stays as it is.
-    least = np.where(peaks > 0.0, PEAK_ARCSEC / np.maximum(peaks, 1e-12), 0.0)
+    least = np.where(peaks > 0.0, scales.calibrated_arcsec / np.maximum(peaks, 1e-12), 0.0)
     values = effect.coefficients()
     named = effect.named_coefficients()
     waves = [each for each in named if len(each.columns) > 1]
@@ -113,19 +108,21 @@ def _parts(
     for wave in waves:
         number = given["orders"][wave.path[1]]["order"] if known else 0
         size = float(np.linalg.norm(values[list(wave.columns)]))
-        wide = _of_order(size, known.get(number))
+        wide = _of_order(size, known.get(number), scales.calibrated)
         yield {str(i): (float(values[i]), math.hypot(wide, float(least[i]))) for i in wave.columns}
     if waves:
         return
     names = [each.name for each in named]
     result: dict[str, tuple[float, float]] = {}
     for at, (name, value) in enumerate(zip(names, values.tolist(), strict=True)):
-        wide = _width(halves.get(name), SHARE * abs(value))
+        wide = _width(halves.get(name), scales.calibrated * abs(value))
         result[str(at)] = value, max(math.hypot(wide, float(least[at])), 1e-9)
     for shape in effect.shape:
         value = shape_value(effect, shape.name)
         size = value - 1.0 if shape.name == "exponent" else value
-        wide = max(_width(halves.get(shape.name), SHAPE_SHARE * abs(size)), 1e-3 * abs(size), 1e-9)
+        wide = max(
+            _width(halves.get(shape.name), scales.calibrated_shape * abs(size)), 1e-3 * abs(size), 1e-9
+        )
         result[shape.name] = (math.log(value), wide / value) if shape.logarithmic else (value, wide)
     if result:
         yield result
@@ -135,9 +132,9 @@ def _width(half: object, otherwise: float) -> float:
     return float(half) / NORMAL_95 if isinstance(half, int | float) else otherwise
 
 
-def _of_order(amplitude_arcsec: float, halves: Mapping[str, Any] | None) -> float:
+def _of_order(amplitude_arcsec: float, halves: Mapping[str, Any] | None, share: float) -> float:
     """Of cosine and sine alike, from the half widths of amplitude and phase."""
     if halves is None:
-        return SHARE * amplitude_arcsec
+        return share * amplitude_arcsec
     turn = math.radians(float(halves.get("phase_deg", 0.0))) * amplitude_arcsec
     return math.hypot(float(halves.get("amplitude_arcsec", 0.0)), turn) / math.sqrt(2.0) / NORMAL_95

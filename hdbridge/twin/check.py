@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import Fitted, free_parameters, solve
@@ -167,7 +168,7 @@ class _Search:
         """What is said of a cause."""
         places, off, covariance = self._moved(cause, fitted)
         parameters = [fitted.parameters[place] for place in places]
-        reach = 1.96 * np.sqrt(np.diag(covariance))
+        reach = NORMAL_95 * np.sqrt(np.diag(covariance))
         intervals = {
             each.name: (each.value(float(at - r)), each.value(float(at + r)))
             for each, at, r in zip(parameters, fitted.place[places], reach, strict=True)

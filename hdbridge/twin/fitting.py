@@ -18,6 +18,7 @@ from scipy.stats import t
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, coarse, counted, prepare, scales
@@ -49,7 +50,6 @@ FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 FIT_S = 60.0
 """A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
 there is time: a thousand replays of a quarter of an hour would take hours."""
-NINETY_FIVE = 1.96
 LAST = ("velocity feed-forward",)
 """Fitted last, if that earns it: most drives feed the whole speed forward, and otherwise it looks like a dead
 time until all else is right."""
@@ -109,7 +109,7 @@ class Fitted:
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % intervals by the parameters' names."""
-        spread = NINETY_FIVE * np.sqrt(np.diag(self.covariance))
+        spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
         return {
             each.name: (each.value(float(x - s)), each.value(float(x + s)))
             for each, x, s in zip(self.parameters, self.place, spread, strict=True)
@@ -209,7 +209,7 @@ def _redrawn(replays: Replays, fitted: Fitted) -> Fitted:
         off = [(fitted.residuals[name] - left[name]) / fitted.scales[name] for name in CHANNELS]
         step = -inverse @ (jacobian.T @ _soft(np.concatenate(off)[rows]))
         squares += np.square(fitted.place + step - place)
-    few = float(t.ppf(0.975, DRAWS)) / NINETY_FIVE
+    few = float(t.ppf(0.975, DRAWS)) / NORMAL_95
     larger = np.maximum(few * np.sqrt(squares / DRAWS / np.diag(fitted.covariance)), 1.0)
     return replace(fitted, covariance=fitted.covariance * np.outer(larger, larger))
 

@@ -11,6 +11,7 @@ from support.springs import with_spring
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.estimation.calibration import calibrated
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
@@ -67,7 +68,7 @@ def test_parts_are_as_wide_as_the_model_file_says(model: TransmissionModel) -> N
     loop = next(place for place, each in enumerate(model.effects) if each.name == "hysteresis")
     parts = calibrated(
         model.effects,
-        {"hysteresis": {"offset_arcsec": 3.92, "width_deg": 1.96}},
+        {"hysteresis": {"offset_arcsec": 2.0 * NORMAL_95, "width_deg": NORMAL_95}},
         lambda effect: np.ones((5, len(effect.coefficients()))),
         Scales(),
     )
