@@ -207,6 +207,7 @@ def test_an_object_is_read(ctl):
     assert "6041h:00 'Statusword': 4663 (0x1237)  uint16" in ctl("get", "joint-1", "Statusword")
 
 
+@pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_axis_that_moves(machine, place, number):
     machine.axes["joint-1"].moving_s = 60.0

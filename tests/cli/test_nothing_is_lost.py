@@ -27,6 +27,7 @@ def started(folder, *arguments):
     return process
 
 
+@pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, number):
     process = started(tmp_path, *LONG, "--record", "kept")

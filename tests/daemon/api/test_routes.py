@@ -135,9 +135,9 @@ def test_the_kernel_says_who_takes_the_lease_without_a_name(api):
 def test_a_move_that_is_waited_for_keeps_the_lease(api):
     """It would run out before the axis is there."""
     bridge = api.bridge
-    bridge.lease = type(bridge.lease)(0.3, bridge.lease._now)
+    bridge.lease = type(bridge.lease)(1.5, bridge.lease._now)
     token = bridge.lease.take("patience")
-    bridge.axes["joint-1"].moving_s = 1.0
+    bridge.axes["joint-1"].moving_s = 2.5
     with api.over_socket(**{"X-Lease": token}) as client:
         client.post("/axes/joint-1/enable").raise_for_status()
         assert client.post("/axes/joint-1/move", json={"target_deg": 5}).status_code == 200

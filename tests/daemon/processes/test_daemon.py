@@ -15,6 +15,7 @@ import pytest
 from support.running import gone, running
 
 
+@pytest.mark.usefixtures("at_a_terminal")
 def test_a_day_in_short(tmp_path: Path) -> None:
     """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
     arguments = ("article", "--simulate", "--speed", 4, "--page", "--port", 0)
