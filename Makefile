@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: help demo test unit check format test-socketcan test-slow blind bench-realtime docs clean
+.PHONY: help demo test unit check format test-socketcan test-socketcan-daemon test-socketcan-bus test-slow blind bench-realtime docs clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -18,7 +18,7 @@ demo: $(READY)   ## the main job: step a simulated axis under four compensation 
 	$(BIN)/hdbridge demo
 
 test: $(READY)   ## everything that CI runs
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target check test-socketcan
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target check test-socketcan
 	@$(MAKE) --no-print-directory unit
 
 # Each worker begins with a run of neighbouring tests, which share what was measured, and helps the other in the end.
@@ -30,8 +30,16 @@ unit: $(READY)   ## the tests on the virtual bus
 test-slow: $(READY)  ## what is too slow for every run (HIDDEN_SEEDS="1 2 3" draws it more often)
 	$(UNIT) -m slow
 
-test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
-	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs tests/socketcan; status=$$?; \
+# Two halves that take as long: each is a kernel of one processor.
+test-socketcan: test-socketcan-daemon test-socketcan-bus  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
+
+test-socketcan-daemon: $(READY)
+	@$(call SOCKETCAN,tests/socketcan/test_daemon.py)
+
+test-socketcan-bus: $(READY)
+	@$(call SOCKETCAN,tests/socketcan --ignore=tests/socketcan/test_daemon.py)
+
+SOCKETCAN = tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs $(1); status=$$?; \
 	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED, for the reason above: this machine has no vcan"; \
 	else exit $$status; fi
 

@@ -28,6 +28,7 @@ readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 readonly unavailable=69 broken=70 timed_out=124
 readonly packages=(user-mode-linux kmod iproute2 can-utils)
 readonly boot_limit_s=120 # it takes 2 s
+locks=/tmp/socketcan-$(id -u) && readonly locks
 limit_s=600 force_uml=no check_only=no slowed=''
 
 say() { echo "socketcan: $*" >&2; }
@@ -66,6 +67,16 @@ uml_is_complete() {
 }
 
 install_uml() {
+    local held status
+    exec {held}>"$locks-install.lock"
+    flock "$held" # of two that begin at once, the second finds them installed
+    install_packages
+    status=$?
+    exec {held}>&-
+    return $status
+}
+
+install_packages() {
     uml_is_complete && return 0
     if [ "$(id -u)" != 0 ]; then say "needs root to install: apt-get install ${packages[*]}"; return 1; fi
     if ! command -v apt-get >/dev/null; then say "no apt-get here to install ${packages[*]}"; return 1; fi
@@ -89,6 +100,18 @@ compile_preload() {
     fi
 }
 
+# Sets `processor` to one of those given that no other user-mode-linux of this script has, while there is one.
+take_processor() {
+    local each held
+    for each in "$@"; do
+        exec {held}>"$locks-processor-$each.lock"
+        if flock --nonblock "$held"; then processor=$each; return; fi # held until this script ends
+        exec {held}>&-
+    done
+    local all=("$@")
+    processor=${all[$$ % $#]}
+}
+
 # In its own session, so that one signal to the group ends user-mode-linux and every process in it.
 run_uml() {
     export -p | grep -vE '^declare -[a-zA-Z]*r' >"$work/environment"
@@ -102,7 +125,10 @@ run_uml() {
     local first=() processors
     mapfile -t processors < <(taskset -pc $$ | sed 's/.*: *//' | tr ',' '\n' |
         while IFS=- read -r from to; do seq "$from" "${to:-$from}"; done)
-    [ ${#processors[@]} -eq 0 ] || first=(taskset -c "${processors[$$ % ${#processors[@]}]}")
+    if [ ${#processors[@]} -gt 0 ]; then
+        take_processor "${processors[@]}"
+        first=(taskset -c "$processor")
+    fi
     chrt --rr 1 true 2>/dev/null && first+=(chrt --rr 1)
     local preload
     preload=$(compile_preload)
@@ -189,7 +215,8 @@ fi
 uml "$@"
 status=$?
 if [ $status -eq $unavailable ] && [ ! -e "$work/ready" ]; then
-    if [ $force_uml = no ] && [ -n "$slowed" ] && native; then
+    # Tests of function that run at once are told apart by their kernels; here they have the interface in turn.
+    if [ $force_uml = no ] && [ -n "$slowed" ] && exec {turn}>"$locks-native.lock" && flock "$turn" && native; then
         say "with this kernel's vcan instead, and with this machine's time"
         here "$@"
         exit $?

@@ -145,6 +145,14 @@ class Witness:
         self._bus.shutdown()
 
 
+@dataclass(frozen=True)
+class Made:
+    """When a fault was made: cycles before it began and when it was there for certain."""
+
+    begun: int
+    done: int
+
+
 @dataclass
 class DaemonBench:
     """A daemon that holds one axis on a real interface, and what can be done to both."""
@@ -182,20 +190,26 @@ class DaemonBench:
         daemon.until(lambda: abs(daemon.axis().get("velocity_deg_s") or 0.0) > 0.9 * SLOW_DEG_S, "it moves")
         self.witness.begin()
 
-    def told(self, cycle: int, kind: str, within: int, words: str = "", reaction: str = "") -> int:
-        """How many cycles after ``cycle`` a client was told it; AssertionError when it was later."""
+    def told(self, made: Made, kind: str, within: int, words: str = "", reaction: str = "") -> int:
+        """How many cycles after a fault was made a client was told it; AssertionError when it was later."""
 
         def found() -> dict[str, Any] | None:
             for each in self.daemon.events_since(self.since):
-                wanted = each["kind"] == kind and (each["cycle"] or 0) >= cycle
+                wanted = each["kind"] == kind and (each["cycle"] or 0) >= made.begun
                 if wanted and each["text"].startswith(words) and each["text"].endswith(reaction):
                     return each
             return None
 
         event = self.daemon.until(found, f"{kind} {words}")
-        taken = int(event["cycle"]) - cycle
+        taken = int(event["cycle"]) - made.done
         assert taken <= within, f"{kind} after {taken} cycles: {event}"
         return max(taken, 1)
+
+    def made(self, fault: Callable[[], object]) -> Made:
+        """Make a fault; a program that does it may need some cycles to begin."""
+        begun = self.daemon.cycle()
+        fault()
+        return Made(begun, self.daemon.cycle())
 
     def stopped(self, state: str, fault: str) -> None:
         """An axis that a client sees stopped in this state, for this fault."""

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Final
 
 import pytest
@@ -40,9 +40,7 @@ def _bus_goes(
 ) -> tuple[str, int, int]:
     daemon = bench.daemon
     processes = daemon.pids("control"), daemon.pids("service")
-    cycle = daemon.cycle()
-    goes()
-    cycles = bench.told(cycle, "bus-down", NOTICED)
+    cycles = bench.told(bench.made(goes), "bus-down", NOTICED)
     if pause_s:
         bench.stopped("latched", "BUS_DOWN")
         time.sleep(pause_s)
@@ -72,9 +70,9 @@ def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
 
 def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
     """What leaves an end of the cable is spoilt so that the axis has to stop; then it is whole again."""
-    cycle = bench.daemon.cycle()
-    with bench.cable.spoilt(end, *how):
-        cycles = bench.told(cycle, "fault", NOTICED, Fault[fault].value, "quick stop")
+    with ExitStack() as spoilt:
+        made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
+        cycles = bench.told(made, "fault", NOTICED, Fault[fault].value, "quick stop")
         bench.stopped("quick-stopped", fault)
         time.sleep(1.0)
     return "quick stop, latched", cycles, NOTICED
@@ -100,9 +98,9 @@ def _queue_full(bench: DaemonBench) -> tuple[str, int, int]:
 
 def _doubled(bench: DaemonBench) -> tuple[str, int, int]:
     bench.goes_on(60)  # what changes nothing is told once a second: nothing has been for so long
-    cycle = bench.daemon.cycle()
-    with bench.cable.spoilt(THEIRS, "duplicate", "100%"):
-        cycles = bench.told(cycle, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
+    with ExitStack() as spoilt:
+        made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(THEIRS, "duplicate", "100%")))
+        cycles = bench.told(made, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
         bench.goes_on()
     return "counted; the axis goes on", cycles, NOTICED
 
@@ -114,9 +112,8 @@ def _reordered(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _second_master(bench: DaemonBench) -> tuple[str, int, int]:
-    cycle = bench.daemon.cycle()
-    bench.witness.send(0x080)
-    cycles = bench.told(cycle, "fault", NOTICED, Fault.FOREIGN_SYNC.value, "quick stop")
+    made = bench.made(lambda: bench.witness.send(0x080))
+    cycles = bench.told(made, "fault", NOTICED, Fault.FOREIGN_SYNC.value, "quick stop")
     bench.stopped("quick-stopped", "FOREIGN_SYNC")
     return "quick stop, latched; the motor stands", cycles, NOTICED
 
@@ -124,10 +121,9 @@ def _second_master(bench: DaemonBench) -> tuple[str, int, int]:
 def _node_reset(bench: DaemonBench) -> tuple[str, int, int]:
     daemon = bench.daemon
     processes = daemon.pids("control"), daemon.pids("service")
-    cycle = daemon.cycle()
-    bench.witness.send(0x000, bytes([0x81, 0x01]))
-    bench.told(cycle, "fault", NOTICED, Fault.OWN_ID_ELSEWHERE.value, "quick stop")
-    cycles = bench.told(cycle, "fault", NOTICED, Fault.BOOT_UP.value, "latch")
+    made = bench.made(lambda: bench.witness.send(0x000, bytes([0x81, 0x01])))
+    bench.told(made, "fault", NOTICED, Fault.OWN_ID_ELSEWHERE.value, "quick stop")
+    cycles = bench.told(made, "fault", NOTICED, Fault.BOOT_UP.value, "latch")
     _is_back(bench)
     assert (daemon.pids("control"), daemon.pids("service")) == processes
     return "quick stop, latch; verified again, disabled", cycles, NOTICED

@@ -1,8 +1,10 @@
 """What ``tools/socketcan.sh`` does where user-mode-linux does not boot: it says why and ends with 69."""
 
 import os
+import re
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,23 @@ def test_a_compiler_that_fails_is_said_and_the_kernel_tried_as_it_is(run_with) -
     assert done.returncode == UNAVAILABLE
     assert "no such header" in done.stderr
     assert "preload=\n" in done.stderr
+
+
+def test_two_at_once_have_a_processor_each(run_with, tmp_path: Path) -> None:
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("this machine has one processor")
+    # Each waits for the other, and says where it was with its last words.
+    kernel = tmp_path / "linux.uml"
+    kernel.write_text(
+        f"#!/bin/sh\ncd {tmp_path}; touch $$.here\n"
+        "for i in $(seq 100); do [ $(ls *.here | wc -l) -ge 2 ] && break; sleep 0.1; done\n"
+        "taskset -pc $$; exit 1\n"
+    )
+    kernel.chmod(0o755)
+    with ThreadPoolExecutor(2) as pool:
+        said = [each.result().stderr for each in [pool.submit(run_with), pool.submit(run_with)]]
+    processors = [re.search(r"affinity list: (\d+)$", each, re.MULTILINE) for each in said]
+    assert len({each[1] for each in processors if each}) == 2, said
 
 
 def test_an_hour_of_idleness_is_not_waited_for() -> None:
