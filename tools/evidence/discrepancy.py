@@ -61,7 +61,7 @@ def hat_columns(values: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def smooth_functions(motion: Motion) -> FloatArray:
-    """Of time, signed speed, travel and time since the path changed, each about one at its largest, (n, k)."""
+    """Of time, speed, travel, and time since the path changed, about one at their largest, (n, k)."""
     functions: list[FloatArray] = []
     if motion.time_s is not None:
         functions += _legendre(motion.time_s)

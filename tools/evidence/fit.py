@@ -119,7 +119,8 @@ def averaging(count: int, most: int) -> IntArray:
     size = -(-count // most)
     if size == 1:
         return np.arange(count, dtype=np.intp)
-    return np.add.outer(np.arange(0, count, 2 * size), (0, size - 1)).ravel().astype(np.intp)
+    starts = np.add.outer(np.arange(0, count, 2 * size - 1), (0, size - 1)).ravel()
+    return np.asarray(starts[starts < count], dtype=np.intp)
 
 
 class Evidence:
@@ -196,7 +197,7 @@ class Evidence:
         if theory.unknown and theory.unknown != IN_TIME:
             added = unknown_columns(self.data, theory.unknown)
             columns.append(estimator.at_points(added))
-            sizes.append(np.full(added.shape[1], self.scales.unknown_arcsec))
+            sizes.append(np.full(added.shape[1], self.scales.size_arcsec))
             plain += added.shape[1]
         columns.append(estimator.at_points(of_loops(loops, motion, start)))
         sizes.append(np.ones(columns[-1].shape[1]))
@@ -335,6 +336,8 @@ class Evidence:
 
     def log_odds(self, theory: Theory) -> float:
         """Prior of a theory: the odds of each of its causes, and of the places where each may be."""
-        count = len(theory.causes) + len(theory.changed) + bool(theory.replaced) + theory.lawless
-        count += bool(theory.unknown)
-        return count * float(np.log(self.scales.odds)) - float(np.sum(np.log(theory.places)))
+        strange = bool(theory.unknown) + theory.lawless
+        known = len(theory.causes) + len(theory.changed) + bool(theory.replaced)
+        # Beside what no law describes the likelihood is wrong, and evidence counts for less.
+        known_for = known / self.scales.tempering if strange else known
+        return (known_for + strange) * float(np.log(self.scales.odds)) - float(np.sum(np.log(theory.places)))

@@ -26,7 +26,7 @@ def ordinary(scales: Scales) -> list[Wander]:
 
 def unknown(scales: Scales) -> list[Wander]:
     """Something unknown that follows nothing but time."""
-    return [(scales.unknown_arcsec, each) for each in (0.3, 1.0, 4.0, 16.0)]
+    return [(scales.size_arcsec, each) for each in (0.3, 1.0, 4.0, 16.0)]
 
 
 class Noise:

@@ -15,7 +15,7 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 KEPT = 10.0
-"""Nats below the best, after tempering, down to which a theory counts."""
+"""Nats below the best, down to which a theory counts."""
 NAMED = 0.5
 """What is more likely there than not is named."""
 
@@ -55,7 +55,7 @@ def weighed(evidence: Evidence, theories: Sequence[Fitted], best: Fitted) -> Res
     """Probabilities from the theories that were fitted."""
     names = [each.theory.names(evidence.parts) for each in theories]
     nats = np.array([each.log_evidence for each in theories])
-    weights = evidence.scales.tempering * (nats - best.log_evidence)
+    weights = nats - best.log_evidence
     kept = np.flatnonzero(weights > -KEPT)
     share = np.exp(weights[kept] - logsumexp(weights[kept]))
     probabilities: dict[str, float] = {}

@@ -18,7 +18,7 @@ class Scales:
         0.02, "", "share of records that have a given cause: some twenty causes, one in two records"
     )
     size_arcsec: float = _scale(
-        4.0, "arcsec", "standard deviation of a cause's peak: sizes in docs/causes.md"
+        4.0, "arcsec", "standard deviation of a cause's peak, and of something unknown: docs/causes.md"
     )
     changed: float = _scale(
         0.2, "share", "standard deviation of a part that has changed: 5-30 % of an offset"
@@ -40,8 +40,11 @@ class Scales:
     wander_arcsec: float = _scale(0.15, "arcsec", "slow noise that every bench has, 2 or 20 s long")
     restless_arcsec: float = _scale(0.5, "arcsec", "... of a bench that is touched, 5 s long")
     drifting_arcsec: float = _scale(1.5, "arcsec", "... of one that warms up, 20 s long")
-    unknown_arcsec: float = _scale(4.0, "arcsec", "what the catalogue does not have: the size of a cause")
-    tempering: float = _scale(1.0, "", "exponent of the evidence: 1 where the likelihood is right")
+    tempering: float = _scale(
+        0.05,
+        "",
+        "exponent of the evidence for a cause beside something unknown, where the likelihood is wrong",
+    )
 
     def as_rows(self) -> list[dict[str, object]]:
         """Name, value, unit and source of each, for a result."""

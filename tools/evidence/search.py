@@ -21,7 +21,7 @@ WORTH = 0.3
 """... nor what promises less than this share of the best."""
 SURELY = 1.0
 """Nats by which a larger theory has to be better, so that a search ends."""
-MOST = 6
+MOST = 4
 """Causes at most."""
 
 
@@ -61,13 +61,17 @@ class Search:
         return fitted
 
     def _climbed(self, best: Fitted) -> Fitted:
-        """With whatever raises the evidence, one at a time, and without what does not any more."""
+        """With whatever raises the evidence, one at a time, and then without what does not any more."""
         while True:
             trials = [self._fit(each, best) for each in self._larger(best)]
             there = max(trials, key=lambda each: each.log_evidence, default=best)
-            if there.log_evidence <= best.log_evidence + SURELY:
+            if there.log_evidence > best.log_evidence + SURELY:
+                best = there
+                continue
+            there = self._pruned(best)
+            if there is best:
                 return best
-            best = self._pruned(there)
+            best = there
 
     def _larger(self, best: Fitted) -> list[Theory]:
         """Theories with one thing more that promise something."""
@@ -109,10 +113,10 @@ class Search:
         return found
 
     def _pruned(self, best: Fitted) -> Fitted:
-        """Without what the evidence does not need."""
-        while len(list(smaller := self._smaller(best))) > 1 or best.theory.unknown:
-            trials = [self._fit(each, best) for each in smaller]
-            there = max(trials, key=lambda each: each.log_evidence, default=best)
+        """Without what the evidence does not need; of one thing alone that is known already."""
+        while len(smaller := self._smaller(best)) > 1 or best.theory.unknown:
+            known = [self.known.get(each.key) or self._fit(each, best) for each in smaller]
+            there = max(known, key=lambda each: each.log_evidence, default=best)
             if there.log_evidence <= best.log_evidence:
                 return best
             best = there
