@@ -25,6 +25,7 @@ os.environ |= {
 }  # one core a worker, so that seconds compare
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import numpy as np
 from evidence.draw import KINDS, draw
 from evidence.posterior import explained
 from evidence.scales import Scales
@@ -72,8 +73,11 @@ def judged(kind: str, seed: int, methods: Sequence[str]) -> dict[str, Any]:
     for method in methods:
         named: Callable[[Record, TransmissionModel], Named] = rules if method == "rules" else evidence
         begin = time.process_time()
-        found = named(record, model)
-        row[method] = {"found": found, "seconds": time.process_time() - begin}
+        try:
+            row[method] = {"found": named(record, model)}
+        except (ArithmeticError, ValueError, AssertionError, np.linalg.LinAlgError) as error:
+            row[method] = {"found": [], "failed": repr(error)}  # counts as having said nothing
+        row[method]["seconds"] = time.process_time() - begin
     return row
 
 
@@ -94,6 +98,7 @@ def figures(rows: Sequence[dict[str, Any]], method: str) -> dict[str, tuple[int,
     for row in rows:
         kind, hidden = row["kind"], [same(each) for each in row["hidden"]]
         names = [each["cause"] for each in row[method]["found"]]
+        count("failed", "failed" in row[method])
         causes = [each for each in names if each != "unexplained"]
         allowed = {name for each in row["allowed"] for name in same(each)}
         wrong = [each for each in causes if each not in allowed]

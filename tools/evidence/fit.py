@@ -33,6 +33,8 @@ ZERO_ARCSEC = 1e3
 """An encoder's zero may be anywhere; the same in every theory."""
 MOST_POINTS = 5000
 """Longer records are averaged, columns alike: time goes with the points."""
+KEPT = 24
+"""Whitened columns are kept for so many points of the grid: some megabytes each."""
 STEPS = 8
 Slack = tuple[float, float]
 """Scale of the discrepancy of the loop, arcsec, and of the laws of causes, share."""
@@ -178,6 +180,8 @@ class Evidence:
         loops = tuple(self.model.effects if not theory.lawless else theory.effects)[: theory.base]
         key = (theory.start, theory.replaced, theory.unknown, loops if theory.lawless else ())
         if key not in self._fixed:
+            if len(self._fixed) > KEPT:
+                self._fixed.clear()
             self._fixed[key] = self._made(theory, refreshed(loops))
         return key, self._fixed[key]
 
@@ -231,6 +235,8 @@ class Evidence:
         kernel = self.noise(wander)
         cached = (wander, key, tuple(steady))
         if cached not in self._solved:
+            if len(self._solved) > KEPT:
+                self._solved.clear()
             columns = np.hstack([fixed.columns, *matrices[0]])
             solved = kernel.solve(columns)
             self._solved[cached] = columns, solved, columns.T @ solved
