@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Start, in_place, refreshed
-from hdbridge.estimation.calibration import SHARE, CalibratedPart
+from hdbridge.estimation.calibration import CalibratedPart
 from hdbridge.estimation.shapes import free_shapes, on_scale
 from hdbridge.estimation.terms import FOUND
 
@@ -129,7 +129,7 @@ def parameters(
     known: dict[str, tuple[float, float]] = {}
     for number, part in enumerate(parts):
         if part.place == at:
-            wide = share / SHARE if number in theory.changed else 1.0
+            wide = share / part.scales.calibrated if number in theory.changed else 1.0
             known |= {name: (mean, wide * deviation) for name, (mean, deviation) in part.parameters.items()}
     result = []
     lower, upper = bounds(effect)
