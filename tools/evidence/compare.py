@@ -186,6 +186,7 @@ def main(arguments: list[str] | None = None) -> int:
         waiting = [pool.submit(judged, *each, options.methods) for each in wanted if each not in done]
         for each in as_completed(waiting):
             row = each.result()
+            rows = [one for one in rows if (one["kind"], one["seed"]) != (row["kind"], row["seed"])]
             rows.append(row)
             document = json.dumps({"scales": scales, "rows": rows}, indent=1) + "\n"
             part = options.out.with_suffix(".part")
