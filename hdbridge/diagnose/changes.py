@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import Finding, Parameter
 from hdbridge.diagnose.search import Search, Trail
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part
-from hdbridge.estimation.calibration import variances
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part, Start
+from hdbridge.estimation.calibration import CalibratedPart, calibrated, variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.model import TransmissionModel
 
@@ -26,14 +27,15 @@ def findings(
 ) -> list[Finding]:
     """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
     estimator = search.estimator
+    usual = _usual(estimator, model)
     result: list[Finding] = []
     for place, (given, now) in enumerate(zip(model.effects, precise.hypothesis.effects, strict=False)):
         if given.part is Part.LOOP:
             if estimator.data.reversals < 2:
                 continue  # a loop shows only where the axis reverses
-            found = _law(estimator, trail, precise, place, given, now, spread)
+            found = _law(estimator, trail, precise, usual[place], given, now, spread)
         elif given.part is Part.ORDERS:
-            found = _orders(estimator, precise, place, given, now, spread)
+            found = _orders(estimator, precise, usual[place], given, now, spread) if usual[place] else None
         else:
             found = _freed(search, trail.fitted, precise, place, given, spread)
         if found is not None:
@@ -45,12 +47,12 @@ def _law(
     estimator: Estimator,
     trail: Trail,
     precise: Fitted,
-    place: int,
+    usual: Sequence[CalibratedPart],
     given: Effect,
     now: Effect,
     spread: FloatArray,
 ) -> Finding | None:
-    fitted = trail.fitted
+    fitted, place = trail.fitted, usual[0].place
     start = fitted.hypothesis.start
 
     def values(effect: Effect) -> FloatArray:
@@ -79,8 +81,8 @@ def _law(
     peak = 0.5 * float(np.ptp(after - before))
     lawless = _lawless_arcsec(estimator, fitted)
     if not lawless and (
-        peak < estimator.scales.loop_arcsec
-        or _away(estimator, precise, place, given, now, spread) < estimator.scales.calibrations
+        peak < estimator.scales.floor_arcsec
+        or strain(precise, usual[0], spread) < estimator.scales.calibrations**2
     ):
         return None
     causes = causes_of(given, now)
@@ -119,30 +121,22 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     return apart if gained and apart > 2.0 * estimator.scales.floor_arcsec else 0.0
 
 
-def _away(
-    estimator: Estimator, fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray
-) -> float:
-    """How far offset, width and exponent - 1 are from the given ones, in standard deviations."""
-    own = fitted.places(place)
-    names = [fitted.parameters[i].name if fitted.parameters[i].shape else "offset_arcsec" for i in own]
-
-    sign = -1.0 if given.parameters()["offset_arcsec"] < 0.0 else 1.0
-
-    def sizes(effect: Effect) -> FloatArray:
-        values = effect.parameters()
-        values["offset_arcsec"] *= sign
-        return np.array([float(values[name]) - (1.0 if name == "exponent" else 0.0) for name in names])
-
-    here = sizes(now)
-    if np.any(here <= 0.0) or np.any(sizes(given) <= 0.0):
-        return math.inf
-    moved = np.log(here / sizes(given))
-    logarithmic = np.array([fitted.parameters[i].logarithmic for i in own])
-    scale = np.where(logarithmic, 1.0, here)
-    covariance = spread[np.ix_(own, own)] / np.outer(scale, scale) + estimator.scales.calibrated**2 * np.eye(
-        len(own)
+def _usual(estimator: Estimator, model: TransmissionModel) -> dict[int, list[CalibratedPart]]:
+    """The parts of each effect of a model as any calibration knows them, whatever their intervals were: some
+    kelvin and weeks later they are that far off.
+    """
+    parts = calibrated(
+        model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
     )
-    return float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
+    return {place: [each for each in parts if each.place == place] for place in range(len(model.effects))}
+
+
+def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
+    """Chi square by which a part of a fit is away from its calibration, both with their errors."""
+    own = {fitted.parameters[i].name: i for i in fitted.places(part.place)}
+    seen = replace(part, parameters={name: each for name, each in part.parameters.items() if name in own})
+    at = [own[name] for name in seen.parameters]
+    return seen.strain(fitted.hypothesis.effects, spread[np.ix_(at, at)])
 
 
 def causes_of(given: Effect, now: Effect) -> list[Effect]:
@@ -152,8 +146,14 @@ def causes_of(given: Effect, now: Effect) -> list[Effect]:
 
 
 def _orders(
-    estimator: Estimator, fitted: Fitted, place: int, given: Effect, now: Effect, spread: FloatArray
+    estimator: Estimator,
+    fitted: Fitted,
+    usual: Sequence[CalibratedPart],
+    given: Effect,
+    now: Effect,
+    spread: FloatArray,
 ) -> Finding | None:
+    place = usual[0].place
     columns = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     changed: list[tuple[Effect, Effect]] = []
     kept: list[int] = []
@@ -161,13 +161,13 @@ def _orders(
     for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
         before, after = old.coefficients(), new.coefficients()
         pair = [columns[each] for each in named.columns]
-        size, own = float(np.linalg.norm(after - before)), float(np.linalg.norm(before))
         # What is odd in the direction takes some of an order away from the mean of both directions.
         share = math.prod(each.left_in_mean(_number(new)) for each in fitted.hypothesis.effects)
-        if float(np.linalg.norm(after - share * before)) < max(estimator.scales.order_arcsec, 0.5 * size):
-            continue
-        deviation = math.sqrt(max(float(np.trace(spread[np.ix_(pair, pair)])), 0.0))
-        if size < max(estimator.scales.order_arcsec, estimator.scales.order_share * own, 5.0 * deviation):
+        part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
+        if (
+            float(np.linalg.norm(after - share * before)) < estimator.scales.floor_arcsec
+            or strain(fitted, part, spread) < estimator.scales.calibrations**2
+        ):
             continue
         changed.append((old, new))
         kept += pair

@@ -52,17 +52,26 @@ class CalibratedPart:
         exact = {name: (mean, EXACT * deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=exact, fixed=True)
 
-    def strain(self, effects: Sequence[Effect]) -> float:
-        """Chi square by which the part is away from its calibration."""
+    def strain(self, effects: Sequence[Effect], spread: FloatArray | None = None) -> float:
+        """Chi square by which the part is away from its calibration; ``spread`` (p, p) is the covariance of
+        the ``effects``' own parameters, where they are known no better.
+        """
         effect = effects[self.place]
         coefficients = effect.coefficients()
         shapes = {each.name: each for each in effect.shape}
-        total = 0.0
-        for name, (mean, deviation) in self.parameters.items():
+        off, variance = np.empty(len(self.parameters)), np.empty(len(self.parameters))
+        for at, (name, (mean, deviation)) in enumerate(self.parameters.items()):
             shape = shapes.get(name)
             value = on_scale(effect, shape) if shape else float(coefficients[int(name)])
-            total += ((value - mean) / deviation) ** 2
-        return total
+            off[at], variance[at] = value - mean, deviation**2
+        if spread is None:
+            return float(np.sum(off**2 / variance))
+        return float(off @ np.linalg.solve(np.diag(variance) + spread, off))
+
+    def times(self, share: float) -> CalibratedPart:
+        """The part where so much of it is seen."""
+        seen = {name: (share * mean, deviation) for name, (mean, deviation) in self.parameters.items()}
+        return replace(self, parameters=seen)
 
 
 def calibrated(

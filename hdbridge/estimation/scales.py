@@ -72,15 +72,14 @@ class Scales:
 
     # Loops of another shape, and changes of the model's own parts.
     free_loop_arcsec: float = _scale(0.2, "arcsec rms", 0.0, "what two laws of one loop differ by")
-    loop_arcsec: float = _scale(1.5, "arcsec", 0.5, "three times the floor")
     calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "what kelvins and weeks change")
     calibrated_shape: float = _scale(
         0.06, "share of a width, of an exponent above one", 0.06, "as a coefficient, and it shows less"
     )
     calibrated_arcsec: float = _scale(0.1, "arcsec at a coefficient's peak", 0.1, "reading of an encoder")
-    calibrations: float = _scale(4.0, "standard deviations", math.inf, "6 in 100,000 by chance")
-    order_share: float = _scale(0.15, "share of an order's amplitude", 0.0, "four calibrations of 4 %")
-    order_arcsec: float = _scale(0.8, "arcsec", 0.5, BLIND)
+    calibrations: float = _scale(
+        4.0, "standard deviations of calibration and fit", 0.0, "6 in 100,000 by chance"
+    )
 
     # Names that look alike.
     in_step: float = _scale(

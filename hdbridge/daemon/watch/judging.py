@@ -58,9 +58,9 @@ class Allowed:
     """How often it is asked."""
     noise: float = 1.5
     """Noise of a day at work, by that of a calibration."""
-    order_arcsec: float = Scales().order_arcsec
-    """Least change of the orders that is one, at the load: as a diagnosis has it (`Scales`)."""
-    loop_arcsec: float = Scales().loop_arcsec
+    order_arcsec: float = 0.8
+    """Least change of the orders that is one, at the load."""
+    loop_arcsec: float = 1.5
     loop_share: float = 3.0 * Scales().calibrated
     """The same for a loop: the larger of a size and of this share of what the loop does."""
     zero_arcsec: float = 5.0
