@@ -11,16 +11,6 @@ from hdbridge.effects import Effect, Observations, aliases_of
 from hdbridge.estimation.scales import Scales
 
 
-def hides(one: Effect, other: Effect) -> bool:
-    """Whether either may hide the other from a search that takes one at a time."""
-    return (
-        one.name != other.name
-        and one.follows_motion()
-        and other.follows_motion()
-        and other.name in aliases_of(one.name)
-    )
-
-
 def overlap(one: Effect, other: Effect, data: Observations, scales: Scales) -> float:
     """Share of the other's evidence that a finding needs, because it may look like what that leaves."""
     if one.name == other.name:

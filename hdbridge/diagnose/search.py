@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from hdbridge.diagnose import matched_filters
 from hdbridge.diagnose.acceptance import all_pieces_seen, gate
-from hdbridge.diagnose.overlap import hides
 from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.screening import Score, Screen, candidates, score_of
@@ -48,7 +46,6 @@ class Search:
         self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
         """Causes that were refused though the evidence spoke for them, with the reason in words."""
-        self._left_out: str | None = None
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
@@ -72,35 +69,10 @@ class Search:
             self.estimator.loop_sign *= -1.0
 
     def run(self) -> Trail:
-        """Find causes, best first; where much is left, again without the cause that was best at first.
-
-        The best of one cause may be one that does a little of the work of each of two.
-        """
-        trail = self._greedily()
-        names = [each.name for each in trail.fitted.hypothesis.effects[self.base :]]
-        if not names or trail.fitted.chi_square < self.scales.again * len(trail.fitted.residual):
-            return trail
-        nuisance = self.estimator.nuisance
-        self.estimator.nuisance = nuisance[:, :0]
-        self._left_out = names[0]
-        self.forget()
-        other = self._greedily()
-        self._left_out = None
-        self.forget()
-        if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
-            return other
-        self.estimator.nuisance = nuisance
-        return trail
-
-    def _greedily(self) -> Trail:
+        """Find causes, best first."""
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
-            rival = found or fitted
-            if rival.chi_square > self.scales.again * len(rival.residual):
-                pair = self._best_pair(fitted)
-                if pair is not None and self.cost(pair) < self.scales.pair_share * self.cost(rival):
-                    found = pair
             if number < 3 and not self.estimator.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
@@ -173,26 +145,6 @@ class Search:
             if best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
-
-    def _best_pair(self, fitted: Fitted) -> Fitted | None:
-        """With two causes more, each of which may hide the other."""
-        present = {each.name for each in fitted.hypothesis.effects} | {self._left_out}
-        best: dict[str, Score] = {}
-        for each in self._screen(fitted).scores(fitted):
-            cause = each.candidate.cause
-            if cause not in present and (cause not in best or each.gain > best[cause].gain):
-                best[cause] = each
-        pairs = []
-        for one, other in combinations(sorted(best), 2):
-            two = (best[one].candidate, best[other].candidate)
-            if not hides(two[0].effect, two[1].effect):
-                continue
-            trial = self.estimator.fit(fitted.hypothesis.plus(two[0].effect).plus(two[1].effect))
-            if self.cost(fitted) - self.cost(trial) > 2.0 * self.scales.enter and not any(
-                self._too_small(trial, each.cause) or self._refusal(trial, each.cause) for each in two
-            ):
-                pairs.append(trial)
-        return min(pairs, key=self.cost, default=None)
 
     def _restated(self, trial: Fitted, cause: str) -> Fitted:
         """What was added by another of its conventions, where it makes no sense by the one it has."""
@@ -270,7 +222,6 @@ class Search:
             for each in self._scores(fitted)
             if _key(each) not in self._refused
             and each.candidate.cause not in present
-            and each.candidate.cause != self._left_out
             and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}

@@ -43,8 +43,6 @@ class Scales:
     )
 
     # Looking again.
-    again: float = _scale(1.5, "chi square per point", math.inf, BLIND)
-    pair_share: float = _scale(0.9, "share of the cost that two causes at once may leave", 0.0, BLIND)
     swap: float = _scale(5.0, "chi square by which a swap has to be better", 0.0, "rounding of fits")
     slow: float = _scale(0.8, "share of a large rest that a third cause may leave", math.inf, BLIND)
     merged_share: float = _scale(
