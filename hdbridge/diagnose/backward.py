@@ -1,7 +1,6 @@
-"""Second thoughts on what a search has picked: swap, merge, prune.
+"""Second thoughts on what a search has picked: swap and prune.
 
-A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. A merge
-does so with two findings that overlap: one cause that explains what they do is more likely than both. What
+A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. What
 remembers the path is fitted anew from each of its shapes. Pruning takes out what no longer earns its keep
 among the others.
 """
@@ -9,9 +8,7 @@ among the others.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
-from hdbridge.diagnose.overlap import overlap
 from hdbridge.diagnose.search import FEW, Search, Trail
 from hdbridge.estimation.hypothesis import Fitted
 
@@ -22,9 +19,6 @@ def reconsidered(search: Search, trail: Trail) -> Trail:
     if len(fitted.hypothesis.effects) - search.base <= FEW:
         fitted = _swapped(search, fitted)
     fitted = _pruned(search, _loops_anew(search, fitted))
-    fitted = _merged(search, fitted)
-    fitted, _ = search.with_best_law(fitted)
-    fitted = _pruned(search, fitted)
     fitted, law_gain = search.with_best_law(fitted)
     return replace(trail, fitted=fitted, law_gain=law_gain)
 
@@ -63,26 +57,6 @@ def _loops_anew(search: Search, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _merged(search: Search, fitted: Fitted) -> Fitted:
-    """Two kin taken out together, and the best one cause put in the place of both."""
-    places = range(search.base, len(fitted.hypothesis.effects))
-    for one, other in combinations(places, 2):
-        same = fitted.hypothesis.effects[one].name == fitted.hypothesis.effects[other].name
-        if same or not _overlap(search, fitted, one, other):
-            continue
-        search.forget()
-        without = search.estimator.fit(fitted.hypothesis.without(other).without(one))
-        trial = search.best_addition(without)
-        if trial is None:
-            continue
-        both = without.chi_square - fitted.chi_square
-        if search.cost(trial) < search.cost(fitted) + search.scales.enter + search.scales.merged_share * both:
-            search.forget()
-            return _merged(search, trial)
-    search.forget()
-    return fitted
-
-
 def _pruned(search: Search, fitted: Fitted) -> Fitted:
     """Without what no longer earns its keep among the others."""
     while len(fitted.hypothesis.effects) > search.base:
@@ -94,22 +68,16 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         place = min(gains, key=lambda each: gains[each][0] - _toll(search, fitted, each))
         gain, without = gains[place]
         small = search.peak(fitted, place) < search.scales.floor_arcsec
-        count = len(fitted.residual)
-        share = max(
-            (_overlap(search, fitted, place, other) * gains[other][0] for other in gains if other != place),
-            default=0.0,
-        )
-        if fitted.chi_square < count and without.chi_square > search.scales.exactly * count:
-            share = 0.0  # what a form gets wrong is not made up for down to the noise
+        # What the law of a large one gets wrong looks like a small one of its kind.
+        effect = fitted.hypothesis.effects[place]
+        alike = [
+            each for each in gains if each != place and fitted.hypothesis.effects[each].name == effect.name
+        ]
+        share = effect.inexact * max((gains[each][0] for each in alike), default=0.0)
         if gain > max(_toll(search, fitted, place), search.scales.leftover * largest, share) and not small:
             break
         fitted = without
     return fitted
-
-
-def _overlap(search: Search, fitted: Fitted, one: int, other: int) -> float:
-    effects, data = fitted.hypothesis.effects, search.estimator.data
-    return overlap(effects[one], effects[other], data, search.scales)
 
 
 def _toll(search: Search, fitted: Fitted, place: int) -> float:

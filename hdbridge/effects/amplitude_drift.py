@@ -89,15 +89,11 @@ class AmplitudeDrift(Linear, Warmed):
                     friction_percent_per_k=1.0, tau_s=tau_s, driven_by=driven_by,
                 )  # fmt: skip
 
-    def follows_motion(self) -> bool:
-        """Where it is mostly the loop's: a ripple lies in both directions alike."""
-        ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
-        friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
-        return abs(self.ripple_percent_per_k) * ripple <= friction
-
     def scales(self) -> tuple[Part, Effect]:
         """Loop or ripple, whichever changes by more."""
-        if self.follows_motion():
+        ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
+        friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
+        if abs(self.ripple_percent_per_k) * ripple <= friction:
             return Part.LOOP, self.loop.law()
         return Part.ORDERS, MotorOrders(orders=self.orders)
 

@@ -242,11 +242,6 @@ class Effect(BaseModel, ABC):
             return over.load_angle(motion, ratio)
         return over.since_reversal(motion) if self.tracker().memory_deg else over.motor_angle(motion)
 
-    def follows_motion(self) -> bool:
-        """Whether it lies between the directions of motion, or where one goes over to the other."""
-        moving = {Channel.SPEED, Channel.ACCELERATION}
-        return bool(moving & self.needs()) or self.tracker().memory_deg > 0.0
-
     def shows(self, motion: Motion) -> Stretch | None:
         """Where it must be seen by itself, if that is not everywhere."""
         return None

@@ -45,19 +45,6 @@ class Scales:
     # Looking again.
     swap: float = _scale(5.0, "chi square by which a swap has to be better", 0.0, "rounding of fits")
     slow: float = _scale(0.8, "share of a large rest that a third cause may leave", math.inf, BLIND)
-    merged_share: float = _scale(
-        0.03, "share of what two causes explain", 0.0, "a real law differs from its formula by some 7 %"
-    )
-    moving_share: float = _scale(
-        0.05, "share of the larger one's chi square", 0.0, "... so 0.07 squared and more of it is left"
-    )
-    alias_share: float = _scale(0.15, "share of the larger one's chi square", 0.0, BLIND)
-    exactly: float = _scale(
-        1.1,
-        "chi square per point",
-        math.inf,
-        "above it more than noise is left",
-    )
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
