@@ -31,7 +31,7 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
             search.forget()
             without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
             other = search.best_addition(without)
-            if other is not None and search.cost(other) < search.cost(fitted) - search.scales.swap:
+            if other is not None and search.cost(other) < search.cost(fitted):
                 fitted, changed = other, True
                 break
         if not changed:

@@ -65,7 +65,7 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
             without = hypothesis.without(place) if rest is None else hypothesis.instead(place, rest)
             present = [i for i, each in enumerate(without.effects) if i >= base and type(each) is kind]
             if present:
-                trial, neither = estimator.fit(without), without.without(present[0])
+                trial = estimator.fit(without)
             else:
                 proposed = [
                     each
@@ -78,15 +78,13 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
                 trials = [estimator.fit(without.plus(each)) for each in proposed]
                 fine = [each for each in trials if not each.hypothesis.effects[-1].violations()]
                 trial = min(fine or trials, key=lambda each: each.chi_square + scales.penalty * each.free())
-                neither = without
-            own = estimator.fit(neither).chi_square - fitted.chi_square
             worse = trial.chi_square - fitted.chi_square
             driven = [each for each in trial.hypothesis.effects if type(each) is kind]
             if any(each.violations() for each in driven):
                 continue
             start = trial.hypothesis.start
             lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-            if worse < scales.twin * own + scales.noisy * float(lost):
+            if worse < scales.enter + float(lost):
                 return trial
     return fitted
 
@@ -154,7 +152,7 @@ def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...
             continue
         trial = estimator.fit(replace(fitted.hypothesis, effects=told))
         if (
-            trial.chi_square < fitted.chi_square + estimator.scales.same
+            trial.chi_square < fitted.chi_square + estimator.scales.enter
             and not trial.hypothesis.effects[place].violations()
         ):
             return trial

@@ -272,7 +272,7 @@ class Search:
         """Other causes that do nearly as well in the place of one; ``without`` is the fit that lacks it."""
         # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
-        margin = 20.0 * excess + 0.01 * (without.chi_square - fitted.chi_square)
+        margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
         return [name for name, trial in self.rivals(without, cause) if self.cost(trial) < most]
 

@@ -43,7 +43,7 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
         directions = seen_directions(tangent.T @ tangent + np.diag(fitted.information[own]))
         shift = directions @ (directions.T @ (tangent.T @ columns))
         left = columns - tangent @ shift
-        claimed = scales.noisy * noise * np.sum(columns**2, axis=0)
+        claimed = noise * np.sum(columns**2, axis=0)
         seen, axes = np.linalg.eigh(left.T @ left - np.diag(claimed))
         if seen[0] < scales.enter + scales.penalty:
             moved = np.zeros((fitted.count(), len(seen)))

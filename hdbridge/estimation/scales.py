@@ -43,7 +43,6 @@ class Scales:
     )
 
     # Looking again.
-    swap: float = _scale(5.0, "chi square by which a swap has to be better", 0.0, "rounding of fits")
     slow: float = _scale(0.8, "share of a large rest that a third cause may leave", math.inf, BLIND)
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
@@ -53,7 +52,10 @@ class Scales:
         "pieces that cancel, an order on an arc",
     )
     wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
-    bend: float = _scale(0.6, "share by which a slope may differ along the way", math.inf, BLIND)
+
+    alias: float = _scale(
+        0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
+    )
 
     # Loops of another shape, and changes of the model's own parts.
     free_loop_arcsec: float = _scale(0.2, "arcsec rms", 0.0, "what two laws of one loop differ by")
@@ -70,9 +72,6 @@ class Scales:
     in_step: float = _scale(
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
-    twin: float = _scale(1e-3, "share of the data's chi square", 0.0, BLIND)
-    noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
-    same: float = _scale(10.0, "chi square", 0.0, "what a fit leaves that has not quite converged")
     line_over_mean: float = _scale(
         12.0, "power over the mean", 0.0, "the highest of 65,000 lines of noise alone: log 65,000 = 11"
     )
