@@ -64,18 +64,15 @@ def _law(
             return None
         old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
         apart = (old.residual - fitted.residual) / estimator.weight
-        if (
-            float(np.sqrt(np.mean(apart**2))) < 0.25 * estimator.scales.floor_arcsec
-            or float(np.max(np.abs(apart))) < 2.0 * estimator.scales.floor_arcsec
-        ):
+        peak = float(np.quantile(np.abs(apart), 0.998))
+        if peak < estimator.scales.floor_arcsec:
             return None
         gain = held_out(estimator, fitted, old)
         name = causes[0].name
         return Finding(
             name, 0.95, (), parameters_of(estimator, precise, place, spread),
             gain, next_experiment(name, ()),
-            float(np.quantile(np.abs(apart), 0.998)),
-            robust=trail.law_gain, effect=causes[0],
+            peak, robust=trail.law_gain, effect=causes[0],
         )  # fmt: skip
     before, after = values(given), values(now)
     peak = 0.5 * float(np.ptp(after - before))
@@ -118,7 +115,7 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
         plain.chi_square - fitted.chi_square
         > estimator.scales.enter + estimator.scales.penalty * searched.shape[1]
     )
-    return apart if gained and apart > 2.0 * estimator.scales.floor_arcsec else 0.0
+    return apart if gained and apart > estimator.scales.floor_arcsec else 0.0
 
 
 def _usual(estimator: Estimator, model: TransmissionModel) -> dict[int, list[CalibratedPart]]:

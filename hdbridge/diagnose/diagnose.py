@@ -23,7 +23,7 @@ from hdbridge.diagnose.lookalikes import (
 )
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.probability import Context, Signs, weighed
+from hdbridge.diagnose.probability import Context, Signs, limited, weighed
 from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.diagnose.systematic import confounded
@@ -336,7 +336,7 @@ class _Judge:
             findings = [each for each in findings if each not in many]
         unknown = Finding(
             cause="unexplained",
-            probability=min(max(1.0 - 0.5 * self.estimator.scales.left_arcsec / max(size, 1e-9), 0.5), 0.97),
+            probability=limited(1.0 / (1.0 + (self.estimator.scales.floor_arcsec / max(size, 1e-9)) ** 2)),
             aliases=(),
             parameters={},
             gain=None,
@@ -347,12 +347,10 @@ class _Judge:
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
-        foretold = left.explained_arcsec**2 > self.estimator.scales.loop_explains * left.arcsec**2
-        if many is None and loops and "last reversal" in lives and foretold:
+        if many is None and loops and "last reversal" in lives and left.foretold(self.estimator.scales):
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             told = replace(
                 loops[0],
-                probability=min(loops[0].probability, 0.8),
                 note=f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left",
                 lives_in=lives,
             )

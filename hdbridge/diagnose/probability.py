@@ -91,4 +91,9 @@ def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> li
 
 def _logistic(terms: dict[str, float]) -> float:
     score = sum(COEFFICIENTS[name] * value for name, value in terms.items())
-    return min(max(1.0 / (1.0 + math.exp(-score)), LEAST), MOST)
+    return limited(1.0 / (1.0 + math.exp(-score)))
+
+
+def limited(probability: float) -> float:
+    """A probability that rules nothing out."""
+    return min(max(probability, LEAST), MOST)

@@ -44,6 +44,10 @@ class Rest:
     explained_arcsec: float
     """Root mean square of what the best rival takes away on data it has not seen."""
 
+    def foretold(self, scales: Scales) -> bool:
+        """Whether a good part of it depends on what it was looked at over."""
+        return self.explained_arcsec**2 > scales.foretold * self.arcsec**2
+
 
 def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     """Look at a residual."""
@@ -73,13 +77,13 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
     # that.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    limit = float(np.hypot(scales.left_arcsec, 0.0 if data.commanded else counts))
-    if left.arcsec > limit and left.explained_arcsec > 0.5 * scales.left_arcsec:
+    limit = float(np.hypot(scales.floor_arcsec, 0.0 if data.commanded else counts))
+    if left.arcsec > limit and left.foretold(scales):
         return True
     # Where command and standstill distinguish noise and following error from the gear, fast things count.
     if data.commanded and data.standstill:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
-        if left.fast_arcsec > max(scales.fast_arcsec, floor) + left.standing_arcsec / 3.0:
+        if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, floor), left.standing_arcsec):
             return True
     return bool(left.arcsec > np.linalg.norm((scales.plain_arcsec, counts, left.standing_arcsec)))
 

@@ -78,14 +78,17 @@ class Scales:
     foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
 
     # What is left.
-    left_arcsec: float = _scale(0.5, "arcsec rms over 0.2 s", math.inf, "as the floor")
-    fast_arcsec: float = _scale(0.75, "arcsec rms of single points", math.inf, BLIND)
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
     shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
     near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
     leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
-    loop_explains: float = _scale(0.3, "share of the square of what is left", 0.0, BLIND)
+    foretold: float = _scale(
+        0.3,
+        "share of the square of what is left",
+        0.0,
+        "means over a coordinate foretell it on held-out stretches",
+    )
 
     def described(self) -> dict[str, dict[str, float | str]]:
         """Name, value, unit and source of each, for machines."""
