@@ -14,7 +14,7 @@ import numpy as np
 from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.parameters import parameters_of, polar
-from hdbridge.diagnose.result import Finding, Parameter
+from hdbridge.diagnose.result import UNWEIGHED, Finding, Parameter
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part, Start
 from hdbridge.estimation.calibration import CalibratedPart, calibrated, variances
@@ -70,7 +70,7 @@ def _law(
         gain = held_out(estimator, fitted, old)
         name = causes[0].name
         return Finding(
-            name, 0.95, (), parameters_of(estimator, precise, place, spread),
+            name, UNWEIGHED, (), parameters_of(estimator, precise, place, spread),
             gain, next_experiment(name, ()),
             peak, robust=trail.law_gain, effect=causes[0],
         )  # fmt: skip
@@ -94,7 +94,7 @@ def _law(
     taken = math.sqrt(max(float(np.mean((residual + apart) ** 2 - residual**2)), 0.0))
     moved = values(fitted.hypothesis.effects[place]) - before
     return Finding(
-        effect.name, 0.9, aliases, parameters_of(estimator, precise, place, spread),
+        effect.name, UNWEIGHED, aliases, parameters_of(estimator, precise, place, spread),
         held_out_change(estimator, fitted, fitted.places(place), moved),
         next_experiment(effect.name, aliases), max(peak, lawless), taken_arcsec=taken,
         robust=float(np.sum((estimator.weight * (after - before - np.mean(after - before))) ** 2)),
@@ -188,7 +188,7 @@ def _orders(
     moved = estimator.columns(difference, fitted.hypothesis.start) @ values
     cause, aliases = causes[0].name, tuple(each.name for each in causes[1:])
     return Finding(
-        cause, 0.9, aliases, parameters, held_out_change(estimator, fitted, np.array(kept), moved),
+        cause, UNWEIGHED, aliases, parameters, held_out_change(estimator, fitted, np.array(kept), moved),
         next_experiment(cause, aliases), difference.bound_arcsec(),
         robust=float(np.sum(estimator.weight**2) * 0.5 * float(values @ values)),
         effect=causes[0],
@@ -211,7 +211,7 @@ def _freed(
         return None
     aliases = tuple(search.instead_of_change(fitted, place, given))
     return Finding(
-        now.name, 0.9, aliases, parameters_of(estimator, precise, place, spread),
+        now.name, UNWEIGHED, aliases, parameters_of(estimator, precise, place, spread),
         held_out_change(estimator, precise, own, change), next_experiment(now.name, aliases), peak,
         robust=float(np.sum((estimator.weight * (change - np.mean(change))) ** 2)), effect=now,
         left_alone=bool(aliases), note="a change of what the model has: " + (

@@ -24,7 +24,7 @@ from hdbridge.diagnose.lookalikes import (
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, Signs, limited, weighed
-from hdbridge.diagnose.result import Diagnosis, Figures, Finding, Traces
+from hdbridge.diagnose.result import UNWEIGHED, Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.diagnose.systematic import confounded
 from hdbridge.diagnose.unexplained import (
@@ -298,7 +298,7 @@ class _Judge:
         own = without.chi_square - fitted.chi_square
         return Finding(
             cause=effect.name,
-            probability=0.5,
+            probability=UNWEIGHED,
             aliases=aliases,
             parameters={},
             gain=gain,

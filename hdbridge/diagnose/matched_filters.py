@@ -24,6 +24,8 @@ BINS = 1 << 17
 DEFECT_BINS = 3600
 HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
 LEAST_LINES = 256
+LINE_OVER_MEAN = 12.0
+"""Power of a line that is worth a fit: it gains twice that in chi square, half of what a cause must earn."""
 LOWEST_HZ = 0.3
 PEAKS = 3
 
@@ -180,9 +182,7 @@ def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray)
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio
     power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
-    least = (
-        estimator.scales.line_over_mean * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
-    )
+    least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
     for _ in range(PEAKS):
         at = int(np.argmax(power))
         if power[at] <= least:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,8 @@ from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 
 SCHEMA = "hdbridge.diagnosis/1"
+UNWEIGHED = math.nan
+"""The probability of a finding that is not weighed against the others yet."""
 
 
 @dataclass(frozen=True, slots=True)

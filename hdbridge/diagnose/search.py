@@ -111,8 +111,7 @@ class Search:
         added = loose.free() - fitted.free()
         gain = fitted.chi_square - loose.chi_square - self.scales.penalty * added - self.scales.enter
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
-        size = np.sqrt(max(gain, 0.0) / float(np.sum(self.estimator.weight**2)))
-        if gain > rival and size > self.scales.free_loop_arcsec:
+        if gain > max(rival, 0.0):
             return loose
         self.estimator.nuisance = self.estimator.nuisance[:, :0]
         return None

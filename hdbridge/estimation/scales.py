@@ -58,7 +58,6 @@ class Scales:
     )
 
     # Loops of another shape, and changes of the model's own parts.
-    free_loop_arcsec: float = _scale(0.2, "arcsec rms", 0.0, "what two laws of one loop differ by")
     calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "what kelvins and weeks change")
     calibrated_shape: float = _scale(
         0.06, "share of a width, of an exponent above one", 0.06, "as a coefficient, and it shows less"
@@ -71,9 +70,6 @@ class Scales:
     # Names that look alike.
     in_step: float = _scale(
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
-    )
-    line_over_mean: float = _scale(
-        12.0, "power over the mean", 0.0, "the highest of 65,000 lines of noise alone: log 65,000 = 11"
     )
     foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
 
