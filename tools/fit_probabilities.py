@@ -6,7 +6,7 @@ formulas of tests/support/plant.py, N seeds of each cause. Each finding gives th
 (hdbridge/diagnose/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
 every term with the sign that it must have; how well it fares is told by cross-validation that leaves whole
 records out. The table that is kept is read again where it is there. Prints the coefficients for
-`COEFFICIENTS`.
+`Scales`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
 
 from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.diagnose.probability import COEFFICIENTS, LEAST, MOST
+from hdbridge.diagnose.probability import coefficients
 from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording
@@ -35,8 +35,8 @@ from hdbridge.records.recording import Recording
 RIDGE = 1.0
 FOLDS = 10
 FREE = frozenset({"constant"})
-AGAINST = frozenset({"excess", "unexplained", "not_recovered"})
-PRIOR = {"not_recovered": -2.5, "unexplained": -1.0}
+AGAINST = frozenset({"excess", "unexplained"})
+PRIOR = {"unexplained": -1.0}
 """What the ridge draws to where these records say little; else to nought."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
 Row = dict[str, Any]
@@ -103,7 +103,7 @@ def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray
 
 
 def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.clip(1.0 / (1.0 + np.exp(-terms @ values)), LEAST, MOST))
+    return np.asarray(np.minimum(1.0 / (1.0 + np.exp(-terms @ values)), Scales().surest))
 
 
 def reliability(title: str, given: np.ndarray, right: np.ndarray) -> None:
@@ -138,7 +138,7 @@ def main() -> int:
     if not rows:
         print("no findings; give --suite or --trials", file=sys.stderr)
         return 2
-    names = list(COEFFICIENTS)
+    names = list(coefficients(Scales()))
     terms = np.array([[row["terms"][name] for name in names] for row in rows])
     right = np.array([bool(row["right"]) for row in rows])
     records = sorted({row["record"] for row in rows})

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hdbridge.diagnose.search import FEW, Search, Trail
+from hdbridge.diagnose.search import Search, Trail
 from hdbridge.estimation.hypothesis import Fitted
 
 
 def reconsidered(search: Search, trail: Trail) -> Trail:
     """What is left of a trail, and what stands in for the rest."""
     fitted = trail.fitted
-    if len(fitted.hypothesis.effects) - search.base <= FEW:
+    if len(fitted.hypothesis.effects) - search.base <= search.scales.few:
         fitted = _swapped(search, fitted)
     fitted = _pruned(search, _loops_anew(search, fitted))
     fitted, law_gain = search.with_best_law(fitted)

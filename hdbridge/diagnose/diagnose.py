@@ -23,7 +23,7 @@ from hdbridge.diagnose.lookalikes import (
 )
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.probability import Context, Signs, limited, weighed
+from hdbridge.diagnose.probability import Context, Signs, weighed
 from hdbridge.diagnose.result import UNWEIGHED, Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.diagnose.systematic import confounded
@@ -306,7 +306,7 @@ class _Judge:
             peak_arcsec=self.search.peak(fitted, place),
             robust=own,
             effect=effect,
-            signs=Signs(judged.robust, judged.needed, gain.recovered if gain else 0.0),
+            signs=Signs(judged.robust, judged.needed),
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
@@ -324,7 +324,8 @@ class _Judge:
         return tuple(aliases)
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
-        many = many_of_one(findings, self.estimator.scales)
+        scales = self.estimator.scales
+        many = many_of_one(findings, scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
         size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
@@ -336,7 +337,7 @@ class _Judge:
             findings = [each for each in findings if each not in many]
         unknown = Finding(
             cause="unexplained",
-            probability=limited(1.0 / (1.0 + (self.estimator.scales.floor_arcsec / max(size, 1e-9)) ** 2)),
+            probability=min(1.0 / (1.0 + (scales.floor_arcsec / max(size, 1e-9)) ** 2), scales.surest),
             aliases=(),
             parameters={},
             gain=None,
@@ -347,7 +348,7 @@ class _Judge:
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
-        if many is None and loops and "last reversal" in lives and left.foretold(self.estimator.scales):
+        if many is None and loops and "last reversal" in lives and left.foretold(scales):
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             told = replace(
                 loops[0],
@@ -356,7 +357,7 @@ class _Judge:
             )
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
-        return [*findings, unknown] if largest > self.estimator.scales.leads * size else [unknown, *findings]
+        return [*findings, unknown] if largest > scales.leads * size else [unknown, *findings]
 
     def _as_given(self) -> FloatArray:
         """Residual of the model as it is, but for the zeros; with the start that suits it best."""

@@ -19,8 +19,9 @@ from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 
 MOST = 6
 BEST = 3
-FEW = 3
-"""So many findings are looked at again; more of them mean something that is none of them."""
+"""So many causes are looked for, and so many of the best candidates are fitted: what a search may take."""
+ANEW = 3
+"""So often the law of the loop is chosen anew after a pick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +74,7 @@ class Search:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
-            if number < 3 and not self.estimator.nuisance.shape[1]:
+            if number < ANEW and not self.estimator.nuisance.shape[1]:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
                     fitted, law_gain = self.with_best_law(loose)
@@ -81,11 +82,11 @@ class Search:
             if found is None:
                 break
             left = found.chi_square
-            slow = left > self.scales.slow * fitted.chi_square and left > 4.0 * len(found.residual)
+            slow = left > self.scales.slow * fitted.chi_square
             fitted = found
-            if number >= FEW - 1 and slow:
+            if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # piece by piece at something that is none of them
-            if number < 3:
+            if number < ANEW:
                 fitted, law_gain = self.with_best_law(fitted)
         return Trail(fitted, self.base, law_gain)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 BLIND = "blind suites of simulated axes"
 """Chosen so that wrong names became rare there without a right one being lost."""
+FITTED = "tools/fit_probabilities.py"
 
 
 def _scale(value: float, unit: str, neutral: float, source: str) -> Any:
@@ -37,13 +38,10 @@ class Scales:
     robust_more: float = _scale(
         6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
     )
-    named_from: float = _scale(0.3, "probability", 0.0, "below it one name in eleven was right: " + BLIND)
-    one_way: float = _scale(
-        0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
-    )
-
     # Looking again.
-    slow: float = _scale(0.8, "share of a large rest that a third cause may leave", math.inf, BLIND)
+    few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
+    large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
+    slow: float = _scale(0.8, "share of a large rest that one more than few may leave", math.inf, BLIND)
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
@@ -76,6 +74,9 @@ class Scales:
     # What is left.
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
     shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
+    episodes: float = _scale(
+        0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
+    )
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
     near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
     leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
@@ -84,6 +85,22 @@ class Scales:
         "share of the square of what is left",
         0.0,
         "means over a coordinate foretell it on held-out stretches",
+    )
+
+    # How sure a name is (`hdbridge.diagnose.probability`): 128 names, 115 of them right.
+    odds: float = _scale(-2.80, "log odds", 0.0, FITTED)
+    odds_strength: float = _scale(1.88, "log odds per log of robust evidence over the needed", 0.0, FITTED)
+    odds_rank: float = _scale(0.42, "log odds per decade of the largest one's chi square", 0.0, FITTED)
+    odds_size: float = _scale(1.22, "log odds per log of peak over what is left", 0.0, FITTED)
+    odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
+    odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
+    strong: float = _scale(
+        12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
+    )
+    surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
+    named_from: float = _scale(0.3, "probability", 0.0, "below it one name in eleven was right: " + BLIND)
+    one_way: float = _scale(
+        0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
     )
 
     def described(self) -> dict[str, dict[str, float | str]]:

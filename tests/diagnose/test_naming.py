@@ -186,7 +186,7 @@ def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagno
 
 
 def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
-    signs = Signs(robust=robust / 10.0, needed=25.0, recovered=0.2)
+    signs = Signs(robust=robust / 10.0, needed=25.0)
     return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, signs=signs)
 
 
