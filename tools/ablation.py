@@ -37,7 +37,7 @@ from hdbridge.records.record import Record
 
 PLAN = plant.Plan(rate_hz=14.0, scale=0.2, load_turns=1.05, steps=14)
 """Short: some 13,000 samples, a diagnosis of 2 to 10 s."""
-LAWS = ("plain", "memory", "bouc_wen", "dahl")
+LAWS = ("plain", "memory", "changed", "bouc_wen", "dahl")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
 SAME = {"motor_encoder_eccentricity": "motor_order"}
 """Causes that no record of one mounting of the encoder distinguishes."""
@@ -95,9 +95,13 @@ def cases(seed: int, count: int) -> Iterator[Case]:
         number += 1
     for at in range(count // 8):
         law = LAWS[at % len(LAWS)]
-        own = ("hysteresis_memory",) if law == "memory" else ()
-        kind = "none" if law in LAWS[:2] else "other_law"
-        yield numbered(number, f"{kind}:{law}", own, {}, {"law": law})
+        if law == "changed":
+            axis = {"offset": 40.0 * float(rng.choice([0.8, 1.22])), "width": float(rng.uniform(18.0, 24.0))}
+            yield numbered(number, "single:hysteresis_parameters", ("hysteresis_parameters",), {}, axis)
+        else:
+            own = ("hysteresis_memory",) if law == "memory" else ()
+            kind = "none" if law in LAWS[:2] else "other_law"
+            yield numbered(number, f"{kind}:{law}", own, {}, {"law": law})
         number += 1
     for at in range(count // 8):
         what = UNKNOWN[at % len(UNKNOWN)]

@@ -47,6 +47,7 @@ class Search:
         self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
         """Causes that were refused though the evidence spoke for them, with the reason in words."""
+        self._left_out: str | None = None
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
@@ -70,7 +71,28 @@ class Search:
             self.estimator.loop_sign *= -1.0
 
     def run(self) -> Trail:
-        """Find causes, best first."""
+        """Find causes, best first; where more than the floor is left, again without the first of them.
+
+        The best of one cause may be one that does a little of the work of each of two.
+        """
+        trail = self._greedily()
+        names = [each.name for each in trail.fitted.hypothesis.effects[self.base :]]
+        left = np.mean((trail.fitted.residual**2 - 1.0) / self.estimator.weight**2)
+        if not names or left < self.scales.floor_arcsec**2:
+            return trail
+        nuisance = self.estimator.nuisance
+        self.estimator.nuisance = nuisance[:, :0]
+        self._left_out = names[0]
+        self.forget()
+        other = self._greedily()
+        self._left_out = None
+        self.forget()
+        if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
+            return other
+        self.estimator.nuisance = nuisance
+        return trail
+
+    def _greedily(self) -> Trail:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
             found = self.best_addition(fitted)
@@ -222,6 +244,7 @@ class Search:
             for each in self._scores(fitted)
             if _key(each) not in self._refused
             and each.candidate.cause not in present
+            and each.candidate.cause != self._left_out
             and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
