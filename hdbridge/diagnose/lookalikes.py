@@ -84,7 +84,7 @@ def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
                 continue
             start = trial.hypothesis.start
             lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-            if worse < scales.enter + float(lost):
+            if worse < scales.enter + scales.noisy * float(lost):
                 return trial
     return fitted
 

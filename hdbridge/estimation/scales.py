@@ -69,6 +69,7 @@ class Scales:
     in_step: float = _scale(
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
+    noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
     foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
 
     # What is left.
