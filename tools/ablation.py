@@ -217,14 +217,18 @@ def main(arguments: list[str] | None = None) -> int:
     base = figures([(case, names) for case, (names, *_) in zip(given, found, strict=True)])
     print("as it is:", ", ".join(f"{name} {count}" for name, count in base.items()))
     result: dict[str, Any] = {"seed": options.seed, "records": len(given), "as_it_is": base, "scalars": {}}
-    print("| scalar | value | neutral | answers that change | rows lost |\n|---|---|---|---|---|")
+    print("| number | value | unit | source | neutral | answers that change | rows lost |")
+    print("|---|---|---|---|---|---|---|")
+    described = Scales().described()
     for name, without in neutral.items():
         answers = [others.get(name, names) for names, others, _ in found]
         changed = sum(name in others for _, others, _ in found)
         after = figures(list(zip(given, answers, strict=True)))
         lost = worse(base, after)
         words = ", ".join(f"{row} {count}" for row, count in lost.items()) or "none"
-        print(f"| `{name}` | {getattr(Scales(), name):g} | {without:g} | {changed} | {words} |")
+        own = described[name]
+        said = f"{own['value']:g} | {own['unit']} | {own['source']}"
+        print(f"| `{name}` | {said} | {without:g} | {changed} | {words} |")
         result["scalars"][name] = {"changed": changed, "lost": lost, "after": after}
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
