@@ -65,7 +65,7 @@ def _law(
         old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
         apart = (old.residual - fitted.residual) / estimator.weight
         peak = float(np.quantile(np.abs(apart), 0.998))
-        if peak < estimator.scales.floor_arcsec:
+        if peak < estimator.scales.plain_arcsec:
             return None
         gain = held_out(estimator, fitted, old)
         name = causes[0].name
@@ -115,7 +115,7 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
         plain.chi_square - fitted.chi_square
         > estimator.scales.enter + estimator.scales.penalty * searched.shape[1]
     )
-    return apart if gained and apart > estimator.scales.floor_arcsec else 0.0
+    return apart if gained and apart > estimator.scales.plain_arcsec else 0.0
 
 
 def _usual(estimator: Estimator, model: TransmissionModel) -> dict[int, list[CalibratedPart]]:
