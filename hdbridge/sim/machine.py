@@ -26,8 +26,8 @@ FloatArray = fast.FloatArray
 class Cycles(NamedTuple):
     """What a machine tells at the end of each of many cycles, as its properties do."""
 
-    motor_counts: FloatArray
-    load_counts: FloatArray
+    motor_reading: FloatArray
+    load_reading: FloatArray
     torque_nm: FloatArray
     torque_permille: FloatArray
     temperature_c: FloatArray
@@ -110,8 +110,8 @@ class Machine:
                 self._follow_compiled(counts[done:], substeps[done:], Cycles(*(each[done:] for each in told)))
                 break
             self.follow(counts[done], counts[done + 1], substeps[done])
-            told.motor_counts[done] = self.motor_counts
-            told.load_counts[done] = self.load_counts
+            told.motor_reading[done] = self.motor_reading
+            told.load_reading[done] = self.load_reading
             told.torque_nm[done] = self.torque_nm
             told.torque_permille[done] = self.torque_permille
             told.temperature_c[done] = self.temperature_c
@@ -121,7 +121,7 @@ class Machine:
 
     def _evenly(self, substeps: Sequence[int]) -> bool:
         """Whether the compiled loops can go on by themselves: nothing happens between the cycles."""
-        if not self._powered or self._hold_counts is not None or self._to_compile is not None:
+        if not self._powered or self._to_compile is not None:
             return False
         if self._motor_errors or self._load_errors or self._motor_losses or self._load_losses:
             return False
@@ -131,6 +131,11 @@ class Machine:
         per_deg, steps = self._motor_counts_per_deg, np.array(substeps, dtype=np.int64)
         demand = np.array(counts, dtype=np.float64)
         start_deg = (demand[:-1] - self._motor_zero) / per_deg
+        if self._hold_counts is not None:
+            moves = np.flatnonzero((demand[:-1] != self._hold_counts) | (demand[1:] != self._hold_counts))
+            start_deg[: moves[0] if len(moves) else len(steps)] = self._hold_deg
+            if len(moves):
+                self._hold_counts = None
         speed_deg_s = (demand[1:] - demand[:-1]) / per_deg / (steps * self.dt_s)
         assert isinstance(self._loops, fast.EvenLoops)
         seen, told.temperature_c[:] = self._loops.follow_all(
@@ -140,9 +145,8 @@ class Machine:
         self._see(tuple(seen[-1].tolist()))
         self._noise_now_deg = float(noise[-1])
         _, motor_deg, _, load_deg, body_deg, _, _, weight_nm, torque_nm, _, _ = seen.T
-        told.motor_counts[:] = np.floor(motor_deg * self._motor_counts_per_deg + self._motor_zero + 0.5)
-        read_deg = load_deg + body_deg + noise
-        told.load_counts[:] = np.floor(read_deg * self._load_counts_per_deg + self._load_zero + 0.5)
+        told.motor_reading[:] = motor_deg * self._motor_counts_per_deg + self._motor_zero
+        told.load_reading[:] = (load_deg + body_deg + noise) * self._load_counts_per_deg + self._load_zero
         told.torque_nm[:] = self.truth.motor.encoder.direction * torque_nm
         told.torque_permille[:] = np.round(self._sense_permille * torque_nm / self._rated_nm)
         told.load_torque_nm[:] = weight_nm
@@ -157,17 +161,27 @@ class Machine:
     @property
     def motor_counts(self) -> int:
         """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
-        return math.floor(self._motor_reading(self._sampled_motor_deg) + 0.5)
+        return math.floor(self.motor_reading + 0.5)
 
     @property
     def load_counts(self) -> int:
         """Load encoder: whole counts, multi-turn, never wrapped; with the noise of this instant."""
+        return math.floor(self.load_reading + 0.5)
+
+    @property
+    def motor_reading(self) -> float:
+        """The motor encoder in counts, before it is rounded."""
+        return self._motor_reading(self._sampled_motor_deg)
+
+    @property
+    def load_reading(self) -> float:
+        """The load encoder in counts, before it is rounded."""
         deg = self._sampled_load_deg
         if self._load_errors:
             deg += sum(each.error_deg(deg) for each in self._load_errors)
         deg += self._body_deg
         deg += self._noise_now_deg
-        counts = math.floor(deg * self._load_counts_per_deg + self._load_zero + 0.5)
+        counts = deg * self._load_counts_per_deg + self._load_zero
         return counts if self._load_losses is None else counts + self._load_losses.counts(self._heat.since_s)
 
     @property

@@ -21,7 +21,8 @@ from hdbridge.errors import InputError
 from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import Fitted, free_parameters, solve
+from hdbridge.twin.fitting import free_parameters
+from hdbridge.twin.least_squares import Fitted, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, noise_floor, prepare
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import Parameter, coordinates

@@ -9,7 +9,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import Comparison, compare
-from hdbridge.twin.fitting import Fitted, fit
+from hdbridge.twin.fitting import fit
+from hdbridge.twin.least_squares import Fitted
 from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
 from hdbridge.twin.noise import noise_in_motion, with_load_noise

@@ -1,7 +1,7 @@
 """What a recording shows and a replay does not, channel by channel: the residuals that a fit makes small.
 
-The replay is smooth: encoders and torque unrounded, no noise, and loops that close on a finer encoder, so
-that the residuals are smooth in the plant's parameters. What rounding and noise do is in the scale of each
+The replay is smooth: encoders and torque unrounded, no noise, and loops that close on a much finer encoder,
+so that the residuals are smooth in the plant's parameters. What rounding and noise do is in the scale of each
 channel.
 """
 
@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
@@ -22,14 +23,18 @@ from hdbridge.twin.replay import Commands, commands_of, legs_of, run
 from hdbridge.twin.stretches import stretches
 from hdbridge.units import ARCSEC_PER_DEG
 
-FINENESS = 64
-"""The loops' encoder is so much finer in a smooth replay."""
+FINEST_STEPS_PER_TURN = 2**40
+"""Of the loops' encoder in a smooth replay. A step is a torque of some 1e-9 of the rated one: with steps that
+a drive has, the least change of a parameter shakes the torque by as much as a change that means something."""
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
 """Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
 recording."""
 RINGING_S = 0.25
 """So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
+STANDS_COUNTS = 1.5
+"""A motor that stays within so many counts of where it comes to rest stands. Its torque is what the integral
+stopped at, or creeps up while friction holds it: which of the two hangs on a thousandth of a count."""
 LONGEST_LEG_S = 2.0
 """A longer leg counts as several: residuals further apart than this have nothing to do with each other."""
 COARSE_S = 15.0
@@ -111,7 +116,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
         out = np.zeros(len(part))
         for each in held:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
-        pieces.append(_piece(part, commands, numbers, kinds, out))
+        pieces.append(_piece(part, commands, numbers, kinds, out, axis.motor_encoder.counts_per_turn))
     return Data(axis, base, tuple(pieces))
 
 
@@ -138,12 +143,12 @@ def traces_of(data: Data, truth: Truth, seed: int | None = None) -> list[dict[st
 
     A smooth one, or with a seed one that is rounded and noisy as a recording is.
     """
-    fine, fineness = smooth(truth) if seed is None else (truth, 1)
+    simulated = smooth(truth) if seed is None else truth
     shown = []
     for number, piece in enumerate(data.pieces):
         commands = piece.commands
         draw = 0 if seed is None else len(data.pieces) * seed + number
-        traces = run(commands, data.axis, fine, draw, fineness=fineness, smooth=seed is None)
+        traces = run(commands, data.axis, simulated, draw, smooth=seed is None)
         wanted = _demand_deg(commands, data.axis)
         shown.append(
             {
@@ -235,42 +240,36 @@ def scales(data: Data, found: Mapping[str, FloatArray]) -> dict[str, float]:
     return given
 
 
-def smooth(truth: Truth) -> tuple[Truth, int]:
-    """The truth with finer encoders and no noise, and how many of its motor counts make one before."""
+def smooth(truth: Truth) -> Truth:
+    """The truth with loops that close on a much finer encoder, and no noise."""
     motor, load, servo = truth.motor.encoder, truth.load_.encoder, truth.servo
-    fineness = max(1, min(FINENESS, (2**31 - 1) // motor.counts_per_turn))
-    load_fineness = max(1, min(FINENESS, (2**31 - 1) // load.counts_per_turn))
-    encoder = motor.model_copy(
-        update={
-            "counts_per_turn": motor.counts_per_turn * fineness,
-            "zero_counts": motor.zero_counts * fineness,
-        }
-    )
-    at_load = load.model_copy(
-        update={
-            "counts_per_turn": load.counts_per_turn * load_fineness,
-            "zero_counts": load.zero_counts * load_fineness,
-            "noise_arcsec": 0.0,
-        }
-    )
-    # The bands are in steps of the loops' encoder.
+    steps = max(FINEST_STEPS_PER_TURN // motor.counts_per_turn, motor.interpolation)
+    finer = steps / motor.interpolation
+    # Not as a truth file may have it: its bands are in steps of the loops' encoder.
     loops = servo.model_copy(
         update={
-            "integral_dead_band": (servo.integral_dead_band + 0.5) * fineness - 0.5,
-            "hunting_band": (servo.hunting_band + 0.5) * fineness - 0.5,
+            "integral_dead_band": (servo.integral_dead_band + 0.5) * finer - 0.5,
+            "hunting_band": (servo.hunting_band + 0.5) * finer - 0.5,
         }
     )
+    encoder = motor.model_copy(update={"interpolation": steps})
+    silent = load.model_copy(update={"noise_arcsec": 0.0})
     return truth.model_copy(
         update={
             "motor": truth.motor.model_copy(update={"encoder": encoder}),
-            "load_": truth.load_.model_copy(update={"encoder": at_load}),
+            "load_": truth.load_.model_copy(update={"encoder": silent}),
             "servo": loops,
         }
-    ), fineness
+    )
 
 
 def _piece(
-    part: Record, commands: Commands, leg: FloatArray, kinds: tuple[str, ...], out: FloatArray
+    part: Record,
+    commands: Commands,
+    leg: FloatArray,
+    kinds: tuple[str, ...],
+    out: FloatArray,
+    counts_per_turn: int,
 ) -> Piece:
     target = part.motor_target_deg
     assert target is not None  # commands_of has refused it
@@ -279,6 +278,7 @@ def _piece(
     last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.ones(len(part))
+    stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * 360.0 / counts_per_turn)
     torque = part.columns.get("motor_torque_nm")
     measured = {
         FOLLOWING: target - part.motor_position_deg,
@@ -287,12 +287,23 @@ def _piece(
     }
     counts = {
         FOLLOWING: everywhere,
-        TORQUE: np.where(stuck | (known <= UNKNOWN_DEG), 0.0, 1.0)
+        TORQUE: np.where(stuck | stands | (known <= UNKNOWN_DEG), 0.0, 1.0)
         if torque is not None
         else 0.0 * everywhere,
         LOAD: np.where(known > UNKNOWN_DEG, 1.0, 0.0),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
+
+
+def _stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
+    """For each row whether command and motor stand where they stand until the command moves on."""
+    rest = np.cumsum(moved)
+    last = np.searchsorted(rest, rest, side="right") - 1
+    away = np.abs(motor_deg - motor_deg[last]) > within_deg
+    rows = np.arange(len(rest))
+    last_away = np.maximum.accumulate(np.where(away | moved, rows, -1))
+    given: NDArray[np.bool_] = last_away < rows
+    return given
 
 
 def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import Fitted
+from hdbridge.twin.least_squares import Fitted
 from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter, value_in, with_values
 from hdbridge.twin.replays import Replays

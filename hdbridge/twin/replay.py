@@ -119,13 +119,9 @@ def run(
     truth: Truth,
     seed: int = 0,
     *,
-    fineness: int = 1,
     smooth: bool = False,
 ) -> Traces:
-    """The commands through the machine alone; a ``smooth`` one reports what it does unrounded.
-
-    ``fineness`` is how many counts of the truth's motor encoder make one of the commands'.
-    """
+    """The commands through the machine alone; a ``smooth`` one reports what it does unrounded."""
     machine = Machine(truth, seed, may_compile=True)
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
@@ -135,13 +131,15 @@ def run(
         owed_s += cycle_s
         substeps.append(int(owed_s / dt_s + 1e-6))
         owed_s -= substeps[-1] * dt_s
-    demand = [float(counts * fineness) for counts in (commands.counts[0], *commands.counts)]
+    demand = [float(counts) for counts in (commands.counts[0], *commands.counts)]
     told = Cycles(*(each[commands.lead :] for each in machine.follow_all(demand, substeps)))
-    motor, load = told.motor_counts, told.load_counts
+    motor, load = told.motor_reading, told.load_reading
+    if not smooth:
+        motor, load = np.floor(motor + 0.5), np.floor(load + 0.5)
     torque = sense * told.torque_nm if smooth else told.torque_permille * permille_nm
     warmth, outer = told.temperature_c, told.load_torque_nm
     encoder = axis.motor_encoder
-    motor = encoder.direction * motor * 360.0 / (encoder.counts_per_turn * fineness)
+    motor = encoder.direction * motor * 360.0 / encoder.counts_per_turn
     load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
     place = commands.row_cycles
     return Traces(*(_between(each, place) for each in (motor, load, torque, warmth, outer)))

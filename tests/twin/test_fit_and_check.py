@@ -17,7 +17,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
-from hdbridge.twin.fitting import solve
+from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, noise_floor, prepare, residuals
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values

@@ -15,9 +15,9 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import FOLLOWING_ERROR, LOAD_ERROR, compare
-from hdbridge.twin.fitting import solve
+from hdbridge.twin.least_squares import solve
 from hdbridge.twin.misfit import prepare, residuals, scales
-from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, coordinates, with_values
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
 
@@ -105,3 +105,29 @@ def test_a_channel_that_a_fit_has_made_worse_counts_as_before() -> None:
         most = scales(data, *replays([TRUTH]))
         assert scales(data, *replays([worse]))[LOAD] > 1.3 * most[LOAD]
         assert solve(replays, worse, parameters, prior, 0, most=most).scales[LOAD] == most[LOAD]
+
+
+def test_a_small_change_of_a_parameter_changes_the_residuals_by_as_little() -> None:
+    """No step of an encoder comes between: the slopes of a fit are those of the plant."""
+    data = prepare(recorded(), AXIS, TRUTH)
+    here = residuals(data, TRUTH)
+    inertia = TRUTH.motor.inertia_kg_m2
+    moved = []
+    for share in (1e-5, 2e-5):
+        there = residuals(data, with_values(TRUTH, {"motor inertia": (1.0 + share) * inertia}))
+        moved.append(there[TORQUE] - here[TORQUE])
+    assert np.linalg.norm(moved[0]) > 0.0
+    assert np.linalg.norm(moved[1] - 2.0 * moved[0]) < 0.05 * np.linalg.norm(moved[1])
+
+
+def test_a_torque_does_not_count_while_the_motor_stands() -> None:
+    (piece,) = prepare(recorded(), AXIS, TRUTH).pieces
+    record = recorded().record
+    target, motor = record.motor_target_deg, record.motor_position_deg
+    assert target is not None
+    rest = np.diff(target, prepend=target[0]) == 0.0
+    last = len(record) - 1
+    stands = rest & (np.abs(motor - motor[last]) < 0.05) & (record.time_s > record.time_s[last] - 0.9)
+    assert stands.any()
+    assert not piece.counts[TORQUE][stands].any()
+    assert piece.counts[TORQUE][~rest & (np.arange(len(record)) > 0.5 * last)].all()

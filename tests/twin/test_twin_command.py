@@ -175,7 +175,7 @@ def test_a_twin_that_is_no_better_is_not_kept(
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path, recording: Path) -> None:
-    """The whole way, with the fit itself: a hundred seconds of CPU."""
+    """The whole way, with the fit itself: some 150 seconds of CPU."""
     done = run_here(profile, "twin", profile, recording)
     assert done.returncode == 0, done.stderr
     learned = KeptTwin.load(profile / "pending-twin.yaml").truth

@@ -1,0 +1,274 @@
+"""Least squares over replays: the plant's parameters from a start to a minimum of the misfit.
+
+The residuals of following error, torque and load angle are scaled by what each channel is left with; a weak
+prior about the start holds what the motion does not show. The misfit has long, narrow and curved valleys, for
+filter, dead time and feed-forwards make up for each other: steps of several dampings are tried, each some way
+along a path that turns with the valley. The covariance allows for residuals that go together within a leg (a
+sandwich of the Jacobian and the legs' own gradients), because what a replay cannot follow is no white noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from hdbridge.effects import FloatArray
+from hdbridge.estimation.intervals import NORMAL_95
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import CHANNELS, Data, counted, scales
+from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
+from hdbridge.twin.replays import Replays
+
+STEP = 0.01
+"""Step of the first Jacobian's differences, in a parameter's spread."""
+RESPONSE = 1.0
+"""Norm of the scaled residuals' change that the later differences are made for: a standard deviation, for no
+motion shows less."""
+FARTHEST = 0.1
+"""The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
+DAMPINGS = (0.0, 0.001, 0.1)
+"""Shares of the information's diagonal that are added to it (Marquardt)."""
+ALONG = (1.0, 0.4, 0.15)
+"""How far along each of these steps to go."""
+PROBED = 0.1
+"""How far along each of them its second derivative is taken."""
+SETTLED = 2
+"""So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
+WORTH = 1.0
+"""A drop of half the squares by less is no evidence of anything."""
+RESCALED = 3
+"""After so many steps the scales are made anew: what a start leaves is no measure of the noise."""
+SETTLED = 2
+"""So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
+SOFT = 4.0
+"""Residuals beyond so many scales count less: a replay that slips elsewhere is no measure of a parameter."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The outcome of a fit over some parameters."""
+
+    truth: Truth
+    parameters: tuple[Parameter, ...]
+    place: FloatArray
+    """Coordinates of the parameters, shape (p,)."""
+    covariance: FloatArray
+    """Of the coordinates, shape (p, p)."""
+    scales: dict[str, float]
+    """Scale of each channel's residuals."""
+    residuals: dict[str, FloatArray]
+    vector: FloatArray
+    """The scaled residuals of the fitted rows, softened."""
+    jacobian: FloatArray
+    """Of these, by coordinate."""
+    cost: float
+    """Half the sum of the squares of the scaled residuals, softened."""
+
+    @property
+    def misfit(self) -> float:
+        """Mean size of the scaled residuals over the channels, in their units: comparable between fits."""
+        return float(np.prod([np.mean(np.abs(each)) + 1e-12 for each in self.residuals.values()]))
+
+    @property
+    def inflation(self) -> float:
+        """Mean square of the scaled residuals, 1 at least: what one of them is worth."""
+        return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))
+
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals by the parameters' names."""
+        spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
+        return {
+            each.name: (each.value(float(x - s)), each.value(float(x + s)))
+            for each, x, s in zip(self.parameters, self.place, spread, strict=True)
+        }
+
+
+def solve(
+    replays: Replays,
+    start: Truth,
+    parameters: tuple[Parameter, ...],
+    prior: FloatArray,
+    steps: int,
+    progress: Progress = lambda _: None,
+    known: dict[str, float] | None = None,
+    everything: bool = False,
+    most: dict[str, float] | None = None,
+    near: Fitted | None = None,
+) -> Fitted:
+    """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
+
+    ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
+    what every third step leaves, ``most`` at most: a channel that has become worse does not count for less.
+    Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
+    directions the first differences are made along.
+    """
+    data = replays.data
+    rows = fitted_rows(data, everything=everything)
+    spread = np.array([each.spread for each in parameters])
+    low, high = np.array([each.bounds for each in parameters]).T
+    place = np.clip(coordinates(start, parameters), low, high)
+
+    def led(places: Sequence[FloatArray]) -> list[dict[str, FloatArray]]:
+        return replays([at_coordinates(start, parameters, each.tolist()) for each in places])
+
+    (found,) = led([place])
+    scale = known if known is not None else _capped(scales(data, found), most)
+
+    def vector(found: dict[str, FloatArray]) -> FloatArray:
+        return scaled(found, scale)[rows]
+
+    def cost(place: FloatArray, found: dict[str, FloatArray]) -> float:
+        """Half the squares of the softened residuals and the prior's."""
+        left, off = softened(vector(found)), (place - prior) / spread
+        return 0.5 * float(left @ left + off @ off)
+
+    moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
+    idle = done = 0
+    while True:
+        now = vector(found)
+        ends = _ends(place, moves, low, high)
+        changes = np.stack([vector(each) for each in led(ends)]) - now
+        slopes: FloatArray = (np.linalg.pinv(np.stack(ends) - place) @ changes).T
+        slopes, left = slopes * _softening(now)[:, None], softened(now)
+        if done == steps or idle == SETTLED:
+            break
+        moves = _moves(slopes, spread)
+        damped = _damped_steps(slopes, left, place, prior, spread, (low, high))
+        probes = led([np.clip(place + PROBED * each.step, low, high) for each in damped])
+        tried = []
+        for each, probe in zip(damped, probes, strict=True):
+            bent = (softened(vector(probe)) - left) / PROBED - slopes @ each.step
+            turn = each.turn(slopes.T @ bent / PROBED)
+            tried += [np.clip(place + far * each.step + far**2 * turn, low, high) for far in ALONG]
+        reached = led(tried)
+        before, after = cost(place, found), [cost(*each) for each in zip(tried, reached, strict=True)]
+        best = int(np.argmin(after))
+        if after[best] < before:
+            place, found = tried[best], reached[best]
+        idle = idle + 1 if before - after[best] < WORTH else 0
+        done += 1
+        if known is None and done % RESCALED == 0:
+            scale = _capped(scales(data, found), most)
+        progress(done / steps)
+    truth = at_coordinates(start, parameters, place.tolist())
+    covariance = sandwich(slopes, left, legs_of_rows(data, rows), spread)
+    return Fitted(truth, parameters, place, covariance, scale, found, left, slopes, 0.5 * float(left @ left))
+
+
+def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
+    """For each row of each channel, one channel after the other, whether a fit sees it."""
+    out = 0.0 if everything else data.out
+    return np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
+
+
+def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
+    """The number of the leg of each of the fitted rows."""
+    return np.concatenate([data.leg] * len(CHANNELS))[rows]
+
+
+def scaled(found: dict[str, FloatArray], scale: dict[str, float]) -> FloatArray:
+    """The residuals of all channels, one after the other, in units of their scales."""
+    return np.concatenate([found[name] / scale[name] for name in CHANNELS])
+
+
+def _capped(found: dict[str, float], most: dict[str, float] | None) -> dict[str, float]:
+    return found if most is None else {name: min(scale, most[name]) for name, scale in found.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Damped:
+    """A step by the linear reckoning."""
+
+    step: FloatArray
+    information: FloatArray
+    """With its damping."""
+
+    def turn(self, bent: FloatArray) -> FloatArray:
+        """By how much a path along the step has to turn, at its end, to follow a curved valley.
+
+        ``bent`` is the slopes' product with half the second derivative of the residuals along the step
+        (geodesic acceleration; Transtrum and Sethna, arXiv:1201.5885).
+        """
+        return np.asarray(-np.linalg.solve(self.information, bent), dtype=np.float64)
+
+
+def _damped_steps(
+    slopes: FloatArray,
+    left: FloatArray,
+    place: FloatArray,
+    prior: FloatArray,
+    spread: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+) -> list[_Damped]:
+    """Steps by the linear reckoning, within the bounds, the boldest first (Levenberg, Marquardt).
+
+    All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
+    """
+    information = slopes.T @ slopes + np.diag(spread**-2.0)
+    gradient = slopes.T @ left + (place - prior) / spread**2
+    low, high = bounds
+    found = []
+    for damping in DAMPINGS:
+        damped = information + damping * np.diag(np.diag(information))
+        root = np.linalg.cholesky(damped)
+        # Least squares of which these are the normal equations.
+        target = -np.linalg.solve(root, gradient)
+        room = (np.minimum(low - place, -1e-12), np.maximum(high - place, 1e-12))
+        found.append(_Damped(lsq_linear(root.T, target, room).x, damped))
+    return found
+
+
+def _ends(place: FloatArray, moves: FloatArray, low: FloatArray, high: FloatArray) -> list[FloatArray]:
+    """Where to take differences from a place: each move in the sense in which the bounds leave more room."""
+    ends = []
+    for move in moves:
+        both = [np.clip(place + way * move, low, high) for way in (1.0, -1.0)]
+        ends.append(max(both, key=lambda each: float(np.linalg.norm(each - place))))
+    return ends
+
+
+def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Along the principal directions of the information, each as far as residuals change by `RESPONSE`."""
+    scaled = slopes * spread
+    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
+    moves: FloatArray = (directions * far).T * spread
+    return moves
+
+
+def softened(values: FloatArray) -> FloatArray:
+    """Residuals whose squares grow evenly beyond `SOFT`."""
+    size = np.abs(values) / SOFT
+    bent = np.where(size > 1.0, np.sqrt(np.maximum(2.0 * size - 1.0, 1.0)), size)
+    return np.sign(values) * SOFT * bent
+
+
+def _softening(values: FloatArray) -> FloatArray:
+    """Derivative of `softened`."""
+    size = np.maximum(np.abs(values) / SOFT, 1.0)
+    return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
+
+
+def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
+    """Covariance of the coordinates where residuals of one leg go together and legs are independent."""
+    information = slopes.T @ slopes + np.diag(spread**-2.0)
+    inverse = np.linalg.inv(information)
+    gradients = slopes * left[:, None]
+    order = np.argsort(legs, kind="stable")
+    firsts = np.flatnonzero(np.diff(legs[order], prepend=-1.0))
+    by_leg = np.add.reduceat(gradients[order], firsts, axis=0)
+    count = len(by_leg)
+    few = count / max(count - 1, 1)
+    meat = few * by_leg.T @ by_leg + np.diag(spread**-2.0)
+    covariance = inverse @ meat @ inverse
+    # Never better than what independent residuals of the present size would give.
+    white = inverse * max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
+    larger = np.maximum(np.sqrt(np.diag(white) / np.diag(covariance)), 1.0)
+    given: FloatArray = covariance * np.outer(larger, larger)
+    return given
