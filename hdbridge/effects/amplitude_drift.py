@@ -25,7 +25,7 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.carried import Loop, growth_of, has_loop, has_orders, loop_of, orders_of
 from hdbridge.effects.motor_order import MotorOrders
-from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
 from hdbridge.effects.reference import REACH_K, Told, nearest
 from hdbridge.effects.torque import TorqueGrowth
 from hdbridge.effects.warmth import Warmed, WarmthState
@@ -139,10 +139,10 @@ class AmplitudeDrift(Linear, Warmed):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One per cent per kelvin of ripple and of loop, shape (n, 2)."""
-        ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
+        orders = ripple(motion.motor_deg, phasors(self.orders))
         if self.under_load is not None:
-            ripple = ripple * self.under_load.factor(motion, self.name)
-        parts = np.column_stack([ripple, self.loop.law().predict(motion, start)])
+            orders = orders * self.under_load.factor(motion, self.name)
+        parts = np.column_stack([orders, self.loop.law().predict(motion, start)])
         columns: FloatArray = 0.01 * self.warmth(motion)[:, np.newaxis] * parts
         return columns
 

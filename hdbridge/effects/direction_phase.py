@@ -26,7 +26,7 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.carried import has_orders, orders_of
 from hdbridge.effects.kinematics import direction_of
-from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors, ripple
 
 STEEPEST = 3.0
 """Of k shift = 72 deg: from there to 108 deg an order's mean is less than a third of the tooth error's."""
@@ -96,8 +96,7 @@ class DirectionPhase(Effect):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Per degree of shift, *at the present shift*, shape (n, 1): nearly linear, so fit, and fit again."""
-        turn = np.exp(1j * (RAD_PER_DEG * motion.motor_deg))
-        error: FloatArray = direction_of(motion, start) * horner(self._odd(), turn).real
+        error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
         return error[:, np.newaxis]
 
     def coefficients(self) -> FloatArray:

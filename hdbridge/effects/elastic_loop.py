@@ -30,6 +30,7 @@ from hdbridge.effects.base import (
     Start,
     Tracker,
 )
+from hdbridge.effects.path import once
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
@@ -89,11 +90,11 @@ class ElasticLoop(Effect):
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""
-        return self.offset_arcsec * self._unit(motion.motor_deg, start)
+        return self.offset_arcsec * self._loop(motion.motor_deg, start)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """The loop of unit offset, shape (n, 1)."""
-        return self._unit(motion.motor_deg, start)[:, np.newaxis]
+        return self._loop(motion.motor_deg, start)[:, np.newaxis]
 
     def coefficients(self) -> FloatArray:
         """The offset, arcsec, shape (1,)."""
@@ -135,6 +136,13 @@ class ElasticLoop(Effect):
     @abstractmethod
     def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
         """A tracker with this width, whose branch rises by no more than ``steepest`` per width."""
+
+    def _loop(self, motor_deg: FloatArray, start: Start) -> FloatArray:
+        """`_unit`, worked out once for all that carry this loop."""
+        if not len(motor_deg):
+            return np.empty(0)
+        key = (self.name, self.width_deg, self.exponent, start)
+        return once(motor_deg, start, key, lambda: self._unit(motor_deg, start))
 
     @abstractmethod
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:

@@ -67,8 +67,6 @@ class Hysteresis(ElasticLoop):
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
         """The loop for an offset of one: a loop over the reversals, then all samples at once."""
-        if not len(motor_deg):
-            return np.empty(0)
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []

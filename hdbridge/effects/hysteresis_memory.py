@@ -29,7 +29,7 @@ import numpy as np
 from hdbridge.effects.base import Cause, Effect, FloatArray, Moment, Observations, Part, Start, Tracker
 from hdbridge.effects.elastic_loop import ElasticLoop, rise, rise_at
 from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.path import branches
+from hdbridge.effects.path import path_of
 
 _DEPTH = 200
 """Reversals remembered; beyond it the innermost loop is forgotten early (a fraction of its own height)."""
@@ -81,11 +81,9 @@ class HysteresisMemory(ElasticLoop):
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
         """The loop for an offset of one: a loop over reversals, then all samples at once."""
-        count = len(motor_deg)
-        if not count:
-            return np.empty(0)
         # A saturated start is a direction, but what counts here is where the motion really turns.
-        turning, signs = branches(motor_deg, start)
+        path = path_of(motor_deg, start)
+        turning, signs = path.turning, path.signs
         memory = _Memory(self.width_deg, self.exponent, float(motor_deg[0]), start.value)
         lengths: list[int] = [turning[0] + 1]
         segments: list[_Segment] = [_Segment(0.0, float(start.value), 0, False)]

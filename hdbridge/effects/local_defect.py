@@ -130,7 +130,10 @@ class LocalDefect(Linear):
     def _bump(self, motion: Motion, half_width_deg: float) -> FloatArray:
         turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
         away = np.abs(turns - np.round(turns)) * DEG_PER_TURN
-        return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.minimum(away / half_width_deg, 1.0)))
+        near = np.flatnonzero(away < half_width_deg)
+        bump = np.zeros(len(away))
+        bump[near] = 0.5 + 0.5 * np.cos((np.pi / half_width_deg) * away[near])
+        return bump
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; it has no state."""

@@ -22,13 +22,14 @@ from hdbridge.effects.base import (
     Stretch,
     Tracker,
 )
-from hdbridge.effects.path import away_from_reversals
+from hdbridge.effects.path import away_from_reversals, once
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_MOTOR_ORDER: Final = 24
 """Orders of the motor that are looked for: six times the strongest one of a strain wave gear, order 4 (two
 contacts, two encoders' or bearings' harmonics of each)."""
-_Phasor = TypeVar("_Phasor", complex, "np.ndarray[tuple[int], np.dtype[np.complex128]]")
+_ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
+_Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 
 
 class MotorOrder(BaseModel):
@@ -71,8 +72,7 @@ class OrderSeries(Effect):
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Error in arcsec, shape (n,)."""
-        turn = np.exp(1j * (self._scale() * motion.motor_deg))
-        error: FloatArray = horner(phasors(self.orders), turn).real
+        error: FloatArray = horner(phasors(self.orders), turn_of(self._scale() * motion.motor_deg)).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -176,7 +176,7 @@ def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[
 
 def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
     """Columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
-    result = np.empty((len(angle_rad), 2 * len(numbers)))
+    result = np.empty((2 * len(numbers), len(angle_rad))).T
     for at, number in enumerate(numbers):
         angle = number * angle_rad
         np.cos(angle, out=result[:, 2 * at])
@@ -211,6 +211,23 @@ def phasors(orders: Iterable[MotorOrder]) -> tuple[complex, ...]:
     """Complex amplitudes from the highest order down to order 0, for `horner`."""
     given = {each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders}
     return tuple(given.get(order, 0j) for order in range(max(given, default=0), -1, -1))
+
+
+def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray:
+    """The orders of the motor together, arcsec, shape (n,); ``amplitudes`` as `phasors` has them."""
+
+    def make() -> FloatArray:
+        return np.ascontiguousarray(horner(amplitudes, turn_of(RAD_PER_DEG * motor_deg)).real)
+
+    return once(motor_deg, Start.VIRGIN, amplitudes, make)
+
+
+def turn_of(angle_rad: FloatArray) -> _ComplexArray:
+    """exp(j angle), shape (n,): by a cosine and a sine, several times faster than numpy's complex one."""
+    result = np.empty(len(angle_rad), dtype=np.complex128)
+    np.cos(angle_rad, out=result.real)
+    np.sin(angle_rad, out=result.imag)
+    return result
 
 
 def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:

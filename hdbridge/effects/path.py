@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -14,6 +15,9 @@ from hdbridge.effects.motion import FloatArray, Motion, Start
 LOOP_DEG: Final = 60.0
 """Motor angle after a reversal within which an elastic loop is felt: three times the width of a published
 gear's loop."""
+
+KEPT: Final = 6
+"""Quantities of every sample that are kept beside a path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +32,7 @@ class Path:
     """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
     sense: FloatArray
     """Their direction."""
+    _kept: dict[object, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, motor_deg: FloatArray, start: Start) -> Path:
@@ -37,6 +42,17 @@ class Path:
         away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
         sense = np.repeat(np.array(signs, dtype=np.float64), lengths)
         return cls(tuple(turning), tuple(signs), tuple(angles.tolist()), away, sense)
+
+    def once(self, key: object, make: Callable[[], FloatArray]) -> FloatArray:
+        """The quantity ``key``, made only where it is not kept."""
+        found = self._kept.pop(key, None)
+        if found is None:
+            found = make()
+            found.setflags(write=False)
+            if len(self._kept) >= KEPT:
+                del self._kept[next(iter(self._kept))]
+        self._kept[key] = found
+        return found
 
 
 _PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
@@ -54,6 +70,17 @@ def path_of(motor_deg: FloatArray, start: Start) -> Path:
     path = Path.of(motor_deg, start)
     _PATHS[key] = (weakref.ref(motor_deg, lambda _: _PATHS.pop(key, None)), path)
     return path
+
+
+def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], FloatArray]) -> FloatArray:
+    """What several effects work out from the same angle, by what it depends on besides; not to be written to.
+
+    The elastic loop and the ripple are those of the model, of each effect that scales them, and of each
+    derivative by what these add to them. Kept for an array that cannot be written to.
+    """
+    if motor_deg.flags.writeable or not len(motor_deg):
+        return make()
+    return path_of(motor_deg, start).once(key, make)
 
 
 def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:

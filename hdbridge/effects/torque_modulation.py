@@ -28,7 +28,7 @@ from hdbridge.effects.carried import has_orders, orders_of
 from hdbridge.effects.coordinate import Spacing
 from hdbridge.effects.motor_order import MotorOrders
 from hdbridge.effects.observations import top
-from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, horner, phasors
+from hdbridge.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
 from hdbridge.effects.torque import TorqueGrowth
 
 
@@ -92,8 +92,8 @@ class TorqueModulation(TorqueGrowth, Linear):
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A growth of one per cent per Nm, shape (n, 1)."""
-        ripple = horner(phasors(self.orders), np.exp(1j * (RAD_PER_DEG * motion.motor_deg))).real
-        column: FloatArray = 0.01 * self.load_nm(motion, self.name) * ripple
+        orders = ripple(motion.motor_deg, phasors(self.orders))
+        column: FloatArray = 0.01 * self.load_nm(motion, self.name) * orders
         return column[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:

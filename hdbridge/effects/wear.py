@@ -23,6 +23,7 @@ from hdbridge.effects.base import (
     Start,
     Tracker,
 )
+from hdbridge.effects.path import once
 from hdbridge.effects.play import stop
 from hdbridge.units import DEG_PER_TURN
 
@@ -87,12 +88,17 @@ class Wear(Linear):
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A growth of one arcsec in 1000 turns, shape (n, 1)."""
         angle = motion.motor_deg
-        run = self.turns_before + np.cumsum(np.abs(np.diff(angle, prepend=angle[:1]))) / DEG_PER_TURN
-        run = np.minimum(run, self.turns_limit)
-        share = np.where(run < 1.0, run, np.maximum(run, 1.0) ** self.exponent)
-        half: FloatArray = 0.5 * _kiloturns(1.0, self.exponent) * share
+        # Its derivative by the width asks for the same growth again.
+        key = (self.name, self.turns_before, self.turns_limit, self.exponent)
+        half = once(angle, start, key, lambda: self._growth(angle))
         column: FloatArray = half * stop(angle, self.width_deg, start)
         return column[:, np.newaxis]
+
+    def _growth(self, angle_deg: FloatArray) -> FloatArray:
+        run = self.turns_before + np.cumsum(np.abs(np.diff(angle_deg, prepend=angle_deg[:1]))) / DEG_PER_TURN
+        run = np.minimum(run, self.turns_limit)
+        share = np.where(run < 1.0, run, np.maximum(run, 1.0) ** self.exponent)
+        return np.asarray(0.5 * _kiloturns(1.0, self.exponent) * share)
 
     def after(self, turns: float) -> Self:
         """The same when the motor has run so many turns more."""

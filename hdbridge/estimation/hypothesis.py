@@ -16,7 +16,7 @@ from scipy.signal import savgol_filter
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
-from hdbridge.estimation.linear import seen_directions
+from hdbridge.estimation.linear import seen_directions, side_by_side
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import Observed
 from hdbridge.estimation.scales import Scales
@@ -156,13 +156,12 @@ class Estimator:
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
-        pieces = effect.pieces()
         if (
             not (effect.shape or effect.carries or effect.curved)
             and Channel.LOAD_ANGLE not in effect.channels
         ):
             # The same in every fit.
-            return np.hstack([np.empty((len(self.index), 0)), *(self._kept(each, start) for each in pieces)])
+            return side_by_side([self._kept(each, start) for each in effect.pieces()], len(self.index))
         # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
         # depend on those, and these are fields of them.
         recent = (unit(effect), start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
@@ -305,7 +304,7 @@ class Estimator:
         names = [f"zero{i}" for i in range(self.data.zeros)]
         names += [f"nuisance{i}" for i in range(self.nuisance.shape[1])]
         zeros = self.zero[:, np.newaxis] == np.arange(self.data.zeros)
-        columns = np.hstack([zeros.astype(np.float64), self.nuisance])
+        columns = side_by_side([zeros, self.nuisance], len(zeros))
         return Nuisances(columns, tuple(names), np.zeros(len(names)))
 
     def _sign(self, effect: Effect) -> float:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import BoolArray, FloatArray
 
 NOTHING = 1e-20
 """Information below this is none."""
@@ -54,6 +56,19 @@ def seen_directions(gram: FloatArray) -> FloatArray:
     kept = values > SEEN * max(float(values[-1]), 1e-300)
     factor = vectors[:, kept] / scale[:, np.newaxis] / np.sqrt(values[kept])
     return np.where((np.diag(gram) > 0.0)[:, np.newaxis], factor, 0.0)
+
+
+def side_by_side(parts: Sequence[FloatArray | BoolArray], rows: int) -> FloatArray:
+    """Columns of some parts in one matrix, shape (rows, p), each column in one piece of memory.
+
+    A long column that is spread over all rows takes as long to write, and to read, as the whole matrix.
+    """
+    result = np.empty((sum(each.shape[1] for each in parts), rows)).T
+    at = 0
+    for each in parts:
+        result[:, at : at + each.shape[1]] = each
+        at += each.shape[1]
+    return result
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ import numpy as np
 
 from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
 from hdbridge.effects.base import Shape
-from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.linear import side_by_side, solve_symmetric
 from hdbridge.estimation.shapes import free_shapes, leaves, moved, on_scale, shape_value, tangent, unit
 from hdbridge.estimation.terms import Column, Effort, Prior, Terms
 
@@ -85,7 +85,7 @@ class Solution:
     @cached_property
     def jacobian(self) -> FloatArray:
         """Derivatives by all columns, shape (m, p)."""
-        linear = np.concatenate([self._point.fixed.matrix, self._point.matrix], axis=1)
+        linear = side_by_side([self._point.fixed.matrix, self._point.matrix], len(self.residual))
         linear[:, ~self._point.inside] = 0.0
         if linear.shape[1] == len(self.columns):
             return linear
@@ -188,7 +188,7 @@ class Separable:
             for place, effect in enumerate(effects)
             for each in free_shapes(effect, self.terms.moves)
         ]
-        result = np.empty((len(self.terms.observed), len(where)))
+        result = np.empty((len(where), len(self.terms.observed))).T
         for at, (place, shape) in enumerate(where):
             result[:, at] = tangent(self.terms.columns, effects[place], shape, central)
         return where, result
@@ -198,12 +198,7 @@ class Separable:
         terms = self.terms
         fixed = self._fixed_of(effects)
         moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
-        matrix = np.empty((len(terms.observed), sum(len(effects[place].coefficients()) for place in moving)))
-        at = 0
-        for place in moving:
-            columns = terms.columns(effects[place])
-            matrix[:, at : at + columns.shape[1]] = columns
-            at += columns.shape[1]
+        matrix = side_by_side([terms.columns(effects[place]) for place in moving], len(terms.observed))
         split, size = len(fixed.gram), len(fixed.gram) + matrix.shape[1]
         gram, right = np.empty((size, size)), np.empty(size)
         gram[:split, :split], right[:split] = fixed.gram, fixed.right
@@ -258,7 +253,7 @@ class Separable:
         else:
             places = tuple(units)
         parts = [self.terms.nuisances.columns, *(self.terms.columns(effects[place]) for place in places)]
-        matrix = np.concatenate(parts, axis=1)
+        matrix = side_by_side(parts, len(self.terms.observed))
         weighted = self.terms.weighting.apply(matrix)
         self._fixed = _Fixed(
             places,
