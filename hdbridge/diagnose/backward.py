@@ -30,8 +30,9 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
         for place in range(search.base, len(fitted.hypothesis.effects)):
             search.forget()
             without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
-            other = search.best_addition(without)
-            if other is not None and search.cost(other) < search.cost(fitted):
+            most = search.cost(fitted)
+            other = search.best_addition(without, most)
+            if other is not None and search.cost(other) < most:
                 fitted, changed = other, True
                 break
         if not changed:

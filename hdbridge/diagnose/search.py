@@ -6,15 +6,16 @@ the first picks. What was picked is looked at again in `backward.py`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hdbridge.diagnose import matched_filters
 from hdbridge.diagnose.acceptance import all_pieces_seen, gate
 from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
-from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.estimation.hypothesis import ENOUGH, Estimator, Fitted, Hypothesis
 from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 
 MOST = 6
@@ -145,11 +146,15 @@ class Search:
         """Candidates that were refused with other findings in the fit are looked at again."""
         self._refused.clear()
 
-    def best_addition(self, fitted: Fitted) -> Fitted | None:
-        """With the best cause more, refitted; None where none earns its keep."""
+    def best_addition(self, fitted: Fitted, most: float = math.inf) -> Fitted | None:
+        """With the best cause more, refitted; None where none earns its keep.
+
+        One that costs more than ``most`` is of no use, and need not be the best that there is.
+        """
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
-            trial = self.estimator.fit(joined(fitted.hypothesis, score.candidate.effect, self.base))
+            hypothesis = joined(fitted.hypothesis, score.candidate.effect, self.base)
+            trial = self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
             trial = self._restated(trial, score.candidate.cause)
             added = trial.free() - fitted.free()
             net = (
@@ -297,20 +302,21 @@ class Search:
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
-        return [name for name, trial in self.rivals(without, cause) if self.cost(trial) < most]
+        return [name for name, _ in self._rivals(without, cause, most)]
 
-    def rivals(self, without: Fitted, cause: str) -> list[tuple[str, Fitted]]:
-        """Other causes in the place of one that was taken out, each fitted at its best; best first."""
+    def _rivals(self, without: Fitted, cause: str, most: float) -> list[tuple[str, Fitted]]:
+        """Other causes that cost less than ``most`` in the place of one that was taken out; best first."""
         self.forget()
         best: dict[str, Fitted] = {}
         for score in self._shortlist(without, BEST + 1):
             if score.candidate.cause != cause:
-                trial = self.estimator.fit(joined(without.hypothesis, score.candidate.effect, self.base))
-                other = best.get(score.candidate.cause)
+                hypothesis = joined(without.hypothesis, score.candidate.effect, self.base)
+                trial = self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
                 name = score.candidate.cause
-                refused = self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)
-                if not refused and (other is None or self.cost(trial) < self.cost(other)):
-                    best[score.candidate.cause] = trial
+                if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
+                    continue
+                if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
+                    best[name] = trial
         return sorted(best.items(), key=lambda each: each[1].chi_square)
 
 

@@ -16,7 +16,6 @@ encoder count of chatter is several arcseconds. Drive it from the command.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -70,24 +69,24 @@ class Hysteresis(ElasticLoop):
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []
-        scale = 1.0 if start is Start.VIRGIN else 2.0
-        for (last, angle), sign in zip(pairwise(path.angles_deg), path.signs, strict=True):
+        crossed = np.abs(path.steps_deg) / self.width_deg
+        heights = 2.0 * rise(crossed, self.exponent)
+        if start is Start.VIRGIN:
+            heights[:1] = rise(2.0 * crossed[:1], self.exponent)
+        for height, sign in zip(heights.tolist(), path.signs, strict=True):
             values.append(value)
-            xi = abs(angle - last) / self.width_deg
-            value = sign * min(sign * value + scale * rise_at(2.0 * xi / scale, self.exponent), 1.0)
-            scale = 2.0
+            value = sign * min(sign * value + height, 1.0)
         first = path.turning[0] + 1
         result = np.full(len(motor_deg), float(start.value))
         result[first:] = path.sense
         # Only the samples that are less than the width away from the turn are not saturated.
         way_deg = np.abs(path.away_deg)
         near = np.flatnonzero(way_deg < self.width_deg)
-        branch = np.searchsorted(path.turning[1:], first + near)
-        sense, begun = path.sense[near], np.array(values)[branch]
+        sense, begun = path.sense[near], np.repeat(values, path.lengths)[near]
         xi_of = way_deg[near] / self.width_deg
         height = 2.0 * rise(xi_of, self.exponent)
         if start is Start.VIRGIN:
-            virgin = branch == 0
+            virgin = near < np.sum(path.lengths[:1])
             height[virgin] = rise(2.0 * xi_of[virgin], self.exponent)
         result[first + near] = sense * np.minimum(sense * begun + height, 1.0)
         return result

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from hdbridge.effects.described import Stretch
-from hdbridge.effects.motion import FloatArray, Motion, Start
+from hdbridge.effects.motion import FloatArray, IntArray, Motion, Start
 
 LOOP_DEG: Final = 60.0
 """Motor angle after a reversal within which an elastic loop is felt: three times the width of a published
@@ -26,8 +26,10 @@ class Path:
 
     turning: tuple[int, ...]
     signs: tuple[int, ...]
-    angles_deg: tuple[float, ...]
-    """Motor angle at ``turning``."""
+    lengths: IntArray
+    """Samples of each branch."""
+    steps_deg: FloatArray
+    """Signed angle of each branch."""
     away_deg: FloatArray
     """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
     sense: FloatArray
@@ -41,7 +43,7 @@ class Path:
         angles, lengths = motor_deg[turning], np.diff(turning)
         away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
         sense = np.repeat(np.array(signs, dtype=np.float64), lengths)
-        return cls(tuple(turning), tuple(signs), tuple(angles.tolist()), away, sense)
+        return cls(tuple(turning), tuple(signs), lengths, np.diff(angles), away, sense)
 
     def once(self, key: object, make: Callable[[], FloatArray]) -> FloatArray:
         """The quantity ``key``, made only where it is not kept."""

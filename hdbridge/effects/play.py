@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from hdbridge.effects.base import FloatArray, Start
@@ -20,13 +18,16 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
     path = path_of(motor_deg, start)
     gain = 2.0 / width_deg
     value = float(start.value)
-    begin = [value]
-    for last, angle in pairwise(path.angles_deg):
-        value = min(max(value + gain * (angle - last), -1.0), 1.0)
+    begin = []
+    for step in (gain * path.steps_deg).tolist():
         begin.append(value)
+        value += step
+        value = 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
     result = np.full(len(motor_deg), float(start.value))
-    from_value = np.repeat(begin[:-1], np.diff(path.turning))
-    result[path.turning[0] + 1 :] = np.clip(from_value + gain * path.away_deg, -1.0, 1.0)
+    inside = result[path.turning[0] + 1 :]
+    np.multiply(gain, path.away_deg, out=inside)
+    inside += np.repeat(begin, path.lengths)
+    np.clip(inside, -1.0, 1.0, out=inside)
     return result
 
 

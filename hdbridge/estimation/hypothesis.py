@@ -28,7 +28,8 @@ ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 """A search compares hypotheses whose chi squares are tens and more apart."""
 KEPT_FITS = 8
 KEPT_COLUMNS = 64
-"""What is asked for again and again is kept; so many, for they are large."""
+"""What is asked for again and again is kept; so many, for they are large. Of older fits only where
+they ended is."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
 """Measured channels of which each reading has its own noise that goes into a column as it is."""
 SMOOTH = 15
@@ -72,6 +73,11 @@ class Fitted:
     chi_square: float
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
+
+    @property
+    def origin(self) -> tuple[Effect, ...]:
+        """The effects whose columns it is of."""
+        return self._solution.origin
 
     @cached_property
     def tangent(self) -> FloatArray:
@@ -121,6 +127,16 @@ class Fitted:
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Origin:
+    """Where a fit begins, or what one that has ended is made of again in a single step."""
+
+    hypothesis: Hypothesis
+    prior: Mapping[tuple[int, str], Prior]
+    costs: float
+    """Of the parts that are taken for changed."""
+
+
 class Estimator:
     """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
 
@@ -139,6 +155,7 @@ class Estimator:
         self._memo: dict[object, FloatArray] = {}
         self._recent: OrderedDict[object, FloatArray] = OrderedDict()
         self._fits: OrderedDict[object, Fitted] = OrderedDict()
+        self._origins: dict[object, _Origin] = {}
         self._noise: dict[object, FloatArray] = {}
         # About the level that they have in common: an encoder's zero is no part of the physics.
         self.level = float(np.median(self.observed))
@@ -215,7 +232,12 @@ class Estimator:
         if key in self._fits:
             self._fits.move_to_end(key)
             return self._fits[key]
-        fitted = self._as_calibrated_or_changed(hypothesis, effort, moves)
+        origin = self._origins.get(key)
+        if origin is None:
+            fitted, origin = self._as_calibrated_or_changed(hypothesis, effort, moves)
+            self._origins[key] = origin
+        else:
+            fitted = self._at(origin, moves, Effort(steps=1))
         self._fits[key] = fitted
         if len(self._fits) > KEPT_FITS:
             self._fits.popitem(last=False)
@@ -223,17 +245,17 @@ class Estimator:
 
     def _as_calibrated_or_changed(
         self, hypothesis: Hypothesis, effort: Effort, moves: frozenset[Moves]
-    ) -> Fitted:
+    ) -> tuple[Fitted, _Origin]:
         """Every part as calibrated at first; one after the other those that cost less as changed ones."""
         parts, costs = list(self.calibrated), 0.0
         while True:
             prior, offset = self._prior(hypothesis, parts)
-            fitted = self._solved(hypothesis, effort, moves, prior)
-            fitted = replace(fitted, chi_square=fitted.chi_square + offset + costs)
+            fitted = self._at(_Origin(hypothesis, prior, offset + costs), moves, effort)
             effects = fitted.hypothesis.effects
             most = max(parts, key=lambda each: each.strain(effects) - each.change_cost, default=None)
             if most is None or most.strain(effects) <= most.change_cost:
-                return fitted
+                origin = replace(hypothesis, effects=fitted.origin)
+                return fitted, _Origin(origin, prior, offset + costs)
             parts.remove(most)
             costs += most.change_cost
             hypothesis = fitted.hypothesis
@@ -271,30 +293,26 @@ class Estimator:
             self._noise[key] = np.asarray(WHITE * np.sum(apart**2, axis=0))
         return self._noise[key]
 
-    def _solved(
-        self,
-        hypothesis: Hypothesis,
-        effort: Effort,
-        moves: frozenset[Moves],
-        prior: Mapping[tuple[int, str], Prior],
-    ) -> Fitted:
-        start = hypothesis.start
+    def _at(self, origin: _Origin, moves: frozenset[Moves], effort: Effort) -> Fitted:
+        """Solved from there."""
+        hypothesis, start = origin.hypothesis, origin.hypothesis.start
         terms = Terms(
             self.observed - self.level,
             lambda effect: self.columns(effect, start),
             White(self.weight),
             self.nuisances(),
-            prior,
+            origin.prior,
             self._sign,
             moves,
         )
+        effort = replace(effort, most=effort.most - origin.costs)
         found = Separable(terms).fit(hypothesis.effects, effort)
         return Fitted(
             replace(hypothesis, effects=found.effects),
             found.nuisances[: self.data.zeros],
             found.residual * self.weight,
             found.columns,
-            found.chi_square,
+            found.chi_square + origin.costs,
             found,
             self.weight,
         )

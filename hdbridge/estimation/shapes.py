@@ -30,7 +30,7 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
     """Derivative of what an effect does by one of its shapes, shape (m,); one-sided at a bound."""
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
-    told = columns(effect) @ coefficients
+    told = _told(columns(effect), coefficients)
     size = float(told @ told)
     length = DIFFERENCE
 
@@ -44,14 +44,24 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
         moved_by = np.log(there / here) if shape.logarithmic else there - here
         if not moved_by:
             return np.zeros(len(told)), 0.0
-        return columns(effect.fitted(coefficients, {shape.name: there})) @ coefficients - told, moved_by
+        there_told = _told(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
+        there_told -= told
+        return there_told, moved_by
 
     up, rise = change(1.0)
     while rise and float(up @ up) > LINEAR**2 * size and length > 1e-9:
         length *= 0.1
         up, rise = change(1.0)
-    down, fall = change(-1.0) if central or not rise else (np.zeros(len(told)), 0.0)
+    if rise and not central:
+        up /= rise
+        return up
+    down, fall = change(-1.0)
     return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(told))
+
+
+def _told(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Their product; of one column by a product of numbers, ten times faster than one of matrices."""
+    return columns[:, 0] * coefficients[0] if columns.shape[1] == 1 else columns @ coefficients
 
 
 def moved(
