@@ -131,7 +131,9 @@ def elsewhere(estimator: Estimator, residual: FloatArray) -> BoolArray:
         return np.ones(len(residual), dtype=np.bool_)
     number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
     left = np.bincount(number, residual**2 * estimator.weight**2)
-    return np.asarray(~np.isin(number, np.argsort(left)[-round(estimator.scales.episodes * EPISODES) :]))
+    return np.asarray(
+        ~np.isin(number, np.argsort(left)[-round(float(estimator.scales.episodes) * EPISODES) :])
+    )
 
 
 def acts(estimator: Estimator, fitted: Fitted, place: int) -> BoolArray:
