@@ -18,9 +18,13 @@ from hdbridge.estimation.linear import orthonormal
 from hdbridge.estimation.stretches import of_length, sums
 
 BLOCKS_S = (1.0, 5.0)
+"""Noise that wanders is correlated over less than one or the other."""
 LEAST_BLOCKS = 30
-"""A short record is cut into so many, whatever their length."""
+"""A short record is cut into so many, whatever their length: fewer tell no variance."""
+LEAST_POINTS = 20
+"""Fewer tell nothing."""
 SHARE_LEFT = 1e-5
+"""Share of a column's squares below which what the others leave of it is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +63,7 @@ def robust_chi_square(
     columns = tangent[:, own]
     if rows is not None:
         rest, columns, target, time = rest[rows], columns[rows], target[rows], time[rows]
-        if np.count_nonzero(rows) < 20:
+        if np.count_nonzero(rows) < LEAST_POINTS:
             return 0.0
     held, asked = fitted.prior_rows()
     held = held[:, others]

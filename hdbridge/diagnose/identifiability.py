@@ -15,11 +15,13 @@ from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import orthonormal
 from hdbridge.estimation.screening import candidates
 
+# What a record could show: these numbers decide what is said of that, and no name.
 ENOUGH = 8_000
 """Points that are enough to distinguish shapes."""
 NOT_APART = 0.95
 """Canonical correlation from which on two causes cannot be distinguished."""
 SHARE_LEFT = 1e-4
+"""Share of a column's squares below which nothing is left of it."""
 WORST_ARCSEC = 30.0
 """A cause whose limit is higher than this counts as not detectable."""
 INFLATION = 2.5

@@ -23,11 +23,17 @@ from hdbridge.units import DEG_PER_TURN
 BINS = 1 << 17
 DEFECT_BINS = 3600
 HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
+"""Grids on which places are looked for; a fit moves what was found. None of the numbers here decides a name:
+what is found has to earn its place as any cause does (`Scales`).
+"""
 LEAST_LINES = 256
+"""Periods per turn of the coarsest encoder that is interpolated."""
 LINE_OVER_MEAN = 12.0
 """Power of a line that is worth a fit: it gains twice that in chi square, half of what a cause must earn."""
 LOWEST_HZ = 0.3
+"""Below it a line is a motion's own."""
 PEAKS = 3
+"""So many of the highest lines are fitted."""
 
 
 def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:

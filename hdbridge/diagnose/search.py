@@ -20,7 +20,7 @@ from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 
 MOST = 6
 BEST = 3
-"""So many causes are looked for, and so many of the best candidates are fitted: what a search may take."""
+"""So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
 ANEW = 3
 """So often the law of the loop is chosen anew after a pick."""
 

@@ -8,7 +8,8 @@ from hdbridge.effects import CATALOGUE, Effect, Part, Start
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 
 MOST = 0.5
-"""Share of the squares that the model leaves; a loop that makes up more is most of what is wrong."""
+"""Share of the squares that the model leaves; a loop that makes up more is most of what is wrong. It decides
+a remark, no name."""
 
 
 def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
