@@ -1,6 +1,6 @@
 """What each deciding number of the diagnosis is good for: each at its neutral value, on the same records.
 
-python tools/ablation.py [--seed 1] [--records 40] [--only NAME ...] [--jobs 2] [--json FILE]
+python tools/ablation.py [--seed 1] [--records 40] [--only NAME ...] [--kinds KIND ...] [--jobs 2] [--json F]
 
 The records come from formulas that share no code with the effects (tests/support/plant.py): each cause alone,
 near the noise too, two together, nothing under four elastic laws, and what the catalogue does not have. A
@@ -196,7 +196,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--records", type=int, default=40)
-    parser.add_argument("--only", nargs="*", default=[], help="names of scalars; default all")
+    parser.add_argument("--only", nargs="*", default=[], help="names of numbers; default all")
+    parser.add_argument("--kinds", nargs="*", default=[], help="single, pair, none, ... ; default all")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
@@ -206,7 +207,11 @@ def main(arguments: list[str] | None = None) -> int:
         if each.metadata["neutral"] != getattr(Scales(), each.name)
         and (not options.only or each.name in options.only)
     }
-    given = list(cases(options.seed, options.records))
+    given = [
+        each
+        for each in cases(options.seed, options.records)
+        if not options.kinds or each.kind in options.kinds
+    ]
     found = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for case, walk in zip(given, pool.map(walked, given, [neutral] * len(given)), strict=True):
