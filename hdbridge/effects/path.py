@@ -16,8 +16,8 @@ LOOP_DEG: Final = 60.0
 """Motor angle after a reversal within which an elastic loop is felt: three times the width of a published
 gear's loop."""
 
-KEPT: Final = 6
-"""Quantities of every sample that are kept beside a path."""
+KEPT_BYTES: Final = 24_000_000
+"""Memory for quantities of every sample that are kept beside a path: three of a million samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Path:
         if found is None:
             found = make()
             found.setflags(write=False)
-            if len(self._kept) >= KEPT:
+            while self._kept and (len(self._kept) + 1) * found.nbytes > KEPT_BYTES:
                 del self._kept[next(iter(self._kept))]
         self._kept[key] = found
         return found
