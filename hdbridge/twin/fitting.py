@@ -39,9 +39,9 @@ SURE = 4.0
 """... and its distance from where it was, in standard deviations."""
 FILTER_SHARES = (0.3, 0.6)
 """Shares of the lag that may be the command filter's, to begin with."""
-STEPS = 16
+STEPS = 30
 """Steps at most of a fit; of each of those to short pieces that it begins with `FIRST_STEPS`."""
-FIRST_STEPS = 8
+FIRST_STEPS = 12
 AGAIN = 3
 """So often at most a fit goes on from where its bias has been taken off: where that is nearer to the record
 by smooth replays as well, the fit has ended at a lesser minimum."""

@@ -30,7 +30,7 @@ RESPONSE = 1.0
 motion shows less."""
 FARTHEST = 0.1
 """The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
-DAMPINGS = (0.0, 0.001, 0.1)
+DAMPINGS = (0.0, 0.001, 0.01, 0.1)
 """Shares of the information's diagonal that are added to it (Marquardt)."""
 ALONG = (1.0, 0.4, 0.15)
 """How far along each of these steps to go."""

@@ -20,7 +20,7 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.twin.replay import Commands, commands_of, legs_of, run
-from hdbridge.twin.stretches import stretches
+from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
 from hdbridge.units import ARCSEC_PER_DEG
 
 FINEST_STEPS_PER_TURN = 2**40
@@ -30,6 +30,10 @@ CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
 """Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
 recording."""
+UNKNOWN_S = 1.0
+"""... and time after which a load that was ringing before is at rest, where a recording begins in motion."""
+LARGEST_UNKNOWN = 0.25
+"""Of such a recording, the largest share that is left out for that."""
 RINGING_S = 0.25
 """So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
 STANDS_COUNTS = 1.5
@@ -106,17 +110,28 @@ def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
 
 
 def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
-    """The recording's parts, long ones in stretches; InputError without a command or with another ratio."""
+    """The recording's parts, long ones in stretches; InputError without a command or with another ratio.
+
+    What came before a stretch leads up to it and does not count, as far as it is known.
+    """
     recording.record.check_ratio(axis.gear.ratio)
-    legs, held = legs_of(recording), held_out_legs(recording)
+    record, legs, held = recording.record, legs_of(recording), held_out_legs(recording)
+    begins = [whole.start for whole in continuous(record)]
     pieces = []
-    for part in (each for whole in recording.record.parts() for each in stretches(whole, legs)):
+    first = 0
+    for stretch in (each for part in record.parts() for each in stretches(part, legs)):
+        end = first + len(stretch)
+        led = int(np.searchsorted(record.time_s, record.time_s[first] - RUN_IN_S))
+        led = max(led, *(begin for begin in begins if begin <= first))
+        part = record.rows(led, end)
         commands = commands_of(part, axis, base)
         numbers, kinds = _legs(part, [(each.kind, each.start_s, each.end_s) for each in legs])
         out = np.zeros(len(part))
         for each in held:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
-        pieces.append(_piece(part, commands, numbers, kinds, out, axis.motor_encoder.counts_per_turn))
+        judged = np.arange(led, end) >= first
+        pieces.append(_piece(part, commands, numbers, kinds, out, judged, axis.motor_encoder.counts_per_turn))
+        first = end
     return Data(axis, base, tuple(pieces))
 
 
@@ -269,15 +284,22 @@ def _piece(
     leg: FloatArray,
     kinds: tuple[str, ...],
     out: FloatArray,
+    judged: NDArray[np.bool_],
     counts_per_turn: int,
 ) -> Piece:
     target = part.motor_target_deg
     assert target is not None  # commands_of has refused it
     moved = np.abs(np.diff(target, prepend=target[0]))
-    known = np.cumsum(np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0])))
+    travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
     last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
     stuck = part.time_s - last_moved_s > RINGING_S
-    everywhere = np.ones(len(part))
+    everywhere = np.where(judged, 1.0, 0.0)
+    since_s = part.time_s - part.time_s[0]
+    rests = not np.any(moved[since_s < RINGING_S] > 0.0)
+    rings = since_s < (0.0 if rests else min(UNKNOWN_S, LARGEST_UNKNOWN * since_s[-1]))
+    elastic = rings | (np.cumsum(travelled) <= UNKNOWN_DEG)
+    # Between two parts a drive's loops may have begun anew.
+    loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * 360.0 / counts_per_turn)
     torque = part.columns.get("motor_torque_nm")
     measured = {
@@ -287,10 +309,8 @@ def _piece(
     }
     counts = {
         FOLLOWING: everywhere,
-        TORQUE: np.where(stuck | stands | (known <= UNKNOWN_DEG), 0.0, 1.0)
-        if torque is not None
-        else 0.0 * everywhere,
-        LOAD: np.where(known > UNKNOWN_DEG, 1.0, 0.0),
+        TORQUE: np.where(stuck | stands | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
+        LOAD: np.where(elastic, 0.0, everywhere),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
 

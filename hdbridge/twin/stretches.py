@@ -1,4 +1,4 @@
-"""A long part of a recording in stretches, so that a fit can do with a few of them. Pure."""
+"""What a fit replays in one go: stretches of long parts, with what came before them. Pure."""
 
 from __future__ import annotations
 
@@ -14,6 +14,13 @@ STRETCH_S = 10.0
 """Long against what a replay does not know of the time before it: 60 degrees of the motor, the ringing."""
 LONG_S = 30.0
 """A part no longer than this stays whole."""
+GAP_S = 0.5
+"""A master that goes from task to task records nothing for some cycles; the command may stay the same."""
+SAME_DEG = 1e-6
+"""Of the motor: the same count, told with as many digits."""
+RUN_IN_S = 2.0
+"""What happened so long before a stretch is no longer to be seen in it: the ringing of a load that is hardly
+damped (15 Hz, 0.03) has come down to a three-hundredth."""
 
 
 def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
@@ -31,3 +38,16 @@ def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
             cuts.append(place)
     rows = [*np.searchsorted(part.time_s, cuts).tolist(), len(part)]
     return [part.rows(first, end) for first, end in pairwise(rows)]
+
+
+def continuous(record: Record) -> list[slice]:
+    """The rows of parts that follow each other within `GAP_S` and with the same command, in order."""
+    target, time_s = record.motor_target_deg, record.time_s
+    firsts = [0]
+    for first in record.starts[1:]:
+        gap_s = float(time_s[first] - time_s[first - 1])
+        # Records that were put together afterwards are one row apart.
+        follows = 1.5 * float(np.median(np.diff(time_s))) < gap_s <= GAP_S
+        if not follows or target is None or abs(float(target[first] - target[first - 1])) > SAME_DEG:
+            firsts.append(first)
+    return [slice(first, end) for first, end in pairwise([*firsts, len(record)])]
