@@ -42,8 +42,6 @@ WORTH = 1.0
 """A drop of half the squares by less is no evidence of anything."""
 RESCALED = 3
 """After so many steps the scales are made anew: what a start leaves is no measure of the noise."""
-SETTLED = 2
-"""So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
 SOFT = 4.0
 """Residuals beyond so many scales count less: a replay that slips elsewhere is no measure of a parameter."""
 
