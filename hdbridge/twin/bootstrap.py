@@ -22,8 +22,9 @@ from hdbridge.twin.parameters import LOAD, at_coordinates
 from hdbridge.twin.replays import Replays
 
 DRAWS = (12, 12, 24)
-"""Simulated recordings of each round. The first round's are about the fit, and of the wide covariance that it
-has before; the others about where the round before has led."""
+"""Simulated recordings of each round. The first round's are about the fit, the others about where the round
+before has led. None is further away than by the wide covariance that the fit has before: a linear step from
+there errs by itself, and rounds that are wider and wider would say nothing."""
 JUDGES = 4
 """Simulated recordings by which the fit with and without its bias are held against the measured one."""
 
@@ -57,7 +58,7 @@ def unbiased(replays: Replays, fitted: Fitted) -> Fitted:
         place = np.clip(fitted.place - bias, *low_high)
         few = float(t.ppf(0.975, count - 1)) / NORMAL_95 * np.sqrt(1.0 + 1.0 / count)
         deviation = few * np.std(missed, axis=0, ddof=1)
-        covariance = _scaled_to(inverse, deviation)
+        covariance = _scaled_to(inverse, np.minimum(deviation, np.sqrt(np.diag(fitted.covariance))))
     own = fitted.vector - np.mean(left, axis=0)
     apart = sandwich(slopes, own, legs_of_rows(replays.data, rows), spread)
     truths = [at_coordinates(noisy, parameters, each.tolist()) for each in (fitted.place, place)]
