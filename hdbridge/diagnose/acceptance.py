@@ -112,6 +112,8 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
         robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows))
         if robust < needed:
             return Gate(robust, needed, passed=False, reason=stretch.otherwise)
+    if _changes(estimator, fitted, place):
+        return Gate(robust, needed, passed=False, reason="not the same everywhere")
     return Gate(robust, needed, passed=True)
 
 
@@ -123,3 +125,26 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
         return True
     robust = [robust_chi_square(estimator, fitted, place, only=each) for each in pieces]
     return min(robust) > max(estimator.scales.robust, effect.inexact * max(robust))
+
+
+def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
+    """Whether what has to be the same everywhere is another one along the way; see `Effect.changing`."""
+    changing = fitted.hypothesis.effects[place].changing(estimator.motion)
+    if changing is None:
+        return False
+    own = fitted.places(place)
+    first = float(fitted.hypothesis.effects[place].coefficients()[0])
+    column = fitted.tangent[:, own[:1]]
+    columns = estimator.weighted(changing[estimator.index])
+    others = np.delete(fitted.tangent, own, axis=1)
+    basis = orthonormal(np.hstack([others, column]))
+    left = columns - basis @ (basis.T @ columns)
+    moment = left.T @ fitted.residual
+    change = np.linalg.lstsq(left.T @ left, moment, rcond=1e-10)[0]
+    # The coefficient before the first change, with the changes in place.
+    step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
+    along = first + np.cumsum(step[: 1 + changing.shape[1]])
+    return bool(
+        np.ptp(along) > estimator.scales.bend * np.max(np.abs(along))
+        and float(moment @ change) > estimator.scales.robust
+    )

@@ -246,6 +246,12 @@ class Effect(BaseModel, ABC):
         """Where it must be seen by itself, if that is not everywhere."""
         return None
 
+    def changing(self, motion: Motion) -> FloatArray | None:
+        """What it would add if its first coefficient changed by one along the way, a column per place of
+        change, shape (n, k); None where that is no contradiction to it.
+        """
+        return None
+
     def scales(self) -> tuple[Part, Effect] | None:
         """The part of a model that it scales, where a picture can show it as a growth of that."""
         return None

@@ -67,6 +67,13 @@ class RatioError(Linear):
         """The load's angle over all turns."""
         return over.position(motion, ratio)
 
+    def changing(self, motion: Motion) -> FloatArray:
+        """Bends at a third and at two thirds of the travel: a wrong ratio has the same slope everywhere."""
+        angle = motion.motor_deg
+        low, span = float(np.min(angle)), float(np.ptp(angle))
+        bends = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
+        return np.column_stack(bends) / DEG_PER_TURN
+
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One arcsec per motor turn, shape (n, 1)."""
         angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)

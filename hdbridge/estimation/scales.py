@@ -51,6 +51,9 @@ class Scales:
     )
     wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
 
+    bend: float = _scale(
+        0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
+    )
     alias: float = _scale(
         0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
     )
