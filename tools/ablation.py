@@ -27,7 +27,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
 from support import plant
-from support.trials import CAUSES, LOOPS, drawn
+from support.trials import CAUSES, LOOPS, drawn, times
 from whatif import WhatIf
 
 from hdbridge.diagnose import diagnose
@@ -41,8 +41,6 @@ LAWS = ("plain", "memory", "changed", "bouc_wen", "dahl")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
 SAME = {"motor_encoder_eccentricity": "motor_order"}
 """Causes that no record of one mounting of the encoder distinguishes."""
-FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1"})
-"""Parameters of an effect that are no size of it."""
 Answer = list[str]
 
 
@@ -75,7 +73,7 @@ def cases(seed: int, count: int) -> Iterator[Case]:
             one, needs = drawn(each, rng)
             effects |= one
             axis |= needs
-        return _times(effects, float(rng.uniform(least, most))), axis
+        return times(effects, float(rng.uniform(least, most))), axis
 
     def numbered(number: int, *rest: Any) -> Case:
         return Case(*rest, seed=seed * 1000 + number)
@@ -108,19 +106,6 @@ def cases(seed: int, count: int) -> Iterator[Case]:
         effects = {"unknown": {"kind": what, "size": float(rng.uniform(1.5, 6.0))}}
         yield numbered(number, f"unknown:{what}", (), effects, {})
         number += 1
-
-
-def _times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, dict[str, Any]]:
-    """Effects of another size."""
-
-    def scaled(name: str, value: Any) -> Any:
-        if name == "orders":
-            return [(order, factor * amplitude, phase) for order, amplitude, phase in value]
-        return value if name in FORMS else factor * value
-
-    return {
-        cause: {name: scaled(name, value) for name, value in each.items()} for cause, each in effects.items()
-    }
 
 
 def walked(case: Case, chosen: Mapping[str, float]) -> tuple[Answer, dict[str, Answer], int]:

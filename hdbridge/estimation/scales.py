@@ -38,6 +38,7 @@ class Scales:
     robust_more: float = _scale(
         6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
     )
+
     # Looking again.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
@@ -50,7 +51,6 @@ class Scales:
         "pieces that cancel, an order on an arc",
     )
     wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
-
     bend: float = _scale(
         0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
     )

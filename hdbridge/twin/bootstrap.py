@@ -16,7 +16,15 @@ from scipy.stats import t
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, sandwich, scaled, softened
+from hdbridge.twin.least_squares import (
+    Fitted,
+    fitted_rows,
+    information_of,
+    legs_of_rows,
+    sandwich,
+    scaled,
+    softened,
+)
 from hdbridge.twin.noise import with_load_noise
 from hdbridge.twin.parameters import LOAD, at_coordinates
 from hdbridge.twin.replays import Replays
@@ -41,7 +49,7 @@ def unbiased(replays: Replays, fitted: Fitted) -> Fitted:
     rows = fitted_rows(replays.data)
     spread = np.array([each.spread for each in parameters])
     slopes = fitted.jacobian
-    inverse = np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(spread**-2.0)), dtype=np.float64)
+    inverse = np.asarray(np.linalg.inv(information_of(slopes, spread)), dtype=np.float64)
     noisy = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     place, covariance = fitted.place, fitted.covariance
     for count in DRAWS:

@@ -22,7 +22,7 @@ from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
-from hdbridge.twin.least_squares import Fitted, solve
+from hdbridge.twin.least_squares import Fitted, information_of, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, noise_floor, prepare
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import Parameter, coordinates
@@ -191,7 +191,7 @@ class _Search:
         here = solve(self._replays, truth, every, prior, 0, known=self._scale, everything=True)
         names = [each.cause for each in every]
         gradient = here.jacobian.T @ here.vector
-        information = here.jacobian.T @ here.jacobian + np.diag([each.spread**-2.0 for each in every])
+        information = information_of(here.jacobian, np.array([each.spread for each in every]))
 
         def gain(causes: Sequence[str]) -> float:
             places = [number for number, name in enumerate(names) if name in causes]

@@ -208,7 +208,7 @@ def _damped_steps(
 
     All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
     """
-    information = slopes.T @ slopes + np.diag(spread**-2.0)
+    information = information_of(slopes, spread)
     gradient = slopes.T @ left + (place - prior) / spread**2
     low, high = bounds
     found = []
@@ -253,9 +253,14 @@ def _softening(values: FloatArray) -> FloatArray:
     return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
 
 
+def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """What residuals of unit variance and the prior say of the coordinates, shape (p, p)."""
+    return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
+
+
 def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
     """Covariance of the coordinates where residuals of one leg go together and legs are independent."""
-    information = slopes.T @ slopes + np.diag(spread**-2.0)
+    information = information_of(slopes, spread)
     inverse = np.linalg.inv(information)
     gradients = slopes * left[:, None]
     order = np.argsort(legs, kind="stable")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from support import plant
 SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
 """Some 15,000 samples."""
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
+FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1", "build"})
+"""Parameters of an effect that are no size of it."""
 
 
 def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
@@ -58,6 +61,19 @@ def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, obj
     }
     effect, axis = options[cause]
     return {cause: effect}, axis
+
+
+def times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, dict[str, Any]]:
+    """Effects so many times as large."""
+
+    def scaled(name: str, value: Any) -> Any:
+        if name == "orders":
+            return [(order, factor * amplitude, phase) for order, amplitude, phase in value]
+        return value if name in FORMS else factor * value
+
+    return {
+        cause: {name: scaled(name, value) for name, value in each.items()} for cause, each in effects.items()
+    }
 
 
 CAUSES = [

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from support import plant
-from support.trials import CAUSES, LOOPS, SPECIAL, drawn
+from support.trials import CAUSES, LOOPS, SPECIAL, drawn, times
 
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
@@ -17,8 +16,6 @@ PLAN = plant.Plan(rate_hz=14.0, scale=0.2, load_turns=1.05, steps=14)
 """As in tools/ablation.py: some 13,000 samples."""
 KINDS = ("single", "small", "pair", "triple", "none", "other_law", "unknown", "noisy", "no_command")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
-FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1", "build"})
-"""Parameters of an effect that are no size of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +68,7 @@ def draw(kind: str, seed: int) -> Drawn:
             one, needs = drawn(cause, rng)
             effects |= one
             axis |= needs
-    truth = plant.Truth(effects=_times(effects, float(rng.uniform(least, most))), **axis)
+    truth = plant.Truth(effects=times(effects, float(rng.uniform(least, most))), **axis)
     if kind == "noisy":
         truth = replace(truth, noise=truth.noise * float(np.exp(rng.uniform(np.log(0.5), np.log(10.0)))))
     return Drawn(
@@ -83,16 +80,3 @@ def _loop(cause: str, rng: np.random.Generator) -> dict[str, Any]:
     if cause == "hysteresis_memory":
         return {"law": "memory"}
     return {"offset": 40 * float(rng.choice([0.82, 1.2])), "width": 20 * float(rng.uniform(0.9, 1.2))}
-
-
-def _times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, dict[str, Any]]:
-    """Effects of another size."""
-
-    def scaled(name: str, value: Any) -> Any:
-        if name == "orders":
-            return [(order, factor * amplitude, phase) for order, amplitude, phase in value]
-        return value if name in FORMS else factor * value
-
-    return {
-        cause: {name: scaled(name, value) for name, value in each.items()} for cause, each in effects.items()
-    }
