@@ -75,6 +75,12 @@ def test_every_command_stands_under_a_heading_and_every_option_says_what_it_does
         assert [each.names[0] for each in command.parameters if each.is_option and not each.help] == []
 
 
+def test_the_readme_names_every_command():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = set(re.findall(r"^\| `hdbridge ([\w-]+)", text, re.MULTILINE))
+    assert table == {each.name.split()[0] for each in command_reference.commands()}
+
+
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
     linked = set(re.findall(r"\]\(([\w-]+\.md)\)", index))
