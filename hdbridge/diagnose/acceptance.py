@@ -34,8 +34,8 @@ class Gate:
     robust: float
     """Smallest block-robust chi square over the block lengths."""
     needed: float
-    passed: bool
     reason: str = ""
+    """Why it is not named, in words; empty where it passed."""
 
 
 def robust_chi_square(
@@ -97,24 +97,23 @@ def robust_chi_square(
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
-    robust = robust_chi_square(estimator, fitted, place)
     needed = estimator.scales.robust + estimator.scales.robust_more * (len(effect.coefficients()) - 1)
+    robust = robust_chi_square(estimator, fitted, place)
     if robust < needed:
-        return Gate(robust, needed, passed=False, reason="not seen in enough independent stretches")
+        return Gate(robust, needed, "not seen in enough independent stretches")
     if effect.tracker().memory_deg > 0.0:
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start))
         robust = min(robust, robust_chi_square(estimator, fitted, place, free))
         if robust < needed:
-            return Gate(robust, needed, passed=False, reason="an elastic loop of another shape does as well")
+            return Gate(robust, needed, "an elastic loop of another shape does as well")
     stretch = effect.shows(estimator.motion)
     if stretch is not None:
         rows = stretch.rows[estimator.index]
         robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows))
         if robust < needed:
-            return Gate(robust, needed, passed=False, reason=stretch.otherwise)
-    if _changes(estimator, fitted, place):
-        return Gate(robust, needed, passed=False, reason="not the same everywhere")
-    return Gate(robust, needed, passed=True)
+            return Gate(robust, needed, stretch.otherwise)
+    changes = _changes(estimator, fitted, place)
+    return Gate(robust, needed, "not the same everywhere" if changes else "")
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:

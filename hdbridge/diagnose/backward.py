@@ -7,10 +7,11 @@ among the others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from hdbridge.diagnose.search import Search, Trail
-from hdbridge.estimation.hypothesis import Fitted
+from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 
 def reconsidered(search: Search, trail: Trail) -> Trail:
@@ -60,26 +61,42 @@ def _loops_anew(search: Search, fitted: Fitted) -> Fitted:
 
 def _pruned(search: Search, fitted: Fitted) -> Fitted:
     """Without what no longer earns its keep among the others."""
-    while len(fitted.hypothesis.effects) > search.base:
-        gains = {}
-        for place in range(search.base, len(fitted.hypothesis.effects)):
-            without = search.estimator.fit(fitted.hypothesis.without(place))
-            gains[place] = (without.chi_square - fitted.chi_square, without)
-        largest = max(gain for gain, _ in gains.values())
-        place = min(gains, key=lambda each: gains[each][0] - _toll(search, fitted, each))
-        gain, without = gains[place]
+
+    def least(fitted: Fitted) -> tuple[int, str] | None:
+        effects = fitted.hypothesis.effects
+        gains = {
+            place: search.estimator.fit(fitted.hypothesis.without(place)).chi_square - fitted.chi_square
+            for place in range(search.base, len(effects))
+        }
+        toll = {
+            each: search.scales.penalty * len(fitted.places(each)) + search.scales.enter for each in gains
+        }
+        place = min(gains, key=lambda each: gains[each] - toll[each], default=-1)
+        if place < 0:
+            return None
         small = search.peak(fitted, place) < search.scales.floor_arcsec
         # What the law of a large one gets wrong looks like a small one of its kind.
-        effect = fitted.hypothesis.effects[place]
-        alike = [
-            each for each in gains if each != place and fitted.hypothesis.effects[each].name == effect.name
-        ]
-        share = effect.inexact * max((gains[each][0] for each in alike), default=0.0)
-        if gain > max(_toll(search, fitted, place), search.scales.leftover * largest, share) and not small:
-            break
-        fitted = without
+        alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
+        share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
+        needed = max(toll[place], search.scales.leftover * max(gains.values()), share)
+        return None if gains[place] > needed and not small else (place, "")
+
+    return eliminated(search.estimator, fitted, search.base, least, [])
+
+
+def eliminated(
+    estimator: Estimator,
+    fitted: Fitted,
+    base: int,
+    worst: Callable[[Fitted], tuple[int, str] | None],
+    told: list[str],
+) -> Fitted:
+    """Without what is ``worst`` (its place, and why it goes), one after the other; the others fitted again.
+
+    What went is appended to ``told`` in words. The effects of the baseline, the first ``base``, stay.
+    """
+    while len(fitted.hypothesis.effects) > base and (found := worst(fitted)) is not None:
+        place, why = found
+        told.append(f"{fitted.hypothesis.effects[place].name}: {why}")
+        fitted = estimator.fit(fitted.hypothesis.without(place))
     return fitted
-
-
-def _toll(search: Search, fitted: Fitted, place: int) -> float:
-    return search.scales.penalty * len(fitted.places(place)) + search.scales.enter

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hdbridge.diagnose import changes
-from hdbridge.diagnose.acceptance import Gate, gate
-from hdbridge.diagnose.backward import reconsidered
+from hdbridge.diagnose.acceptance import gate
+from hdbridge.diagnose.backward import eliminated, reconsidered
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.holdout import held_out
@@ -23,22 +23,21 @@ from hdbridge.diagnose.lookalikes import (
 )
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.probability import Context, Signs, weighed
+from hdbridge.diagnose.probability import Context, weighed
 from hdbridge.diagnose.result import UNWEIGHED, Diagnosis, Figures, Finding, Traces
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.diagnose.systematic import confounded
 from hdbridge.diagnose.unexplained import (
+    LESS,
     Rest,
-    acts,
-    beyond_noise,
-    elsewhere,
+    does_more,
     is_unexplained,
     many_of_one,
     rest,
     without_doubtful_loops,
 )
 from hdbridge.diagnose.unfitted import unfitted
-from hdbridge.effects import Channel, FloatArray, Part, Start, unmet
+from hdbridge.effects import Channel, Effect, FloatArray, Part, Start, unmet
 from hdbridge.effects.base import missing_error
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.torque import beyond_limit
@@ -104,7 +103,7 @@ def diagnose(
     progress("searching for causes")
     trail = reconsidered(search, search.run())
     progress("judging what was found")
-    found = _Judge(estimator, search, trail, model, record, bool(first)).diagnosis()
+    found = _Judge(estimator, search, trail, model, bool(first)).diagnosis()
     return replace(found, remarks=(*remarks, *found.remarks))
 
 
@@ -125,8 +124,6 @@ class _Judged:
     """Without a loop of free form."""
     findings: list[Finding]
     left: Rest
-    spread: FloatArray
-    considered: list[str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,202 +132,181 @@ class _Judge:
     search: Search
     trail: Trail
     model: TransmissionModel
-    record: Record
     unfitted: bool
     """Whether the model lacks most of what the axis has."""
+    considered: list[str] = field(default_factory=list)
+    """What is not named, with the reason."""
 
     def diagnosis(self) -> Diagnosis:
-        estimator, trail, base = self.estimator, self.trail, self.trail.base
-        fitted, considered = self._named_only(trail.fitted)
-        fitted, more = self._without_doubtful(fitted)
-        considered += more
+        estimator, given = self.estimator, self.model.effects
+        base = len(given)
+        fitted = eliminated(estimator, self.trail.fitted, base, self._stopped, self.considered)
+        fitted = eliminated(estimator, fitted, base, self._shadow, self.considered)
         fitted = plausible_only(self.search, fitted)
-        fitted = with_measured(estimator, fitted, trail.base)
-        fitted = as_calibrated(estimator, fitted, self.model.effects)
+        fitted = with_measured(estimator, fitted, base)
+        fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
-        fitted, left, spread = judged.fitted, judged.left, judged.spread
-        usual = {each.cause for each in judged.findings if _ordinary(each)}
-        findings = [each for each in judged.findings if each.cause not in usual]
-        considered += [*judged.considered, *(f"{cause}: no more than usual" for cause in sorted(usual))]
-        known = {each.cause for each in findings} | {each.split(":")[0] for each in considered}
+        fitted, findings = judged.fitted, judged.findings
+        known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
         refused = self.search.told_refusals(fitted)
-        considered += [each for each in refused if each.split(":")[0] not in known]
-        findings = self._with_unexplained(findings, left)
-        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-        given, refitted = (
-            self._as_given(),
-            estimator.fit(Hypothesis(self.model.effects, fitted.hypothesis.start)),
-        )
-        honest = as_named(estimator, fitted, self.model.effects, {each.cause for each in findings})
-        if honest is not fitted:
-            fitted, spread = honest, covariance(estimator, honest)
+        self.considered.extend(each for each in refused if each.split(":")[0] not in known)
+        findings = self._with_unexplained(findings, judged.left)
+        refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
+        fitted = as_named(estimator, fitted, given, {each.cause for each in findings})
+        spread = covariance(estimator, fitted)
         alone = {each.cause for each in findings if each.left_alone}
-        sound = supported(estimator, fitted, self.model.effects, alone)
+        sound = supported(estimator, fitted, given, alone)
         fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
         named = {each.cause for each in findings if not each.within}
         chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
+        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         extended = extended_model(self.model, fitted, chosen, spread, reason, base)
-        after = self._about_zeros(estimator.told(extended.effects, fitted.hypothesis.start))
-        fitted = replace(fitted, residual=after * estimator.weight)
-        points = estimator.data.points
+        # Of the model as it was given with the start that suits it best.
+        each_start = (self._left_by(given, start) for start in Start)
+        before = min(each_start, key=lambda error: float(error @ error))
+        after = self._left_by(extended.effects, fitted.hypothesis.start)
+        measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         return Diagnosis(
-            baseline=_figures(given),
+            baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
-            noise_floor_arcsec=float(np.sqrt(np.mean(points.sigma_arcsec[estimator.index] ** 2))),
+            noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
             findings=tuple(findings),
-            identifiability=identifiability(estimator, fitted, self.model.effects),
-            by_kind=self._by_kind(given, after),
+            identifiability=identifiability(estimator, fitted, given),
+            by_kind=self._by_kind(before, after),
             remarks=estimator.data.remarks,
             model=extended,
-            traces=self._traces(fitted, given),
-            considered=tuple(dict.fromkeys(considered)),
+            traces=Traces(
+                measured_arcsec=measured,
+                model_arcsec=measured - before,
+                extended_arcsec=measured - after,
+                motion=estimator.motion,
+                rows=estimator.index,
+                samples=estimator.data.full.motion,
+                runs=estimator.data.runs,
+                start=fitted.hypothesis.start,
+            ),
+            considered=tuple(dict.fromkeys(self.considered)),
             scales=estimator.scales,
         )
 
-    def _likely_only(self, fitted: Fitted) -> _Judged:
-        """The findings, without those that are not likely enough to be named; they leave the fit too."""
-        considered: list[str] = []
-        nuisance = self.estimator.nuisance
-        while True:
-            judged = self._judged(fitted)
-            doubted = [
-                each for each in judged.findings if each.probability < self.estimator.scales.named_from
-            ]
-            considered += [f"{each.cause}: more likely something else" for each in doubted]
-            effects = {id(each.effect) for each in doubted}
-            kept = fitted.hypothesis
-            for place in range(len(kept.effects) - 1, self.trail.base - 1, -1):
-                if id(kept.effects[place]) in effects:
-                    kept = kept.without(place)
-            if kept == fitted.hypothesis:  # what is left of them are changes of the baseline, which it keeps
-                likely = [each for each in judged.findings if each not in doubted]
-                return replace(judged, findings=likely, considered=[*considered, *judged.considered])
-            self.estimator.nuisance = nuisance
-            fitted = self.estimator.fit(kept)
+    def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
+        """Of what a gate stops the weakest."""
+        effects = range(len(self.model.effects), len(fitted.hypothesis.effects))
+        gates = {place: gate(self.estimator, fitted, place) for place in effects}
+        stopped = [place for place, each in gates.items() if each.reason]
+        place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed, default=-1)
+        return None if place < 0 else (place, gates[place].reason)
 
-    def _judged(self, fitted: Fitted) -> _Judged:
-        """What a hypothesis finds, and how sure that is."""
-        estimator, base = self.estimator, self.trail.base
+    def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
+        """Of names that do less than what is left unexplained in addition, and may be a shadow of that, the
+        one that does least.
+        """
+        estimator, base = self.estimator, len(self.model.effects)
+        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # what is fast casts no shadow
+        if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
+            return None
+        share = {
+            place: does_more(estimator, fitted, place)
+            for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
+            # What is left has no such line, and casts no shadow there; or any axis has it.
+            if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
+        }
+        place = min(share, key=lambda each: share[each], default=-1)
+        if place < 0 or share[place] > estimator.scales.shadow:
+            return None
+        return place, LESS
+
+    def _likely_only(self, fitted: Fitted) -> _Judged:
+        """The findings, without those that are not likely enough to be named, which leave the fit too, and
+        without those that any axis has.
+        """
+        nuisance, base = self.estimator.nuisance, len(self.model.effects)
+        while True:
+            judged, words = self._judged(fitted)
+            likely = [
+                each for each in judged.findings if each.probability >= self.estimator.scales.named_from
+            ]
+            doubted = [each for each in judged.findings if each not in likely]
+            self.considered.extend(f"{each.cause}: more likely something else" for each in doubted)
+            effects = {id(each.effect) for each in doubted}
+            kept = [
+                each
+                for i, each in enumerate(fitted.hypothesis.effects)
+                if i < base or id(each) not in effects
+            ]
+            if len(kept) == len(fitted.hypothesis.effects):
+                break  # what is left of them are changes of the baseline, which it keeps
+            self.estimator.nuisance = nuisance
+            fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
+        usual = {each.cause for each in likely if _ordinary(each)}
+        self.considered.extend([*words, *(f"{cause}: no more than usual" for cause in sorted(usual))])
+        return replace(judged, findings=[each for each in likely if each.cause not in usual])
+
+    def _judged(self, fitted: Fitted) -> tuple[_Judged, list[str]]:
+        """What a hypothesis finds, how sure that is, and in words what of it is not named."""
+        estimator, base = self.estimator, len(self.model.effects)
         precise = precisely(estimator, fitted)
         spread = covariance(estimator, precise)
         findings = [
             replace(self._finding(fitted, place), parameters=parameters_of(estimator, precise, place, spread))
             for place in range(base, len(fitted.hypothesis.effects))
         ]
-        findings += changes.findings(
-            self.search, self.model, replace(self.trail, fitted=fitted), precise, spread
-        )
+        trail = replace(self.trail, fitted=fitted)
+        findings += changes.findings(self.search, self.model, trail, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         if estimator.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
             estimator.nuisance = estimator.nuisance[:, :0]
             fitted = estimator.fit(fitted.hypothesis)
         left = rest(estimator, fitted)
-        unknown = is_unexplained(estimator, left) or many_of_one(findings, self.estimator.scales) is not None
-        considered: list[str] = []
+        unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
+        words: list[str] = []
         if unknown:
-            findings, considered = without_doubtful_loops(findings, left, estimator.scales)
+            findings, words = without_doubtful_loops(findings, left, estimator.scales)
         findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
         if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
-            findings = [
-                replace(each, probability=min(each.probability, estimator.scales.one_way))
-                for each in findings
-            ]
-        return _Judged(fitted, findings, left, covariance(estimator, fitted), considered)
-
-    def _named_only(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
-        """Take out what a gate stops, weakest first, and fit again."""
-        considered: list[str] = []
-        while len(fitted.hypothesis.effects) > self.trail.base:
-            gates: dict[int, Gate] = {
-                place: gate(self.estimator, fitted, place)
-                for place in range(self.trail.base, len(fitted.hypothesis.effects))
-            }
-            stopped = [place for place in gates if not gates[place].passed]
-            if not stopped:
-                break
-            place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed)
-            considered.append(f"{fitted.hypothesis.effects[place].name}: {gates[place].reason}")
-            fitted = self.estimator.fit(fitted.hypothesis.without(place))
-        return fitted, considered
-
-    def _without_doubtful(self, fitted: Fitted) -> tuple[Fitted, list[str]]:
-        """Take out names that do less than what is left unexplained in addition: it may well be its
-        shadow.
-        """
-        considered: list[str] = []
-        while len(fitted.hypothesis.effects) > self.trail.base:
-            left = rest(self.estimator, fitted)
-            if not is_unexplained(
-                self.estimator, replace(left, fast_arcsec=0.0)
-            ):  # what is fast casts no shadow
-                break
-            residual = fitted.residual / self.estimator.weight
-            apart = elsewhere(self.estimator, residual)
-            share = {}
-            for place, effect in enumerate(fitted.hypothesis.effects[self.trail.base :], self.trail.base):
-                if (effect.sought is not None and effect.sought.is_line) or effect.ordinary_arcsec:
-                    continue  # what is left has no such line, and casts no shadow there; or any axis has it
-                rows = acts(self.estimator, fitted, place)
-                if np.any(rows & apart):
-                    rows &= apart
-                without = self.estimator.fit(fitted.hypothesis.without(place))
-                lost = without.residual[rows] / self.estimator.weight[rows]
-                does = float(np.mean(lost**2) - np.mean(residual[rows] ** 2))
-                left_arcsec = beyond_noise(self.estimator, residual, rows)
-                share[place] = (does / max(left_arcsec**2, 1e-12), without)
-            place = min(share, key=lambda each: share[each][0], default=-1)
-            if place < 0 or share[place][0] > self.estimator.scales.shadow:
-                break
-            considered.append(
-                f"{fitted.hypothesis.effects[place].name}: does less than what is left unexplained"
-            )
-            fitted = share[place][1]
-        return fitted, considered
+            most = estimator.scales.one_way
+            findings = [replace(each, probability=min(each.probability, most)) for each in findings]
+        return _Judged(fitted, findings, left), words
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
         effect = fitted.hypothesis.effects[place]
         without = self.estimator.fit(fitted.hypothesis.without(place))
-        judged = gate(self.estimator, fitted, place)
-        gain = held_out(self.estimator, fitted, without)
         aliases = self._aliases(fitted, without, place)
-        own = without.chi_square - fitted.chi_square
         return Finding(
             cause=effect.name,
             probability=UNWEIGHED,
             aliases=aliases,
             parameters={},
-            gain=gain,
+            gain=held_out(self.estimator, fitted, without),
             experiment=next_experiment(effect.name, aliases),
             peak_arcsec=self.search.peak(fitted, place),
-            robust=own,
+            robust=without.chi_square - fitted.chi_square,
             effect=effect,
-            signs=Signs(judged.robust, judged.needed),
+            gate=gate(self.estimator, fitted, place),
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
         """Other causes that do nearly as well in its place."""
-        effect = fitted.hypothesis.effects[place]
-        aliases = self.search.as_well(fitted, without, effect.name)
-        alike = waves_alike(self.estimator, [effect], fitted.hypothesis.start)
-        aliases += [each for each in alike if each not in aliases]
-        available = self.estimator.motion.available()
-        for kind, _ in lookalikes(effect, self.estimator.data.ratio):
-            if kind.channels - available and kind.name not in aliases:
-                aliases.append(kind.name)
-        beside = confounded(self.estimator, fitted, place)
-        aliases += [each.name for each in beside if each.name not in aliases]
-        return tuple(aliases)
+        effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
+        alike = lookalikes(effect, self.estimator.data.ratio)
+        names = [
+            *self.search.as_well(fitted, without, effect.name),
+            *waves_alike(self.estimator, [effect], fitted.hypothesis.start),
+            *(kind.name for kind, _ in alike if kind.channels - available),
+            *(each.name for each in confounded(self.estimator, fitted, place)),
+        ]
+        return tuple(dict.fromkeys(names))
 
     def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
         scales = self.estimator.scales
         many = many_of_one(findings, scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
-        size = left.arcsec if many is None else max(each.peak_arcsec for each in many)
-        lives = left.lives_in
+        size, lives = left.arcsec, left.lives_in
         if many is not None:
+            size = max(each.peak_arcsec for each in many)
             effect = many[0].effect
             if effect is not None and effect.waves():
                 lives = effect.coordinate(self.estimator.motion, self.estimator.data.ratio).name
@@ -350,24 +326,17 @@ class _Judge:
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and "last reversal" in lives and left.foretold(scales):
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
-            told = replace(
-                loops[0],
-                note=f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left",
-                lives_in=lives,
-            )
+            note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
+            told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > scales.leads * size else [unknown, *findings]
 
-    def _as_given(self) -> FloatArray:
-        """Residual of the model as it is, but for the zeros; with the start that suits it best."""
-        tried = (self._about_zeros(self.estimator.told(self.model.effects, start)) for start in Start)
-        return min(tried, key=lambda error: float(error @ error))
-
-    def _about_zeros(self, told_arcsec: FloatArray) -> FloatArray:
+    def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
         estimator = self.estimator
-        return about_zeros(estimator.observed - told_arcsec, estimator.zero, estimator.weight**2)
+        left = estimator.observed - estimator.told(effects, start)
+        return about_zeros(left, estimator.zero, estimator.weight**2)
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator
@@ -380,27 +349,6 @@ class _Judge:
             for name, rows in masks.items()
             if np.count_nonzero(rows) > 10
         }
-
-    def _traces(self, fitted: Fitted, given: FloatArray) -> Traces:
-        estimator = self.estimator
-        points = estimator.data.points
-        speed = points.motion.motor_speed_deg_s
-        assert speed is not None
-        measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
-        return Traces(
-            time_s=estimator.time_s,
-            motor_deg=estimator.motion.motor_deg[estimator.index],
-            measured_arcsec=measured,
-            model_arcsec=measured - given,
-            extended_arcsec=measured - fitted.residual / estimator.weight,
-            direction=direction_of(estimator.motion)[estimator.index],
-            speed_deg_s=speed[estimator.index],
-            motion=estimator.motion,
-            rows=estimator.index,
-            samples=estimator.data.full.motion,
-            runs=estimator.data.runs,
-            start=fitted.hypothesis.start,
-        )
 
 
 def _ordinary(finding: Finding) -> bool:

@@ -18,31 +18,12 @@ from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.stretches import of_length, sums
+from hdbridge.units import unit_of
 
 PARTS: Final = (6, 12)
 """Numbers of equal parts of a record that count as one observation each."""
 STEP_95: Final = 11.03
 """95 % point of where a Brownian motion with the drift -|t| / 2 to either side is largest."""
-_UNITS: Final = {
-    "arcsec_per_kiloturn": "arcsec/kiloturn",
-    "arcsec_s_per_deg": "arcsec s/deg",
-    "arcsec_per_turn": "arcsec/turn",
-    "arcsec_per_nm": "arcsec/Nm",
-    "arcsec_per_k": "arcsec/K",
-    "percent_per_nm": "%/Nm",
-    "percent_per_k": "%/K",
-    "stiffness_s2": "s^2",
-    "percent": "%",
-    "arcsec": "arcsec",
-    "deg_s2": "deg/s^2",
-    "deg_s": "deg/s",
-    "deg": "deg",
-    "ms2": "ms^2",
-    "ms": "ms",
-    "hz": "Hz",
-    "nm": "Nm",
-    "s": "s",
-}
 
 
 def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
@@ -182,10 +163,3 @@ def polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parame
         ),
         f"{prefix}phase_deg": Parameter(phase, "deg", phase - turn, phase + turn),
     }
-
-
-def unit_of(name: str) -> str:
-    """The unit that a parameter's name ends with; 1 where it has none."""
-    return next(
-        (unit for ending, unit in _UNITS.items() if name == ending or name.endswith("_" + ending)), "1"
-    )

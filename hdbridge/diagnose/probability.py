@@ -10,21 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from hdbridge.diagnose.acceptance import Gate
+from hdbridge.diagnose.result import Finding
 from hdbridge.estimation.scales import Scales
-
-if TYPE_CHECKING:
-    from hdbridge.diagnose.result import Finding
-
-
-@dataclass(frozen=True, slots=True)
-class Signs:
-    """What speaks for one finding."""
-
-    robust: float
-    """Block-robust chi square."""
-    needed: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,15 +39,12 @@ def coefficients(scales: Scales) -> dict[str, float]:
     }
 
 
-def features(
-    finding: Finding, all_of_them: Sequence[Finding], context: Context, scales: Scales
-) -> dict[str, float]:
-    """The terms of the formula, by their names."""
-    signs = finding.signs or Signs(finding.robust, scales.robust)
-    largest = max(each.robust for each in all_of_them)
+def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
+    """The terms of the formula, by their names; ``largest`` is the chi square of the largest finding."""
+    gate = finding.gate or Gate(finding.robust, scales.robust)
     return {
         "constant": 1.0,
-        "strength": math.log(min(max(signs.robust, 1e-9) / signs.needed, scales.strong)),
+        "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
         "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
         "size": math.log(max(finding.peak_arcsec, 1e-3) / max(scales.floor_arcsec, context.left_arcsec)),
         "excess": math.log(min(max(context.excess, 1.0), scales.large)),
@@ -68,7 +54,8 @@ def features(
 
 def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> list[Finding]:
     """The findings with the probability that each (or one of its aliases) is there."""
-    terms = [features(each, findings, context, scales) for each in findings]
+    largest = max((each.robust for each in findings), default=0.0)
+    terms = [features(each, largest, context, scales) for each in findings]
     return [
         replace(each, probability=probability(own, scales), terms=own)
         for each, own in zip(findings, terms, strict=True)

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hdbridge.diagnose.probability import Signs
+from hdbridge.diagnose.acceptance import Gate
 from hdbridge.diagnose.residual_views import shares_by_coordinate
 from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
+from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.observed import means
 from hdbridge.estimation.scales import Scales
@@ -78,8 +79,8 @@ class Finding:
     note: str = ""
     effect: Effect | None = field(default=None, repr=False)
     """As it goes into the model."""
-    signs: Signs | None = field(default=None, repr=False)
-    """What speaks for it."""
+    gate: Gate | None = field(default=None, repr=False)
+    """What speaks for it; of a change within the model none."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
     """The terms of the formula of its probability."""
 
@@ -108,7 +109,7 @@ class Finding:
     @property
     def within(self) -> bool:
         """Whether it is a change of a part that the model has already."""
-        return self.signs is None and self.cause != "unexplained"
+        return self.gate is None and self.cause != "unexplained"
 
     def refusal(self) -> str:
         """Why it is not offered as an improvement of the model, in words; empty where nothing is against."""
@@ -158,15 +159,11 @@ class Identifiability:
 class Traces:
     """Arrays for pictures, one length: model next to measurement on the same trajectory."""
 
-    time_s: FloatArray
-    motor_deg: FloatArray
     measured_arcsec: FloatArray
     """About the zero of the fit."""
     model_arcsec: FloatArray
     """The model as it was given."""
     extended_arcsec: FloatArray
-    direction: FloatArray
-    speed_deg_s: FloatArray
     motion: Motion
     """What drove the whole record; an elastic state passes through all of it."""
     rows: IntArray
@@ -177,6 +174,17 @@ class Traces:
     """The same at every sample."""
     runs: IntArray
     """First sample of each point of ``motion``."""
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Of the record's clock."""
+        assert self.motion.time_s is not None
+        return self.motion.time_s[self.rows]
+
+    @property
+    def direction(self) -> FloatArray:
+        """Of the motor, -1 or 1, held at rest."""
+        return direction_of(self.motion)[self.rows]
 
     def told(self, effect: Effect) -> FloatArray:
         """What an effect does at these points, arcsec, shape (m,)."""

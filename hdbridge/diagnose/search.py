@@ -153,23 +153,17 @@ class Search:
         """
         best: tuple[float, Fitted] | None = None
         for score in self._shortlist(fitted):
-            hypothesis = joined(fitted.hypothesis, score.candidate.effect, self.base)
-            trial = self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
-            trial = self._restated(trial, score.candidate.cause)
-            added = trial.free() - fitted.free()
-            net = (
-                fitted.chi_square - trial.chi_square - self.scales.penalty * max(added, 1) - self.scales.enter
-            )
-            key = _key(score)
             cause = score.candidate.cause
+            trial = self._restated(self._with(fitted, score, most), cause)
+            toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
+            net = fitted.chi_square - trial.chi_square - toll
             none = net <= 0.0 or self._too_small(trial, cause)
             reason = "" if none else self._refusal(trial, cause)
             if reason:
                 self.refusals[cause] = reason
             if none or reason:
-                self._refused.add(key)
-                continue
-            if best is None or net > best[0]:
+                self._refused.add(_key(score))
+            elif best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
 
@@ -264,10 +258,8 @@ class Search:
         screen = self._screen(fitted)
         scores = screen.scores(fitted)
         for candidate in matched_filters.found(self.estimator, fitted):
-            columns = self.estimator.weighted(
-                self.estimator.columns(candidate.effect, fitted.hypothesis.start)
-            )
-            scores.append(score_of(candidate, columns, fitted))
+            columns = self.estimator.columns(candidate.effect, fitted.hypothesis.start)
+            scores.append(score_of(candidate, self.estimator.weighted(columns), fitted))
         return scores
 
     def _screen(self, fitted: Fitted) -> Screen:
@@ -297,27 +289,30 @@ class Search:
             self.estimator.calibrated = known
 
     def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
-        """Other causes that do nearly as well in the place of one; ``without`` is the fit that lacks it."""
+        """Other causes that do nearly as well in the place of one, best first; ``without`` is the fit that
+        lacks it.
+        """
         # Where more is left than noise, neither is the whole truth, and a margin counts for less.
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
-        return [name for name, _ in self._rivals(without, cause, most)]
-
-    def _rivals(self, without: Fitted, cause: str, most: float) -> list[tuple[str, Fitted]]:
-        """Other causes that cost less than ``most`` in the place of one that was taken out; best first."""
         self.forget()
         best: dict[str, Fitted] = {}
         for score in self._shortlist(without, BEST + 1):
-            if score.candidate.cause != cause:
-                hypothesis = joined(without.hypothesis, score.candidate.effect, self.base)
-                trial = self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
-                name = score.candidate.cause
-                if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
-                    continue
-                if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
-                    best[name] = trial
-        return sorted(best.items(), key=lambda each: each[1].chi_square)
+            name = score.candidate.cause
+            if name == cause:
+                continue
+            trial = self._with(without, score, most)
+            if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
+                continue
+            if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
+                best[name] = trial
+        return sorted(best, key=lambda each: best[each].chi_square)
+
+    def _with(self, fitted: Fitted, score: Score, most: float) -> Fitted:
+        """With one of the candidates more; roughly where it costs more than ``most``."""
+        hypothesis = joined(fitted.hypothesis, score.candidate.effect, self.base)
+        return self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:

@@ -25,6 +25,7 @@ BINS = {"load angle": 360, "position": 400, "time": 25}
 """Of angles as many as a narrow bump or a wave of the motor's orders asks for; of time no more than there are
 stretches of either half for."""
 BLOCK_S = 0.2
+LESS = "does less than what is left unexplained"
 EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
 
@@ -117,31 +118,33 @@ def without_doubtful_loops(
         and "last reversal" not in left.lives_in
         and each.taken_arcsec**2 < scales.shadow * left.arcsec**2
     ]
-    words = [f"{each.cause}: does less than what is left unexplained" for each in doubtful]
+    words = [f"{each.cause}: {LESS}" for each in doubtful]
     return [each for each in findings if each not in doubtful], words
 
 
-def elsewhere(estimator: Estimator, residual: FloatArray) -> BoolArray:
-    """The points outside the tenth of the record's stretches in which most is left, shape (m,).
+def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
+    """Squares that an effect takes away where it acts, in those of what is left there.
 
-    What is left in one episode, say in small swings of a motor that sticks where it turns, casts no
+    It acts where it is a good part of what it can be. The tenth of the record in which most is left does not
+    count: what is left in one episode, say in small swings of a motor that sticks where it turns, casts no
     shadow on what is seen everywhere else. Without reversals an episode is a place, and all points count.
     """
-    if estimator.data.reversals < 2:
-        return np.ones(len(residual), dtype=np.bool_)
-    number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
-    left = np.bincount(number, residual**2 * estimator.weight**2)
-    return np.asarray(
-        ~np.isin(number, np.argsort(left)[-round(float(estimator.scales.episodes) * EPISODES) :])
-    )
-
-
-def acts(estimator: Estimator, fitted: Fitted, place: int) -> BoolArray:
-    """The points at which an effect is a good part of what it can be, shape (m,)."""
-    effect = fitted.hypothesis.effects[place]
+    effect, weight, scales = fitted.hypothesis.effects[place], estimator.weight, estimator.scales
+    residual = fitted.residual / weight
     values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
     values = np.abs(values - np.median(values))
-    return np.asarray(values > estimator.scales.acts * float(np.quantile(values, 0.998)))
+    rows = values > scales.acts * float(np.quantile(values, 0.998))
+    if estimator.data.reversals >= 2:
+        number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
+        most = np.argsort(np.bincount(number, fitted.residual**2))[
+            -round(float(scales.episodes) * EPISODES) :
+        ]
+        apart = ~np.isin(number, most)
+        if np.any(rows & apart):
+            rows &= apart
+    without = estimator.fit(fitted.hypothesis.without(place)).residual[rows] / weight[rows]
+    does = float(np.mean(without**2) - np.mean(residual[rows] ** 2))
+    return does / max(beyond_noise(estimator, residual, rows) ** 2, 1e-12)
 
 
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from hdbridge.diagnose import Diagnosis
-from hdbridge.diagnose.experiment import machine_for_unexplained, machine_plans
 from hdbridge.diagnose.planned import plan_report
+from hdbridge.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.improvement.extension import alternatives
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView

@@ -12,7 +12,8 @@ import pytest
 from scipy.signal import lfilter
 
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
-from hdbridge.diagnose.probability import Context, Signs, weighed
+from hdbridge.diagnose.acceptance import Gate
+from hdbridge.diagnose.probability import Context, weighed
 from hdbridge.effects import Hysteresis
 from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
@@ -186,8 +187,8 @@ def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagno
 
 
 def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
-    signs = Signs(robust=robust / 10.0, needed=25.0)
-    return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, signs=signs)
+    gate = Gate(robust=robust / 10.0, needed=25.0)
+    return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, gate=gate)
 
 
 ALONE = Context(left_arcsec=0.1, excess=1.0, unexplained=False)

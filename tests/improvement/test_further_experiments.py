@@ -6,9 +6,9 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import axis_view
-from hdbridge.diagnose.experiment import machine_for_unexplained, machine_plans
 from hdbridge.diagnose.result import Finding
 from hdbridge.improvement import choose, untold
+from hdbridge.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 

@@ -28,7 +28,6 @@ from hdbridge.effects import (
     causes,
     extended,
 )
-from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.gain import Gain
 from hdbridge.evaluation.stepping import Scatter
 from hdbridge.model import TransmissionModel
@@ -117,7 +116,6 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
         np.zeros(len(driven)),
     )
     measured = model + own + noise * rng.normal(size=len(driven))
-    direction = direction_of(driven)
     effects = MODEL.effects
     for each in findings:
         effects = effects if each.effect is None else extended(effects, each.effect)
@@ -135,13 +133,9 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
         remarks=("no command (motor_target_deg)",),
         model=TransmissionModel(RATIO, effects),
         traces=Traces(
-            driven.time_s,
-            driven.motor_deg,
             measured,
             model,
             model + own,
-            direction,
-            driven.motor_speed_deg_s,
             driven,
             np.arange(len(driven)),
             Start.FORWARD,
