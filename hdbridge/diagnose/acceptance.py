@@ -132,18 +132,12 @@ def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     if changing is None:
         return False
     own = fitted.places(place)
-    first = float(fitted.hypothesis.effects[place].coefficients()[0])
-    column = fitted.tangent[:, own[:1]]
-    columns = estimator.weighted(changing[estimator.index])
-    others = np.delete(fitted.tangent, own, axis=1)
-    basis = orthonormal(np.hstack([others, column]))
+    columns = np.hstack([fitted.tangent[:, own[:1]], estimator.weighted(changing[estimator.index])])
+    basis = orthonormal(np.delete(fitted.tangent, own, axis=1))
     left = columns - basis @ (basis.T @ columns)
     moment = left.T @ fitted.residual
-    change = np.linalg.lstsq(left.T @ left, moment, rcond=1e-10)[0]
-    # The coefficient before the first change, with the changes in place.
-    step = np.linalg.lstsq(np.hstack([column, columns, others]), fitted.residual, rcond=None)[0]
-    along = first + np.cumsum(step[: 1 + changing.shape[1]])
-    return bool(
-        np.ptp(along) > estimator.scales.bend * np.max(np.abs(along))
-        and float(moment @ change) > estimator.scales.robust
-    )
+    step = np.linalg.lstsq(left.T @ left, moment, rcond=1e-10)[0]
+    along = float(fitted.hypothesis.effects[place].coefficients()[0]) + np.cumsum(step)
+    scales = estimator.scales
+    differs = float(np.ptp(along)) > scales.bend * float(np.max(np.abs(along)))
+    return differs and float(moment @ step) > scales.robust

@@ -162,13 +162,19 @@ def tones(
     for each in present:
         own_hz = shape_value(each, each.shape[0].name)
         power[np.abs(frequency - own_hz) < estimator.scales.foot_lines / (length * data.period_s)] = 0.0
+    for at in _highest(power, lobe, 0.0):
+        yield (float(frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]),)
+
+
+def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
+    """Places of the highest peaks above ``least``, highest first, none within a ``lobe`` of another."""
+    left = power.copy()
     for _ in range(PEAKS):
-        at = int(np.argmax(power))
-        if power[at] <= 0.0:
+        at = int(np.argmax(left))
+        if left[at] <= least:
             return
-        best = frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]
-        yield (float(best),)
-        power[max(at - lobe, 0) : at + lobe + 1] = 0.0
+        yield at
+        left[max(at - lobe, 0) : at + lobe + 1] = 0.0
 
 
 def _off_centre(height: FloatArray, at: int) -> float:
@@ -189,12 +195,7 @@ def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray)
     ratio = estimator.data.ratio
     power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
     least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
-    for _ in range(PEAKS):
-        at = int(np.argmax(power))
-        if power[at] <= least:
-            return
-        yield at
-        power[max(at - 3, 0) : at + 4] = 0.0
+    yield from _highest(power, 3, least)
 
 
 def with_load_angle(estimator: Estimator, load_deg: FloatArray) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -50,16 +50,16 @@ class ResidualViews:
         Noise has a share of zero.
         """
         odd = every_other(self.time_s)
-        both = self.given_arcsec, self.left_arcsec
-        squares = [max(float(np.mean(each**2)), 1e-300) for each in both]
 
-        def share(coordinate: Coordinate, which: int) -> float:
-            if coordinate.name == "time":
-                coordinate = replace(coordinate, bins=COARSE)
-            gain = foretold(coordinate, both[which], self.direction, odd)
-            return max(gain / squares[which], 0.0)
+        def share(each: Coordinate, values: FloatArray) -> float:
+            coarse = replace(each, bins=COARSE) if each.name == "time" else each
+            gain = foretold(coarse, values, self.direction, odd)
+            return max(gain / max(float(np.mean(values**2)), 1e-300), 0.0)
 
-        return {name: (share(each, 0), share(each, 1)) for name, each in self.coordinates.items()}
+        return {
+            name: (share(each, self.given_arcsec), share(each, self.left_arcsec))
+            for name, each in self.coordinates.items()
+        }
 
 
 def see(diagnosis: Diagnosis) -> ResidualViews:
@@ -74,21 +74,13 @@ def see(diagnosis: Diagnosis) -> ResidualViews:
     )
 
 
-def shares_by_coordinate(diagnosis: Diagnosis) -> dict[str, Any]:
-    """`ResidualViews.shares` for machines."""
-    seen = see(diagnosis)
-    return {
-        name: {"share_of_baseline": round(before, 4), "share_of_extended": round(after, 4)}
-        for name, (before, after) in seen.shares().items()
-    }
-
-
 def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:
     """What a record can be looked at over at some of its points; only what was recorded, and what varies."""
-    found = [
+    found = (
         over.motor_angle(motion),
         over.load_angle(motion, ratio),
         over.position(motion, ratio),
+        Coordinate("direction", "", direction_of(motion), bins=2),
         over.speed(motion),
         over.time(motion),
         over.since_reversal(motion),
@@ -96,13 +88,8 @@ def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coord
         over.since_change(motion),
         over.acceleration(motion),
         *(over.measured(motion, each) for each in MEASURED),
-    ]
-    kept = [
-        Coordinate("direction", "", direction_of(motion)[rows], bins=2),
-        *(each.at(rows) for each in found),
-    ]
-    order = ("motor angle", "load angle", "position", "direction")
-    kept.sort(key=lambda each: order.index(each.name) if each.name in order else len(order))
+    )
+    kept = (each.at(rows) for each in found)
     return {each.name: each for each in kept if each.varies()}
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hdbridge.diagnose.acceptance import Gate
-from hdbridge.diagnose.residual_views import shares_by_coordinate
+from hdbridge.diagnose.residual_views import see
 from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.gain import Gain
@@ -231,7 +231,10 @@ class Diagnosis:
             "remarks": list(self.remarks),
             "considered": list(self.considered),
             "scales": self.scales.described(),
-            "seen_over": shares_by_coordinate(self),
+            "seen_over": {
+                name: {"share_of_baseline": round(before, 4), "share_of_extended": round(after, 4)}
+                for name, (before, after) in see(self).shares().items()
+            },
         }
 
     def verdict(self) -> str:
