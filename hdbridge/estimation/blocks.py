@@ -7,7 +7,7 @@ hysteresis is steep, and never reach across a turn, a gap, or samples that canno
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -73,80 +73,58 @@ class Blocks:
         """Number of blocks."""
         return len(self.first)
 
+    @property
+    def sizes(self) -> IntArray:
+        """Usable samples in each block, outliers too."""
+        return np.diff(np.append(self.first, len(self.index)))
+
     def mean(self, values: FloatArray) -> FloatArray:
         """Average of a per-sample quantity (n,) or (n, p) over each block: (b,) or (b, p)."""
         picked = values[self.index]
-        weighted = picked * (self.weight if picked.ndim == 1 else self.weight[:, np.newaxis])
-        total = np.add.reduceat(weighted, self.first, axis=0)
-        count = np.maximum(self.count, 1e-300)
-        return np.asarray(total / (count if picked.ndim == 1 else count[:, np.newaxis]))
+        spread = (slice(None), np.newaxis)[: picked.ndim]
+        total = np.add.reduceat(picked * self.weight[spread], self.first, axis=0)
+        return np.asarray(total / np.maximum(self.count, 1e-300)[spread])
 
     def picked(self, index: IntArray) -> Blocks:
         """Some of the blocks, each stood for by its middle sample."""
-        values = {
-            each.name: getattr(self, each.name)[index]
-            for each in fields(self)
-            if each.name not in {"index", "first", "weight"}
-        }
-        middle = np.sort(self.middle[index])
-        return Blocks(index=middle, first=np.arange(len(index)), weight=np.ones(len(index)), **values)
-
-    def parts(self, samples: int) -> Iterator[tuple[slice, IntArray]]:
-        """Runs of whole blocks of about so many samples: the blocks, and the samples in them."""
-        begin = 0
-        while begin < len(self):
-            end = int(np.searchsorted(self.first, self.first[begin] + samples, "right"))
-            stop = int(self.first[end]) if end < len(self) else len(self.index)
-            yield slice(begin, end), self.index[self.first[begin] : stop]
-            begin = end
-
-    def mean_of_part(self, part: slice, values: FloatArray) -> FloatArray:
-        """Like `mean` for the values (m, p) of one part's samples."""
-        begin = int(self.first[part.start])
-        weighted = values * self.weight[begin : begin + len(values), np.newaxis]
-        total = np.add.reduceat(weighted, self.first[part] - begin, axis=0)
-        return np.asarray(total / np.maximum(self.count[part, np.newaxis], 1e-300))
+        own = {"index", "first", "weight"}
+        kept = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name not in own}
+        return Blocks(self.middle[index], np.arange(len(index)), np.ones(len(index)), **kept)
 
 
 def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
     """Cut the usable samples into blocks; ``weight`` (one per sample, 0 or 1) leaves outliers out."""
     index = np.flatnonzero(samples.usable)
-    travel = np.concatenate([_travel(samples.motor_deg[chain.rows]) for chain in samples.chains])
-    chain = np.empty(len(samples), dtype=np.intp)
-    leg = np.empty(len(samples), dtype=np.intp)
-    key = np.empty(len(samples), dtype=np.int64)
-    coarsest = float(
-        np.clip(sum(float(travel[each.rows][-1]) for each in samples.chains) / TARGET_BLOCKS, 1.0, 6.0)
-    )
-    for number, each in enumerate(samples.chains):
-        chain[each.rows] = number
-        leg[each.rows] = _legs(samples.motor_deg[each.rows]) + (leg[each.rows.start - 1] + 1 if number else 0)
-        key[each.rows] = _cells(samples.motor_deg[each.rows], coarsest)
-    time = samples.time_s
-    cut = np.ones(len(index), dtype=bool)
-    if len(index) > 1:
-        a, b = index[:-1], index[1:]
-        moving = np.abs(samples.speed_deg_s) > REST_DEG_S
-        cut[1:] = (
-            (b != a + 1)
-            | (key[a] != key[b])
-            | (samples.kind[a] != samples.kind[b])
-            | (chain[a] != chain[b])
-            | (moving[a] != moving[b])
-            | (np.floor(time[a] / LONGEST_S) != np.floor(time[b] / LONGEST_S))
-        )
+    motor, time = samples.motor_deg, samples.time_s
+    parts = [motor[each.rows] for each in samples.chains]
+    travels = [_travel(each) for each in parts]
+    coarsest = float(np.clip(sum(each[-1] for each in travels) / TARGET_BLOCKS, 1.0, 6.0))
+    turnings = [branches(each)[0] for each in parts]
+    travel, heading = np.concatenate(travels), np.concatenate([_heading(each) for each in parts])
+    key = np.concatenate([_cells(*each, coarsest) for each in zip(parts, turnings, strict=True)])
+    chain = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+    legs = [
+        np.searchsorted(turns[1:-1], np.arange(len(each)))
+        for each, turns in zip(parts, turnings, strict=True)
+    ]
+    before = np.cumsum([0, *(each[-1] + 1 for each in legs[:-1])])
+    leg = np.concatenate([each + first for each, first in zip(legs, before, strict=True)])
+    resting = np.abs(samples.speed_deg_s) <= REST_DEG_S
+    cut = np.diff(index, prepend=-2) != 1
+    for each in (key, samples.kind, chain, resting, np.floor(time / LONGEST_S)):
+        cut[1:] |= each[index[1:]] != each[index[:-1]]
     first = np.flatnonzero(cut)
     last = np.append(first[1:], len(index)) - 1
     weights = np.ones(len(index)) if weight is None else weight[index]
     count = np.add.reduceat(weights, first)
-    size = last - first + 1
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(values[index], first) / size)
+        return np.asarray(np.add.reduceat(values[index], first) / (last - first + 1))
 
     weighted_error = np.add.reduceat(samples.error_arcsec[index] * weights, first) / np.maximum(count, 1e-300)
     middle = index[(first + last) // 2]
-    speed, moving = mean(samples.speed_deg_s), np.abs(samples.speed_deg_s[middle]) > REST_DEG_S
+    speed, moving = mean(samples.speed_deg_s), ~resting[middle]
+    rounding_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
     return Blocks(
         index=index,
         first=first,
@@ -154,21 +132,19 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
         count=count,
         time_s=mean(time),
         duration_s=time[index[last]] - time[index[first]],
-        motor_deg=mean(samples.motor_deg),
+        motor_deg=mean(motor),
         travel_deg=mean(travel),
         extent_deg=travel[index[last]] - travel[index[first]],
         speed_deg_s=speed,
         moving=moving,
-        heading=np.concatenate([_heading(samples.motor_deg[each.rows]) for each in samples.chains])[middle],
+        heading=heading[middle],
         kind=samples.kind[middle],
         zero=samples.zero[middle],
         chain=chain[middle],
         middle=middle,
         error_arcsec=weighted_error,
         leg=leg[middle],
-        locked_arcsec=moving
-        * locked_counts(speed, samples.count_deg)
-        * (samples.count_deg / samples.ratio * ARCSEC_PER_DEG),
+        locked_arcsec=moving * locked_counts(speed, samples.count_deg) * rounding_arcsec,
         blur=np.zeros(len(first)),
     )
 
@@ -184,20 +160,14 @@ def _travel(motor_deg: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(motor_deg)))])
 
 
-def _legs(motor_deg: FloatArray) -> IntArray:
-    turning, _ = branches(motor_deg)
-    return np.searchsorted(turning[1:-1], np.arange(len(motor_deg)), "left")
-
-
 def _heading(motor_deg: FloatArray) -> FloatArray:
     steps = np.sign(np.diff(motor_deg, prepend=motor_deg[:1]))
     last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
     return np.asarray(steps[last])
 
 
-def _cells(motor_deg: FloatArray, coarsest_deg: float) -> IntArray:
+def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
     """A number per sample that changes from cell to cell of the travel since the last turn."""
-    turning, _ = branches(motor_deg)
     cells = np.zeros(len(motor_deg), dtype=np.int64)
     edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest
     base = 0

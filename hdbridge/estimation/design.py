@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,9 +11,9 @@ from hdbridge.effects import Effect, FloatArray, IntArray, Start
 from hdbridge.effects.base import Memoryless
 from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import Blocks
+from hdbridge.estimation.linear import side_by_side
 from hdbridge.estimation.samples import Samples, motion_at
-
-PART_SAMPLES = 50_000
+from hdbridge.estimation.shapes import unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,54 +38,30 @@ class Design:
         """The same with other states at the start."""
         return replace(self, starts=tuple(starts))
 
-    def thinned(self, target: int, near_deg: float) -> tuple[Design, IntArray]:
-        """A design of about so many blocks for a search, and which they are.
-
-        All blocks within ``near_deg`` after a reversal stay, of the others a random share counts for all.
-        Only inexact columns can be had of it.
-        """
-        blocks = self.blocks
-        near = np.zeros(len(blocks), dtype=bool)
-        for number, chain in enumerate(self.samples.chains):
-            turning, _ = branches(self.samples.motor_deg[chain.rows])
-            place = np.array(turning) + chain.rows.start
-            turn = place[np.maximum(np.searchsorted(place, blocks.middle, "left") - 1, 0)]
-            since = np.abs(self.samples.motor_deg[blocks.middle] - self.samples.motor_deg[turn])
-            near |= (blocks.chain == number) & (since < near_deg)
-        far = np.flatnonzero(~near)
-        wanted = max(target - int(np.count_nonzero(near)), target // 2)
-        share = min(float(wanted) / max(len(far), 1), 1.0)
-        kept = far[np.random.default_rng(0).random(len(far)) < share]
-        index = np.sort(np.concatenate([np.flatnonzero(near), kept]))
-        part = blocks.picked(index)
-        part = replace(part, count=np.where(near[index], part.count, part.count / share))
-        return Design.of(self.samples, part, self.starts), index
-
     def roughly(self, effect: Effect) -> FloatArray:
         """Columns in which the middles of the blocks stand for all samples."""
         return self.columns(effect, exact=False)
 
     def columns(self, effect: Effect, exact: bool = True) -> FloatArray:
         """Columns of an effect, shape (b, p); ``exact`` averages all samples, else middles stand for them."""
-        memoryless = isinstance(effect.tracker(), Memoryless)
-        if memoryless and exact:
-            key = effect.fitted(np.zeros_like(effect.coefficients()))
-            if effect.shape:
-                return self._in_parts(effect)
-            if key not in self.memo:
-                self.memo[key] = self._in_parts(effect)
-            return self.memo[key]
+        if exact and not effect.shape and isinstance(effect.tracker(), Memoryless):
+            return side_by_side([self._kept(unit(each)) for each in effect.pieces()], len(self.blocks))
         width = len(effect.coefficients())
-        result = np.empty((len(self.blocks), width))
-        every = np.empty((len(self.samples), width)) if exact else None
+        result = np.empty((len(self.samples) if exact else len(self.blocks), width))
         for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
-            if every is not None:
-                every[chain.rows] = effect.columns(self.samples.along(chain), start)
+            motion = self.samples.along(chain)
+            if exact:
+                result[chain.rows] = effect.columns(motion, start)
             else:
                 picked, middles = self.sketch[number]
                 inside = self.blocks.chain == number
-                result[inside] = effect.columns(motion_at(self.samples.along(chain), picked), start)[middles]
-        return result if every is None else self.blocks.mean(every)
+                result[inside] = effect.columns(motion_at(motion, picked), start)[middles]
+        return self.blocks.mean(result) if exact else result
+
+    def _kept(self, piece: Effect) -> FloatArray:
+        if piece not in self.memo:
+            self.memo[piece] = self.blocks.mean(piece.columns(self.samples.motion))
+        return self.memo[piece]
 
     def told(self, effects: Sequence[Effect], exact: bool = True) -> FloatArray:
         """What effects say together, shape (b,)."""
@@ -135,22 +111,7 @@ class Design:
                 left[chain.rows] -= effect.predict(self.samples.along(chain), start)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
-        sizes = np.diff(np.append(self.blocks.first, len(index)))
-        result[index] = left[index] - np.repeat(rest, sizes)
-        return result
-
-    def _in_parts(self, effect: Effect) -> FloatArray:
-        """Without memory a sample's columns do not depend on the others, so a part at a time will do."""
-        motion = self.samples.motion
-        return self.averaged(
-            len(effect.coefficients()), lambda index: effect.columns(motion_at(motion, index))
-        )
-
-    def averaged(self, width: int, values: Callable[[IntArray], FloatArray]) -> FloatArray:
-        """Block averages of ``values`` (i, width) of samples (i,), a part of them at a time; (b, width)."""
-        result = np.empty((len(self.blocks), width))
-        for part, index in self.blocks.parts(PART_SAMPLES):
-            result[part] = self.blocks.mean_of_part(part, values(index))
+        result[index] = left[index] - np.repeat(rest, self.blocks.sizes)
         return result
 
 
@@ -159,13 +120,9 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
 
     Orders need not be whole numbers: 1 / N is once per load turn, k (1 + 1/N) the flexspline's.
     """
-    rate = np.deg2rad(np.asarray(orders, dtype=np.float64))
-
-    def waves(index: IntArray) -> FloatArray:
-        angles = np.outer(design.samples.motor_deg[index], rate)
-        return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(index), -1)
-
-    return design.averaged(2 * len(orders), waves)
+    angles = (np.deg2rad(each) * design.samples.motor_deg for each in orders)
+    parts = [design.blocks.mean(np.stack([np.cos(each), np.sin(each)], axis=1)) for each in angles]
+    return side_by_side(parts, len(design.blocks))
 
 
 def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray]]:
@@ -175,7 +132,7 @@ def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray
         motor_deg = samples.motor_deg[chain.rows]
         turning, _ = branches(motor_deg, Start.VIRGIN)
         first_moves = np.flatnonzero(np.diff(motor_deg))[:1]
-        picked = np.union1d(np.concatenate([middles, np.array(turning), first_moves]), []).astype(np.intp)
+        picked = np.unique(np.concatenate([middles, turning, first_moves]).astype(np.intp))
         result.append((picked, np.searchsorted(picked, middles)))
     return result
 

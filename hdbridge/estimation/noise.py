@@ -9,7 +9,7 @@ and a fit costs no more than one with white noise (Rybicki and Press 1995).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -169,15 +169,8 @@ def fit_noise(
     always = np.all(part.moving)
 
     def model(x: FloatArray) -> NoiseModel:
-        white = np.exp(x[:2])
-        return NoiseModel(
-            standing_arcsec=float(white[1] if always else white[0]),
-            moving_arcsec=float(white[0] if still else white[1]),
-            slow_arcsec=float(np.exp(x[2])),
-            slow_s=float(np.exp(x[3])),
-            place_arcsec=float(np.exp(x[4])),
-            place_deg=float(np.exp(x[5])),
-        )
+        standing, moving, *wanders = np.exp(x).tolist()
+        return NoiseModel(moving if always else standing, standing if still else moving, *wanders)
 
     lower = np.log([SMALLEST_ARCSEC, SMALLEST_ARCSEC, SMALLEST_ARCSEC, 0.3, SMALLEST_ARCSEC, 0.01])
     upper = np.log([1e3, 1e3, 1e3, 600.0, 1e3, 60.0])
@@ -185,15 +178,7 @@ def fit_noise(
     def cost(x: FloatArray) -> float:
         return -Precision(model(x), part).log_likelihood(left)
 
-    x = np.log(
-        np.maximum(
-            [
-                begin.standing_arcsec, begin.moving_arcsec, begin.slow_arcsec,
-                begin.slow_s, begin.place_arcsec, begin.place_deg,
-            ],
-            SMALLEST_ARCSEC,
-        )
-    )  # fmt: skip
+    x = np.log(np.maximum(astuple(begin), SMALLEST_ARCSEC))
     found = minimize(
         cost,
         np.clip(x, lower, upper),
@@ -203,14 +188,8 @@ def fit_noise(
     )
     best = model(found.x)
     share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
-    return NoiseModel(
-        best.standing_arcsec * share,
-        best.moving_arcsec * share,
-        best.slow_arcsec,
-        best.slow_s,
-        best.place_arcsec,
-        best.place_deg,
-    )
+    white = {name: share * getattr(best, name) for name in ("standing_arcsec", "moving_arcsec")}
+    return replace(best, **white)
 
 
 def first_guess(residual: FloatArray, blocks: Blocks) -> NoiseModel:
@@ -227,14 +206,8 @@ def first_guess(residual: FloatArray, blocks: Blocks) -> NoiseModel:
         return median_deviation(picked) if len(picked) else 1.0
 
     rest = max(median_deviation(residual), SMALLEST_ARCSEC) * np.sqrt(0.5)
-    return NoiseModel(
-        max(white(~blocks.moving), SMALLEST_ARCSEC),
-        max(white(blocks.moving), SMALLEST_ARCSEC),
-        rest,
-        5.0,
-        rest,
-        0.2,
-    )
+    at_rest, in_motion = (max(white(each), SMALLEST_ARCSEC) for each in (~blocks.moving, blocks.moving))
+    return NoiseModel(at_rest, in_motion, rest, 5.0, rest, 0.2)
 
 
 def _pieces(blocks: Blocks) -> IntArray:

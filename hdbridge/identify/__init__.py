@@ -8,9 +8,8 @@ from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.identify.fit import fit
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Family, Order
+from hdbridge.identify.orders import Family, Line, Order
 from hdbridge.identify.result import FitResult
-from hdbridge.identify.spectrum import Spectrum
 
 __all__ = [
     "Family",
@@ -18,8 +17,8 @@ __all__ = [
     "FitResult",
     "Interval",
     "Kind",
+    "Line",
     "Order",
     "Segment",
-    "Spectrum",
     "fit",
 ]

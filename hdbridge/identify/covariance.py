@@ -21,7 +21,7 @@ from hdbridge.estimation.linear import inverse_symmetric
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_turn
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.terms import Column
+from hdbridge.estimation.stretches import sums
 
 STRETCHES = 100
 """The record is cut into about so many stretches for the sandwich."""
@@ -37,14 +37,14 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
     if count < 2 * len(main):
         return model
     scores = solution.jacobian[:, main] * precision.apply(solution.residual)[:, np.newaxis]
-    sums = np.zeros((count, len(main)))
-    np.add.at(sums, number, scores)
+    summed = sums(scores, number)
     inner = model[np.ix_(main, main)]
-    sandwich = inner @ (sums.T @ sums) @ inner * count / (count - 1.0)
+    sandwich = inner @ (summed.T @ summed) @ inner * count / (count - 1.0)
     widen = np.ones(len(model))
     widen[main] = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inner), 1e-300), 1.0))
-    waves = np.array([at for at, each in enumerate(solution.columns) if _is_wave(solution, each)], dtype=int)
-    if len(waves):
+    orders = {at for at, each in enumerate(solution.effects) if each.part is Part.ORDERS}
+    waves = [at for at, each in enumerate(solution.columns) if each.effect in orders]
+    if waves:
         between = math.sqrt(_between_legs(solution.jacobian[:, waves], precision, solution.residual, blocks))
         widen[waves] = np.maximum(widen[waves], between)
     return np.asarray(model * np.outer(widen, widen))
@@ -57,19 +57,13 @@ def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]
     return intervals_of(solution.effects[index], columns, cov[np.ix_(mine, mine)])
 
 
-def _is_wave(solution: Solution, column: Column) -> bool:
-    return column.effect >= 0 and solution.effects[column.effect].part is Part.ORDERS
-
-
 def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
     """By how much the variance of waves, taken from leg to leg, is more than the noise model's; at least 1.
 
     Waves (b, p) of one kind have nearly the same information and hardly share any, so that each tells of all.
     """
-    scores = np.zeros((int(blocks.leg[-1]) + 1, waves.shape[1]))
-    own = np.zeros_like(scores)
-    np.add.at(scores, blocks.leg, waves * precision.apply(residual)[:, np.newaxis])
-    np.add.at(own, blocks.leg, waves * precision.apply(waves))
+    scores = sums(waves * precision.apply(residual)[:, np.newaxis], blocks.leg)
+    own = sums(waves * precision.apply(waves), blocks.leg)
     information = np.sum(own, axis=0)
     legs = information**2 / np.sum(own**2, axis=0)
     ratio = np.sum(scores**2, axis=0) / information * legs / np.maximum(legs - 1.0, 0.5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from hdbridge.effects import Effect, FloatArray, Start
 from hdbridge.errors import InputError
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.design import Design, harmonics
-from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
+from hdbridge.estimation.noise import fit_noise
 from hdbridge.estimation.nuisances import (
     DELAY,
     ROUNDING,
@@ -31,9 +30,9 @@ from hdbridge.identify.conclude import conclude
 from hdbridge.identify.covariance import covariance, of_effect
 from hdbridge.identify.figures import outlying
 from hdbridge.identify.options import FitOptions
-from hdbridge.identify.orders import Selection, System
-from hdbridge.identify.problem import LINEAR_ONLY, Problem
-from hdbridge.identify.result import FitResult, Outliers
+from hdbridge.identify.orders import System
+from hdbridge.identify.result import FitResult
+from hdbridge.identify.shapes import LINEAR_ONLY, searched
 from hdbridge.identify.state import State, candidate_orders, turns_covered
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -44,9 +43,6 @@ NO_DEGREES = "where the axis went further, both angles are in radians or turns: 
 """Both angles in one other unit give the right ratio: only how little the axis went can show it."""
 EFFECT_SHARE = 1e-3
 """An effect of whose columns less than this is left by the zeros and orders is not in the record."""
-SEARCH_BLOCKS = 8_000
-NEAR_DEG = 120.0
-"""The search takes all blocks within this motor angle after a reversal, and some of the others."""
 ROUNDS = 3
 
 
@@ -81,10 +77,9 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
             f"only {usable} of {len(samples)} samples were used: what is fast or accelerates is left out"
         )
     state = _prepare(samples, options, warnings)
-    state = _search(state, warnings)
-    state, solution, selection, system, outliers = _settle(state, options)
-    solution, cov = _hold_what_is_unknown(state, solution, selection, options, warnings)
-    return conclude(state, solution, cov, selection, system, outliers, options, warnings)
+    state, solution, system = _settle(_search(state, warnings))
+    solution, cov = _hold_what_is_unknown(state, solution, warnings)
+    return conclude(state, solution, cov, system, warnings)
 
 
 def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> State:
@@ -131,89 +126,89 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
     moving = design.blocks.moving
     if fine and speeds_differ(design.blocks.speed_deg_s[moving], design.blocks.count[moving]):
         nuisances.append(SWING)
-    return State(design, candidates, waves, tuple(nuisances), tuple(effects), NoiseModel(1.0, 1.0))
+    return State(options, design, candidates, waves, tuple(nuisances), tuple(effects))
 
 
 def _search(state: State, warnings: list[str]) -> State:
     """Shapes from a grid, the elastic state at the start where it is not known, and a first noise model."""
-    thin, picked = state.design.thinned(SEARCH_BLOCKS, NEAR_DEG)
     waves = [f"{each} {part}" for each in state.candidates for part in ("cosine", "sine")]
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
-    columns = simple.nuisance_columns().and_waves(state.waves, waves)
+    columns = simple.in_addition().and_waves(state.waves, waves)
 
-    def found(design: Design, effects: tuple[Effect, ...]) -> tuple[float, tuple[Effect, ...]]:
-        problem = Problem(design, effects, columns.rows(picked))
-        return problem.searched(Precision(state.noise, design.blocks))
+    def found(
+        starts: list[Start], effects: tuple[Effect, ...]
+    ) -> tuple[float, tuple[Effect, ...], list[Start]]:
+        begun = state._replace(design=state.design.beginning(starts))
+        return *searched(begun.under(begun.precision(), columns, exact=False), effects), starts
 
-    cost, effects = found(thin, state.effects)
-    starts = list(state.design.starts)
-    for number, chain in enumerate(thin.samples.chains):
-        if chain.start is not None or not effects:
-            continue
-        tried = [(cost, effects, starts)]
-        for start in (Start.VIRGIN, Start.BACKWARD):
-            others = [*starts[:number], start, *starts[number + 1 :]]
-            tried.append((*found(thin.beginning(others), effects), others))
-        cost, effects, starts = min(tried, key=lambda each: each[0])
-    for each in effects:
+    best = found(list(state.design.starts), state.effects)
+    for number, chain in enumerate(state.design.samples.chains):
+        if chain.start is None and best[1]:
+            _, effects, starts = best
+            others = (
+                [*starts[:number], each, *starts[number + 1 :]] for each in (Start.VIRGIN, Start.BACKWARD)
+            )
+            best = min((best, *(found(each, effects) for each in others)), key=lambda each: each[0])
+    for each in best[1]:
         if each.violations():
             warnings.append(f"{each.name}: left out, the record shows it only with an impossible sign")
-    effects = tuple(each for each in effects if not each.violations())
-    design = state.design.beginning(starts).blurred(effects)
+    effects = tuple(each for each in best[1] if not each.violations())
+    design = state.design.beginning(best[2]).blurred(effects)
     state = state._replace(design=design, effects=effects)
-    problem = Problem(design, effects, columns)
-    solution = problem.fitted(state.precision(), LINEAR_ONLY, exact=False)
+    solution = state.under(state.precision(), columns, exact=False).fit(effects, LINEAR_ONLY)
     return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
 
 
-def _settle(state: State, options: FitOptions) -> tuple[State, Solution, Selection, System, Outliers]:
+def _settle(state: State) -> tuple[State, Solution, System]:
     """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
-    selection = state.selected(options)
-    problem = state.problem(selection)
-    solution = problem.fitted(state.precision(), exact=False)
+    state = state.selected()
+    solution = state.fitted(exact=False)
     samples = state.design.samples
     weight, outliers = outlying(
-        problem.design.residual(solution.effects, problem.nuisances.columns @ solution.nuisances),
+        state.design.residual(solution.effects, state.columns().columns @ solution.nuisances),
         samples.count_deg / samples.ratio * ARCSEC_PER_DEG,
     )
-    delay_ms = dict(zip(problem.nuisances.names, solution.nuisances.tolist(), strict=True)).get(DELAY, 0.0)
+    state = state._replace(outliers=outliers)
+    delay_ms = _value(solution, DELAY)
     if outliers.samples or delay_ms:
         state = state.after(solution).remade(samples.delayed(delay_ms / 1000.0), weight, delay_ms)
     for turn in range(ROUNDS):
         state = state.after(solution)
-        solution = state.problem(selection).fitted(state.precision())
+        solution = state.fitted()
         noise = fit_noise(solution.residual, state.design.blocks, solution.jacobian.shape[1], state.noise)
         state = state.after(solution)._replace(noise=noise)
-        system = state.information()
-        again = state.selected(options, system)
-        if again.chosen == selection.chosen and turn:
+        system, before = state.information(), state.selection.chosen
+        state = state.selected(system)
+        if state.selection.chosen == before and turn:
             break
-        selection = again
-    problem = state.problem(selection)
-    solution = problem.fitted(state.precision())
-    if dict(zip(problem.nuisances.names, solution.nuisances.tolist(), strict=True)).get(SWING, 0.0) < 0.0:
+    solution = state.fitted()
+    if _value(solution, SWING) < 0.0:
         # No load is held back below its natural frequency: something else differs from speed to speed.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
-        solution = state.problem(selection).fitted(state.precision())
+        solution = state.fitted()
         system = state.information()
     state = state.after(solution)
-    problem = state.problem(selection)
-    if len(problem.nuisances.names) != len(solution.nuisances):
+    if len(state.columns().names) != len(solution.nuisances):
         # The first orders came in last, and what swings with them, or turns that now matter.
-        solution = problem.fitted(state.precision())
+        solution = state.fitted()
         system = state.information()
-    return state, solution, selection, system, outliers
+    return state, solution, system
+
+
+def _value(solution: Solution, nuisance: str) -> float:
+    """Of a nuisance; 0 where it is not fitted."""
+    names = [each.name for each in solution.columns[: len(solution.nuisances)]]
+    return float(solution.nuisances[names.index(nuisance)]) if nuisance in names else 0.0
 
 
 def _hold_what_is_unknown(
-    state: State, solution: Solution, selection: Selection, options: FitOptions, warnings: list[str]
+    state: State, solution: Solution, warnings: list[str]
 ) -> tuple[Solution, FloatArray]:
     """Where the data cannot say what shape an effect has, it keeps the one that it came with."""
-    blocks = state.design.blocks
+    options, blocks = state.options, state.design.blocks
     cov = covariance(solution, state.precision(), blocks)
     effects = list(solution.effects)
-    held = False
-    for index, effect in enumerate(effects):
+    for index, effect in enumerate(solution.effects):
         unknown = [each for each in of_effect(solution, index, cov) if not each.identifiable]
         edge = [name for owner, name in solution.at_bound if owner == index]
         if edge and not unknown:
@@ -226,13 +221,11 @@ def _hold_what_is_unknown(
             shape = {each.name: float(getattr(prototype, each.name)) for each in effect.shape}
             effects[index] = effect.fitted(effect.coefficients(), shape)
             names = [each.parameter for each in unknown]
-            held = True
             warnings.append(
                 f"{effect.name}: {' and '.join(names)} cannot be identified from this record; its shape is "
                 "kept as it was: record slow sines and nested reversals"
             )
-    if held:
-        problem = replace(state.problem(selection), effects=tuple(effects))
-        solution = problem.fitted(state.precision(), LINEAR_ONLY)
+    if tuple(effects) != solution.effects:
+        solution = state.under(state.precision(), state.columns()).fit(effects, LINEAR_ONLY)
         cov = covariance(solution, state.precision(), blocks)
     return solution, cov

@@ -11,15 +11,16 @@ from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.noise import NoiseModel, Precision
+from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.samples import KINDS
 from hdbridge.estimation.segment import Kind
 from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.stretches import about_zeros, sums
 from hdbridge.estimation.terms import Effort
-from hdbridge.identify.problem import Problem
 from hdbridge.identify.result import HeldOut
+from hdbridge.identify.state import State
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
@@ -34,39 +35,34 @@ SAME_WAY = 0.8
 
 
 def held_out(
-    problem: Problem,
-    solution: Solution,
-    noise: NoiseModel,
-    active_arcsec: FloatArray,
-    measured_arcsec: FloatArray,
-    inside_variance: float,
-    against: str,
+    state: State, solution: Solution, measured_arcsec: FloatArray, inside_variance: float
 ) -> HeldOut:
-    """Leave out one fold at a time.
+    """Leave out one fold at a time, and compare with the active model, or none.
 
-    ``active_arcsec`` (b,) is what the active model predicts; ``measured_arcsec`` (b,) what was measured,
-    before any delay was put right; ``inside_variance`` is what samples vary inside their blocks, which no
-    model of this kind changes. ``against`` names in words what the active model is.
+    ``measured_arcsec`` (b,) is what was measured, before any delay was put right; ``inside_variance`` is what
+    samples vary inside their blocks, which no model of this kind changes.
     """
-    blocks = problem.design.blocks
-    fold, over = folds(problem)
+    design, blocks, active = state.design, state.design.blocks, state.options.active
+    active_arcsec = design.told(active.effects if active else ())
+    fold, over = folds(blocks)
     # Turns and rounding are noise of the fit, not something that a model could be given.
-    problem = replace(problem, nuisances=problem.nuisances.without(is_rounding))
-    shift = problem.nuisances.columns
+    columns = state.columns().without(is_rounding)
+    shift = columns.columns
     added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
     used = np.zeros(len(blocks), dtype=bool)
     for number in np.unique(fold).tolist():
         out = fold == number
-        precision = Precision(noise, blocks, out)
+        precision = Precision(state.noise, blocks, out)
         if np.count_nonzero(~out) < 2 * solution.jacobian.shape[1]:
             continue
-        fit = problem.under(precision, exact=False).fit(solution.effects, BRIEF)
+        fit = state.under(precision, columns, exact=False).fit(solution.effects, BRIEF)
         # The active model has no nuisances of its own: it is given those that suit it best.
-        rest = _least_squares(shift, problem.observed - active_arcsec, precision)
-        either = (problem.observed - active_arcsec - shift @ rest, fit.residual)
+        before, weighted = blocks.error_arcsec - active_arcsec, precision.apply(shift)
+        rest = solve_symmetric(shift.T @ weighted, weighted.T @ before)
+        either = (before - shift @ rest, fit.residual)
         # As far as a model can hold them.
         valid = [each for each in fit.effects if not each.violations()]
-        told = (active_arcsec, problem.design.told(valid, exact=False))
+        told = (active_arcsec, design.told(valid, exact=False))
         # About the zeros that the rest of the data have; about its own where a zero is in this fold alone.
         lost = ~np.isin(blocks.zero, blocks.zero[~out])
         for row in (0, 1):
@@ -90,11 +86,12 @@ def held_out(
     result = HeldOut(gain(alone), gain(added), fitted, "")
     assert result.gain is not None
     words = "improves on" if result.improves else "does not improve on"
+    against = "the active model" if active else "no model"
     figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"
     return replace(result, text=f"{words} {against}: {figures} on {over} left out")
 
 
-def folds(problem: Problem) -> tuple[IntArray, str]:
+def folds(blocks: Blocks) -> tuple[IntArray, str]:
     """Which fold each block is in, and what is left out in words.
 
     Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
@@ -102,7 +99,6 @@ def folds(problem: Problem) -> tuple[IntArray, str]:
     short recordings of the same travel whole ones: what is left in one of them goes on from one
     stretch to the next, and would be foretold by its neighbours.
     """
-    blocks = problem.design.blocks
     lowest = float(np.min(blocks.motor_deg))
     turns = float(np.ptp(blocks.motor_deg)) / DEG_PER_TURN
     by_turn = np.floor((blocks.motor_deg - lowest) / DEG_PER_TURN).astype(np.intp) % FOLDS
@@ -124,8 +120,3 @@ def _alike(blocks: Blocks) -> bool:
         if np.any(own) and np.mean(np.isin(cell[own], cell[~own])) < SAME_WAY:
             return False
     return True
-
-
-def _least_squares(columns: FloatArray, observed: FloatArray, precision: Precision) -> FloatArray:
-    weighted = precision.apply(columns)
-    return np.asarray(np.linalg.lstsq(columns.T @ weighted, weighted.T @ observed, rcond=None)[0])

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.noise import NoiseModel, Precision
-from hdbridge.identify.orders import Family
+from hdbridge.identify.orders import Family, Line
 from hdbridge.identify.result import NoiseFigures, ResidualTest
-from hdbridge.identify.spectrum import Spectrum
 
 SURE = 3.0
 """Standard errors that a difference must have."""
@@ -23,14 +23,13 @@ def residual_tests(
     residual: FloatArray,
     blocks: Blocks,
     precision: Precision,
-    lines: Spectrum,
-    fitted_orders: set[str],
+    left: Sequence[Line],
     figures: NoiseFigures,
 ) -> tuple[ResidualTest, ...]:
-    """All tests; ``fitted_orders`` are names of orders in the fit."""
+    """All tests; ``left`` are the orders that are not in the fit."""
     return (
-        _orders("motor_angle", lines, (Family.MOTOR, Family.FLEXSPLINE), fitted_orders),
-        _orders("load_angle", lines, (Family.LOAD,), fitted_orders),
+        _orders("motor_angle", [each for each in left if each.order.family is not Family.LOAD]),
+        _orders("load_angle", [each for each in left if each.order.family is Family.LOAD]),
         _contrast("direction", np.sign(blocks.speed_deg_s) * blocks.moving, residual, precision, 2.0),
         _contrast("time", _centred(blocks.time_s), residual, precision, 1.0),
         _whiteness(figures.model),
@@ -38,13 +37,9 @@ def residual_tests(
     )
 
 
-def _orders(name: str, lines: Spectrum, families: tuple[Family, ...], fitted: set[str]) -> ResidualTest:
-    left = [
-        each
-        for each in lines.lines
-        if each.order.family in families and str(each.order) not in fitted and each.significant
-    ]
-    worst = max(left, key=lambda each: each.amplitude_arcsec, default=None)
+def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
+    significant = [each for each in left if each.significant]
+    worst = max(significant, key=lambda each: each.amplitude_arcsec, default=None)
     size = worst.amplitude_arcsec if worst else 0.0
     text = f"{worst.order} of {size:.2f} arcsec is left" if worst else "no order is left"
     return ResidualTest(name, size < WORTH_ARCSEC, size, text)

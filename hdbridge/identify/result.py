@@ -11,8 +11,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.noise import NoiseModel
-from hdbridge.identify.orders import Order
-from hdbridge.identify.spectrum import Spectrum
+from hdbridge.identify.orders import Line
 from hdbridge.model import TransmissionModel
 
 WORTH = 0.01
@@ -99,16 +98,6 @@ class HeldOut:
 
 
 @dataclass(frozen=True, slots=True)
-class ChosenOrder:
-    """A motor order of the synchronous part, with how sure it is."""
-
-    order: Order
-    amplitude_arcsec: float
-    fall_in_chi_square: float
-    threshold: float
-
-
-@dataclass(frozen=True, slots=True)
 class Nuisance:
     """Something that was fitted in addition to the model so that it does not bend it."""
 
@@ -136,7 +125,9 @@ class Traces:
     predicted_arcsec: FloatArray
     """The model's effects."""
     residual_arcsec: FloatArray
-    """Observed minus model, zero and nuisances."""
+    """Observed minus model, about the zeros that suit it."""
+    orders_arcsec: FloatArray
+    """Observed without hysteresis, zero and nuisances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,9 +142,10 @@ class FitResult:
     nuisances: tuple[Nuisance, ...]
     noise: NoiseFigures
     outliers: Outliers
-    orders: tuple[ChosenOrder, ...]
-    spectrum: Spectrum
-    """Of the error without hysteresis, zero and nuisances."""
+    orders: tuple[Line, ...]
+    """Of the motor, in the model."""
+    spectrum: tuple[Line, ...]
+    """All orders that were looked for."""
     residual_tests: tuple[ResidualTest, ...]
     held_out: HeldOut
     traces: Traces

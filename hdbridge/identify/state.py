@@ -1,4 +1,4 @@
-"""What the steps of an identification hand on, and the problems that are made of it."""
+"""What the steps of an identification hand on, and the fits that are made of it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 from hdbridge.effects import Effect, FloatArray, is_ripple, ripple
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.design import Design, harmonics
+from hdbridge.estimation.linear import side_by_side
 from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
-from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import tangent
-from hdbridge.estimation.terms import Nuisances
+from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, select
-from hdbridge.identify.problem import Problem
+from hdbridge.identify.result import Outliers
 from hdbridge.units import DEG_PER_TURN
 
 WHOLE_TURN = 0.95
@@ -29,6 +30,7 @@ COVERED_DEG = 30.0
 class State(NamedTuple):
     """Where an identification stands."""
 
+    options: FitOptions
     design: Design
     candidates: tuple[Order, ...]
     waves: FloatArray
@@ -36,76 +38,77 @@ class State(NamedTuple):
     nuisances: tuple[str, ...]
     effects: tuple[Effect, ...]
     """All but the ripple."""
-    noise: NoiseModel
-    delay_ms: float = 0.0
-    """By which the samples have been put right already."""
+    noise: NoiseModel = NoiseModel(1.0, 1.0)
+    selection: Selection = Selection((), ())
     ripple: Effect | None = None
     """As last fitted."""
-
-    def nuisance_columns(self) -> Nuisances:
-        """Zeros and nuisances."""
-        return nuisances_of(self.design, self.nuisances, self.effects, self._shaking())
-
-    def _shaking(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """Orders of the ripple, what each contributes to the blocks, and a quarter later."""
-        if self.ripple is None:
-            return []
-        places = {
-            float(each.number): at for at, each in enumerate(self.candidates) if each.family is Family.MOTOR
-        }
-        waves = []
-        for order, amplitude_arcsec, phase_deg in self.ripple.waves():
-            phase = np.deg2rad(phase_deg)
-            pair = self.waves[:, 2 * places[order] : 2 * places[order] + 2]
-            both = amplitude_arcsec * np.array(
-                [[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]]
-            )
-            now, later = (pair @ both).T
-            waves.append((order, now, later))
-        return waves
+    outliers: Outliers = Outliers(0, 0)
+    delay_ms: float = 0.0
+    """By which the samples have been put right already."""
 
     def precision(self) -> Precision:
         """Of the present noise model."""
         return Precision(self.noise, self.design.blocks)
+
+    def in_addition(self) -> Nuisances:
+        """Zeros and nuisances."""
+        waves = []
+        for order, amplitude_arcsec, phase_deg in self.ripple.waves() if self.ripple else ():
+            at = 2 * self.candidates.index(Order.motor(round(order)))
+            wave = amplitude_arcsec * np.exp(1j * np.deg2rad(phase_deg))
+            turned = wave * (self.waves[:, at] + 1j * self.waves[:, at + 1])
+            waves.append((order, turned.real, turned.imag))
+        return nuisances_of(self.design, self.nuisances, self.effects, waves)
+
+    def columns(self) -> Nuisances:
+        """Zeros and nuisances, and the chosen orders that are not the motor's."""
+        others = [
+            (f"{order} {part}", 2 * at + number)
+            for at, order in enumerate(self.candidates)
+            if order in self.selection.chosen and order.family is not Family.MOTOR
+            for number, part in enumerate(("cosine", "sine"))
+        ]
+        picked = self.waves[:, [at for _, at in others]]
+        return self.in_addition().and_waves(picked, [name for name, _ in others])
+
+    def model(self) -> tuple[Effect, ...]:
+        """The chosen motor orders as the ripple, and the other effects."""
+        motor = [each.number for each in self.selection.chosen if each.family is Family.MOTOR]
+        return ((ripple(motor),) if motor else ()) + self.effects
+
+    def under(self, weighting: Weighting, columns: Nuisances, exact: bool = True) -> Separable:
+        """Fits of effects; ``exact`` averages all samples into their blocks, else middles stand for them."""
+        of = self.design.columns if exact else self.design.roughly
+        return Separable(Terms(self.design.blocks.error_arcsec, of, weighting, columns))
+
+    def fitted(self, effort: Effort | None = None, exact: bool = True) -> Solution:
+        """The minimum near where the model stands."""
+        return self.under(self.precision(), self.columns(), exact).fit(self.model(), effort)
 
     def information(self) -> System:
         """J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
 
         With the tangents in, shapes are refitted with every order that is tried.
         """
-        extra = self.nuisance_columns()
+        extra, roughly = self.in_addition(), self.design.roughly
         parts = [self.waves, extra.columns]
         for effect in self.effects:
-            parts.append(self.design.roughly(effect))
-            parts += [
-                tangent(self.design.roughly, effect, each, central=True)[:, np.newaxis]
-                for each in effect.shape
-            ]
-        columns = np.concatenate(parts, axis=1)
+            parts.append(roughly(effect))
+            parts += [tangent(roughly, effect, each, central=True)[:, np.newaxis] for each in effect.shape]
+        columns = side_by_side(parts, len(self.waves))
         weighted = self.precision().apply(columns)
         gram = columns.T @ weighted
-        first = self.waves.shape[1]
-        inside = np.arange(first, first + len(extra.prior))
+        inside = np.arange(len(extra.prior)) + self.waves.shape[1]
         gram[inside, inside] += extra.prior
         return gram, weighted.T @ self.design.blocks.error_arcsec
 
-    def selected(self, options: FitOptions, system: System | None = None) -> Selection:
-        """The orders that this noise lets one see; ``system`` is `information`, where it is at hand."""
-        information, right = system or self.information()
-        return select(self.candidates, information, right, options.family_wise, options.smallest_arcsec)
-
-    def problem(self, selection: Selection) -> Problem:
-        """Motor orders as the ripple, other effects; orders not the motor's in addition."""
-        motor = [each.number for each in selection.chosen if each.family is Family.MOTOR]
-        others = [
-            index
-            for index, each in enumerate(self.candidates)
-            if each in selection.chosen and each.family is not Family.MOTOR
-        ]
-        picked = [2 * index + part for index in others for part in (0, 1)]
-        names = [f"{self.candidates[index]} {part}" for index in others for part in ("cosine", "sine")]
-        effects = ((ripple(motor),) if motor else ()) + self.effects
-        return Problem(self.design, effects, self.nuisance_columns().and_waves(self.waves[:, picked], names))
+    def selected(self, system: System | None = None) -> State:
+        """With the orders that this noise lets one see; ``system`` is `information`, where it is at hand."""
+        options = self.options
+        found = select(
+            self.candidates, system or self.information(), options.family_wise, options.smallest_arcsec
+        )
+        return self._replace(selection=found)
 
     def after(self, solution: Solution) -> State:
         """With a solution's effects, and the blur that they bring."""

@@ -44,6 +44,7 @@ PAUSE_STEPS: Final = 20.0
 """A gap in time of so many usual steps parts two runs."""
 HIGHEST_ORDER: Final = 16.0
 """Of the spectrum that is drawn."""
+BINS_PER_TURN: Final = 128
 
 
 def calibration_page(result: Calibration) -> Page:
@@ -183,12 +184,9 @@ def _is_loop(motor_deg: FloatArray) -> bool:
 
 
 def _spectrum(result: Calibration) -> Chart:
-    spectrum = result.fit.spectrum
-    curve = spectrum.curve
-    shown = curve.order <= HIGHEST_ORDER
-    series = [Series("one order alone", curve.order[shown], curve.amplitude_arcsec[shown])]
+    series = [Series("one order alone", *_alone(result.fit.traces))]
     lines = sorted(
-        (each for each in spectrum.lines if each.order.per_motor_turn <= HIGHEST_ORDER),
+        (each for each in result.fit.spectrum if each.order.per_motor_turn <= HIGHEST_ORDER),
         key=lambda each: each.order.per_motor_turn,
     )
     if lines:
@@ -201,11 +199,29 @@ def _spectrum(result: Calibration) -> Chart:
     if chosen:
         orders = [each.order.per_motor_turn for each in chosen]
         series.append(Series("in the model", orders, [each.amplitude_arcsec for each in chosen], Mark.POINTS))
-    caption = (
-        f"Orders per motor turn; {spectrum.resolution.turns:.0f} motor turns distinguish orders that are "
-        f"{spectrum.resolution.nearest_orders:.3f} or more apart"
-    )
+    turns = float(np.ptp(result.fit.traces.motor_deg)) / DEG_PER_TURN
+    caption = f"Orders per motor turn; {turns:.0f} motor turns distinguish orders that are "
+    caption += f"{1.0 / turns if turns else math.inf:.3f} or more apart"
     return Chart(caption, "order, per motor turn", "amplitude, arcsec", series, y_log=True)
+
+
+def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
+    """Orders and amplitudes of the error averaged in even bins of the motor angle, by FFT: for the eye.
+
+    Empty bins count as zero; amplitudes are scaled by the share of bins that are filled.
+    """
+    moving = traces.direction != 0.0
+    shown = moving if np.mean(moving) > 0.5 else np.ones_like(moving)
+    motor, error = traces.motor_deg[shown], traces.orders_arcsec[shown]
+    turns = max(math.ceil(float(np.ptp(motor)) / DEG_PER_TURN), 1)
+    edges = np.min(motor) + DEG_PER_TURN / BINS_PER_TURN * np.arange(turns * BINS_PER_TURN + 1)
+    filled, total = np.histogram(motor, edges)[0], np.histogram(motor, edges, weights=error)[0]
+    binned = total / np.maximum(filled, 1)
+    # A bin's mean attenuates high orders; the sinc of half a bin puts them right.
+    order = np.fft.rfftfreq(len(binned), 1.0 / BINS_PER_TURN)
+    lines = np.abs(np.fft.rfft(binned)) / np.count_nonzero(filled) / np.sinc(order / BINS_PER_TURN)
+    below = order <= HIGHEST_ORDER
+    return np.asarray(order[below], dtype=np.float64), np.asarray(2.0 * lines[below])
 
 
 def _residual(result: Calibration) -> Iterator[Block]:

@@ -18,8 +18,8 @@ from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.segment import Kind, Segment
-from hdbridge.estimation.terms import Effort
-from hdbridge.identify.problem import Problem
+from hdbridge.estimation.separable import Separable
+from hdbridge.estimation.terms import Effort, Terms
 from hdbridge.records.record import Record
 
 RATIO = plant.RATIO
@@ -62,9 +62,10 @@ def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
     table = seen.calibration
     design = Design.of(table, make_blocks(table), [Start.VIRGIN])
     blocks = design.blocks
-    problem = Problem(design, GIVEN, nuisances_of(design, (), GIVEN))
+    weighting = Precision(NoiseModel(NOISE_ARCSEC, NOISE_ARCSEC), _white(blocks))
     exactly = Effort(steps=60, converged=1e-10)
-    one = problem.fitted(Precision(NoiseModel(NOISE_ARCSEC, NOISE_ARCSEC), _white(blocks)), exactly)
+    terms = Terms(blocks.error_arcsec, design.columns, weighting, nuisances_of(design, (), GIVEN))
+    one = Separable(terms).fit(GIVEN, exactly)
 
     full = replace(
         seen.diagnosis.full,

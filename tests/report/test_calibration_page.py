@@ -15,9 +15,8 @@ from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.intervals import Interval
 from hdbridge.estimation.noise import NoiseModel
 from hdbridge.evaluation.stepping import Scatter
-from hdbridge.identify.orders import Order
+from hdbridge.identify.orders import Line, Order
 from hdbridge.identify.result import (
-    ChosenOrder,
     FitResult,
     HeldOut,
     NoiseFigures,
@@ -26,7 +25,6 @@ from hdbridge.identify.result import (
     ResidualTest,
     Traces,
 )
-from hdbridge.identify.spectrum import Curve, Line, Resolution, Spectrum
 from hdbridge.model import TransmissionModel
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
@@ -53,8 +51,18 @@ def traces():
     time[8200:] += 100.0
     error = 30.0 * direction + 5.0 * np.cos(np.radians(2 * motor))
     residual = np.random.default_rng(1).normal(size=len(motor))
+    waves = 5.0 * np.cos(np.radians(2 * motor)) + residual
     return Traces(
-        time, motor, motor / 50.0, direction, ("sweep", "sine"), kind, error + residual, error, residual
+        time,
+        motor,
+        motor / 50.0,
+        direction,
+        ("sweep", "sine"),
+        kind,
+        error + residual,
+        error,
+        residual,
+        waves,
     )
 
 
@@ -72,15 +80,8 @@ def fitted():
         nuisances=(Nuisance("delay_ms", "the load encoder is read later by", 0.25, 0.02, "ms"),),
         noise=NoiseFigures(None, 0.4, NoiseModel(0.3, 0.4), 1.0, 1.0, 8400, 800.0),
         outliers=Outliers(3, 1),
-        orders=(ChosenOrder(second, 5.0, 900.0, 16.0),),
-        spectrum=Spectrum(
-            (
-                Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05),
-                Line(second, 5.0, 170.0, 0.01, 0.05),
-            ),
-            Resolution(50.0, 1.0, 0.02, ()),
-            Curve(np.linspace(0.0, 30.0, 301), np.linspace(0.0, 3.0, 301)),
-        ),
+        orders=(Line(second, 5.0, 170.0, 0.01, 0.05),),
+        spectrum=(Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05), Line(second, 5.0, 170.0, 0.01, 0.05)),
         residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),
         held_out=HeldOut(
             *[Gain("motor turns", 2, np.ones(8), np.full(8, 400.0), np.ones(8))] * 2,
