@@ -33,6 +33,7 @@ Command = Target | Callable[[Feedback], Target]
 
 STILL_CYCLES: Final = 3
 """After a quick stop the motor has to keep its place for this many cycles to count as standing."""
+_ENABLED: Final = State.OPERATION_ENABLED
 _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, State.UNKNOWN)
 
 
@@ -201,7 +202,7 @@ class AxisCycle:
         if self._channels:
             self._step_channels()
         power = image.power
-        enabled = power.state is State.OPERATION_ENABLED
+        enabled = power.state is _ENABLED
         if complete and enabled and self._last is not None:
             complete = self._believable(self._last, count)
         before = self.feedback
@@ -234,7 +235,7 @@ class AxisCycle:
             return self._react(count, data, before)
         if data is None:
             data = self._idle()
-        self._commanded = enabled and power.aim is State.OPERATION_ENABLED
+        self._commanded = enabled and power.aim is _ENABLED
         return data
 
     def listen(self, count: int, time_s: float, complete: bool) -> None:

@@ -23,6 +23,7 @@ from hdbridge.control.realtime import resumed_realtime
 from hdbridge.control.sensed import Sensed
 from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import new_tuple
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
@@ -359,14 +360,17 @@ class Bench:
                 target_deg = at(elapsed_s)
                 feedback = tick(answer)
                 samples.append(
-                    Sample(
-                        feedback.time_s,
-                        target_deg,
-                        motor_deg(feedback.demand_counts),
-                        motor_deg(feedback.motor_counts),
-                        load_deg(feedback.load_counts),
-                        feedback.torque_permille * torque_nm,
-                        feedback.readings,
+                    new_tuple(
+                        Sample,
+                        (
+                            feedback.time_s,
+                            target_deg,
+                            motor_deg(feedback.demand_counts),
+                            motor_deg(feedback.motor_counts),
+                            load_deg(feedback.load_counts),
+                            feedback.torque_permille * torque_nm,
+                            feedback.readings,
+                        ),
                     )
                 )
                 if len(samples) > most:

@@ -291,5 +291,7 @@ class ProcessImage:
         if not math.isfinite(motor_deg):
             raise InputError(f"target of {motor_deg!r} deg is not a finite angle; the target was not sent")
         counts = round(self.axis.motor_encoder.counts(motor_deg))
-        self.check_target(counts)
+        least, greatest = self.limits_counts
+        if not least <= counts <= greatest:
+            self.check_target(counts)
         return counts

@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import can
 
+from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.drive.interfacelock import interface_lock
 from hdbridge.errors import BusError
@@ -164,7 +165,9 @@ class Link:
                 continue
             if self._mark is not None and message.channel == self._mark:
                 continue
-            if message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd:
+            if type(message) is not DataFrame and (
+                message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd
+            ):
                 self._drop(message)
                 continue
             return new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))

@@ -38,6 +38,11 @@ class State(Enum):
     __hash__ = object.__hash__
 
 
+# For the control cycle: to look a member up in its class takes five times as long as a name of the module.
+_ENABLED: Final = State.OPERATION_ENABLED
+_QUICK_STOP: Final = State.QUICK_STOP_ACTIVE
+_FAULT: Final = State.FAULT
+
 _DECODING: Final[tuple[tuple[State, int, int], ...]] = (
     # state, mask, value: bits 0-3, 5, 6 of the statusword
     (State.NOT_READY_TO_SWITCH_ON, 0x4F, 0x00),
@@ -234,7 +239,7 @@ class PowerWalk:
         """Take a statusword, give its state."""
         state = _DECODED[statusword & _STATE_BITS] if statusword is not None else State.UNKNOWN
         self._state = state
-        if state is State.OPERATION_ENABLED:
+        if state is _ENABLED:
             self._was_enabled = True
         elif self._was_enabled:
             self._was_enabled = False
@@ -242,7 +247,7 @@ class PowerWalk:
                 # It dropped out by itself. Where it went is where it is left, until somebody aims anew.
                 blind = state in (State.QUICK_STOP_ACTIVE, State.UNKNOWN)
                 self._aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
-        if state is not State.FAULT:
+        if state is not _FAULT:
             self._reset = _NO_RESET
         return state
 
@@ -275,7 +280,7 @@ class PowerWalk:
             return 0
         if self._reset == _RESET_HIGH:
             return Command.FAULT_RESET.word
-        if self._aim is State.QUICK_STOP_ACTIVE and self._state is not State.QUICK_STOP_ACTIVE:
+        if self._aim is _QUICK_STOP and self._state is not _QUICK_STOP:
             # Also blind, when nothing is known about the drive: a quick stop harms in no state.
             return Command.QUICK_STOP.word
         return _WORDS[self._state][self._aim]

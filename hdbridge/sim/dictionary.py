@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import canopen
 from canopen.objectdictionary import ODVariable, datatypes
@@ -106,7 +106,7 @@ class Entry:
         self.high: Final[int | None] = variable.max
         empty: int | str = 0 if code else ""
         self.default: int | bytes = _stored(empty if variable.default is None else variable.default)
-        self.value: int | bytes = self.default
+        self.value: Any = self.default  # of what the codec says
         self.bound: Callable[[], int] | None = None
         self.guard: Callable[[int], None] | None = None
         self.follower: Callable[[int], None] | None = None
@@ -129,8 +129,7 @@ class Entry:
 
     def number(self) -> int:
         """The present value of an integer entry."""
-        value = self.value if self.bound is None else self.bound()
-        assert isinstance(value, int)
+        value: int = self.value if self.bound is None else self.bound()
         return value
 
     def read(self) -> bytes:

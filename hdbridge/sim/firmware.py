@@ -22,6 +22,9 @@ STAY_STOPPED: Final = 5
 """Option codes of 605Ah from here on stay in QUICK STOP ACTIVE."""
 WINDOW_OFF: Final = 0xFFFFFFFF
 
+# For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
+_ENABLED: Final = State.OPERATION_ENABLED
+_QUICK_STOP_ACTIVE: Final = State.QUICK_STOP_ACTIVE
 _HALT: Final = int(Control.HALT)
 _FAULT_RESET: Final = int(Control.FAULT_RESET)
 _ALWAYS: Final = Status.VOLTAGE_ENABLED | Status.REMOTE
@@ -134,7 +137,7 @@ class Firmware:
             word |= _REFERENCED
         if self._braking is not None:
             return word
-        if self.state is State.OPERATION_ENABLED and not self._halted:
+        if self.state is _ENABLED and not self._halted:
             return word | self._mode.status()
         if self._halted or self.state is State.QUICK_STOP_ACTIVE:
             word |= _REACHED  # stopped, as demanded
@@ -334,7 +337,7 @@ class Firmware:
         if braking is not None:
             braking.elapsed_s += period_s
             demand, velocity = braking.ramp.at(braking.elapsed_s)
-        elif self.state is State.OPERATION_ENABLED and not self._halted:
+        elif self.state is _ENABLED and not self._halted:
             demand, velocity = self._mode.step(period_s)
         else:
             demand, velocity = motion.demand_counts, 0.0
@@ -346,14 +349,14 @@ class Firmware:
         self._watch_following_error(period_s)
 
     def _watch_following_error(self, period_s: float) -> None:
-        if self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+        if self.state is not _ENABLED and self.state is not _QUICK_STOP_ACTIVE:
             return
-        window = self._window.number()
+        window = self._window.value
         error = abs(self.motion.demand_counts - self.motion.motor_counts)
         if window == WINDOW_OFF or error <= window:
             self._beyond_window_s = 0.0
             return
         self._beyond_window_s += period_s
-        if self._beyond_window_s * 1000.0 > self._window_time.number():
+        if self._beyond_window_s * 1000.0 > self._window_time.value:
             self._following_error = True
             self.fault(ErrorCode.FOLLOWING_ERROR)

@@ -110,7 +110,7 @@ class _PolledBus(VirtualBus):
         for waiting in self.channel:
             if waiting is own:
                 continue
-            if type(msg) is DataFrame and type(waiting) is _PolledQueue:
+            if type(waiting) is _PolledQueue and type(msg) is DataFrame:
                 waiting.queue.append(msg)  # nobody changes it: one for all
             else:
                 waiting.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
@@ -152,18 +152,18 @@ class LockstepBus(can.BusABC):
 
         Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame where no time-out is given.
         """
-        message = self._take()
-        if message is not None:
-            return message
         clock = self._clock
+        if self._waiting and (message := self._take()) is not None:
+            return message
         deadline_s = clock.now_s + (LONGEST_WAIT_S if timeout is None else timeout)
         while clock.step(deadline_s):
-            message = self._take()
-            if message is not None:
+            if self._waiting and (message := self._take()) is not None:
                 return message
-        for node in clock.nodes:  # somebody else on the channel may have sent to them
-            node.poll(deadline_s)
-        message = self._take()
+        message = None
+        if not (self.private and len(clock.nodes) == 1):
+            for node in clock.nodes:  # somebody else on the channel may have sent to them
+                node.poll(deadline_s)
+            message = self._take()
         if message is None and timeout is None:
             raise can.CanOperationError(f"no frame in {LONGEST_WAIT_S:g} s of virtual time")
         return message

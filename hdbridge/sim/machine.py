@@ -161,7 +161,7 @@ class Machine:
     @property
     def motor_counts(self) -> int:
         """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
-        return math.floor(self.motor_reading + 0.5)
+        return math.floor(self._motor_reading(self._sampled_motor_deg) + 0.5)
 
     @property
     def load_counts(self) -> int:

@@ -66,7 +66,7 @@ class CyclicSynchronousPosition(Mode):
     def step(self, period_s: float) -> tuple[float, float]:
         motion = self.motion
         motion.limited = False
-        target = self._target.number() + self._offset.number()
+        target = self._target.value + self._offset.value
         goal = motion.goal(target)
         step = goal - motion.demand_counts
         longest = motion.max_speed_counts_s() * period_s

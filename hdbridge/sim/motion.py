@@ -79,7 +79,7 @@ class Motion:
     @property
     def sign(self) -> int:
         """-1 where object 607Eh reverses positions, else 1."""
-        return -1 if self._polarity.number() & 0x80 else 1
+        return -1 if self._polarity.value & 0x80 else 1
 
     def user(self, counts: float) -> int:
         """The user's (unbounded) position of a plant position."""
@@ -94,7 +94,7 @@ class Motion:
         sign = self.sign
         here = sign * round(self.demand_counts) + self.home_counts
         distance = ((target - here + _HALF) & _MASK) - _HALF
-        low, high = self._min.number(), self._max.number()
+        low, high = self._min.value, self._max.value
         if low < high and (low > -_HALF or high < _HALF - 1):
             here32 = ((here + _HALF) & _MASK) - _HALF
             reach = here32 + distance
@@ -107,7 +107,8 @@ class Motion:
 
     def max_speed_counts_s(self) -> float:
         """Object 6080h in counts/s."""
-        return self._max_speed.number() * self._motor_resolution.number() / 60.0
+        speed: float = self._max_speed.value * self._motor_resolution.value / 60.0
+        return speed
 
     def preload_target(self) -> None:
         """Make the demand the target, so that a mode that begins does not move."""

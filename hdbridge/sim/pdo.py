@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from operator import call
 from typing import Final
 
 from hdbridge.sim.dictionary import Abort, Dictionary, Entry, SdoAbortError
@@ -150,7 +151,7 @@ class TransmitPdo(Pdo):
 
     def pack(self) -> bytes:
         """The mapped values now."""
-        return self._codec.pack(*[read() for read in self._readers])
+        return self._codec.pack(*map(call, self._readers))
 
     def on_sync(self) -> bytes | None:
         """The data to send upon a SYNC, None when this one is not its turn."""
@@ -164,7 +165,7 @@ class TransmitPdo(Pdo):
         if self.syncs_to_go:
             return None
         self.syncs_to_go = self.transmission_type
-        return self._codec.pack(*[read() for read in self._readers])
+        return self._codec.pack(*map(call, self._readers))
 
     def on_event(self, now_s: float) -> bytes | None:
         """The data of an event-driven TPDO that is due: changed and not inhibited, or its timer ran out."""

@@ -22,6 +22,9 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = 0x0F
     FAULT = 0x08
 
+    # By identity: the hash that Enum has is computed in Python, which shows in every cycle.
+    __hash__ = object.__hash__
+
 
 class Command(Enum):
     """What a controlword asks for (device control commands)."""
