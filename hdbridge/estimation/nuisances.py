@@ -12,9 +12,10 @@ faster. Two speeds distinguish that from the orders' amplitudes; at one speed th
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.estimation.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, locked_counts
@@ -136,30 +137,25 @@ def nuisances_of(
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
     """Zeros and the nuisances named; ``waves`` as for `swing_columns`."""
+    parts: list[tuple[FloatArray, Sequence[str], ArrayLike]] = []
     count = design.samples.zeros
-    columns = [zeros(design)]
-    names = [f"zero {number}" for number in range(count)]
-    prior = [0.0] * count
+    parts.append((zeros(design), [f"zero {number}" for number in range(count)], [0.0] * count))
     if DELAY in nuisances:
-        columns.append(delay_column(design))
-        names.append(DELAY)
-        prior.append(0.0)
+        parts.append((delay_column(design), [DELAY], [0.0]))
     if ROUNDING in nuisances:
         column, sizes = rounding_columns(design)
-        columns.append(column)
-        names += [ROUNDING, *(f"{ROUNDING} {number}" for number in range(1, len(sizes)))]
-        prior += (sizes**-2.0).tolist()
+        numbered = [f"{ROUNDING} {number}" for number in range(1, len(sizes))]
+        parts.append((column, [ROUNDING, *numbered], sizes**-2.0))
     if TURNS in nuisances:
         column = turn_columns(design, effects)
-        columns.append(column)
-        names += [f"turn {number}" for number in range(column.shape[1])]
-        prior += [COUNTS**-2] * column.shape[1]
+        number = column.shape[1]
+        parts.append((column, [f"turn {each}" for each in range(number)], [COUNTS**-2] * number))
     if SWING in nuisances and waves:
         rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
-        columns.append(swing_columns(rate, waves, unit_s=1e-3))
-        names += [SWING, SWING_LAG]
-        prior += [SWING_MS2**-2, SWING_MS3**-2]
-    return Nuisances(np.concatenate(columns, axis=1), tuple(names), np.array(prior))
+        column = swing_columns(rate, waves, unit_s=1e-3)
+        parts.append((column, [SWING, SWING_LAG], [SWING_MS2**-2, SWING_MS3**-2]))
+    columns, names, prior = zip(*parts, strict=True)
+    return Nuisances(np.concatenate(columns, axis=1), tuple(chain(*names)), np.concatenate(prior))
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -130,79 +131,22 @@ def gather(
         )
     prepared = observed(record, ratio)
     record = prepared.record
-    count = len(record)
+    time, position, target = record.time_s, record.motor_position_deg, record.motor_target_deg
     for part in record.parts() if independent_zeros or prepared.cuts else (record,):
         part.check_ratio(ratio)
-    seen = _as_recorded(record, ratio, legs, independent_zeros)
-    full, motion = seen.full, seen.motion
-    remarks = list(prepared.remarks)
-    if not seen.commanded:
-        remarks.append("no command (motor_target_deg): the encoder's own counts drive the hysteresis")
-    still = motion.motor_speed_deg_s == 0.0 if motion.motor_speed_deg_s is not None else np.zeros(count, bool)
-    standstill = float(np.mean(still)) > 0.02 and int(np.sum(still)) > 50
-    if not standstill:
-        remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
-    if seen.reversals < 2:
-        remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
-    known = expected(motion) if expected is not None else 0.0
-    sigma = noise_arcsec(
-        full.error_arcsec - known,
-        still,
-        seen.motor_count_arcsec,
-        seen.load_count_arcsec,
-        seen.commanded,
-        record.starts,
-    )
-    seen = replace(
-        seen,
-        full=replace(full, sigma_arcsec=sigma),
-        standstill=standstill,
-        travel_deg=prepared.travel_deg(independent_zeros),
-        remarks=tuple(remarks),
-    )
-    return seen.over(_runs(count, record.starts))
-
-
-def _as_recorded(record: Record, ratio: float, legs: Sequence[Segment], independent: bool) -> Observed:
-    """Every sample as a point; its noise is not known yet."""
-    time = record.time_s
     steps = np.diff(time)
     period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
-    fresh = np.zeros(len(time), dtype=bool)
-    fresh[list(record.starts)] = True
     window = max(1, round(SPEED_WINDOW_S / period)) | 1
-    edges = [*record.starts, len(time)]
-    rows_of = [slice(first, last) for first, last in pairwise(edges)]
-    reading = _reading(record.motor_position_deg, rows_of)
-    count = reading.count_deg
-    target = record.motor_target_deg
-    if target is not None and np.ptp(target) <= 0.0 and np.ptp(record.motor_position_deg) > 4.0 * count:
+    rows_of = [slice(first, last) for first, last in pairwise([*record.starts, len(time)])]
+    reading = _reading(position, rows_of)
+    if target is not None and np.ptp(target) <= 0.0 and np.ptp(position) > 4.0 * reading.count_deg:
         target = None  # a command that never moves while the motor does is no command
     pieces = [
-        kinematics(
-            record.motor_position_deg[rows],
-            None if target is None else target[rows],
-            time[rows],
-            window,
-            reading,
-        )
+        kinematics(position[rows], None if target is None else target[rows], time[rows], window, reading)
         for rows in rows_of
     ]
     driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
     driving.setflags(write=False)  # so that where it reverses is worked out once
-    # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
-    angle = driving if target is not None else record.motor_position_deg
-    error = (record.load_position_deg - angle / ratio) * ARCSEC_PER_DEG
-    zero = np.cumsum(fresh) - 1 if independent else np.zeros(len(time), dtype=np.intp)
-    kind, leg, names = _kinds(time, speed, fresh, legs)
-    usable = np.ones(len(time), dtype=bool)
-    if legs:
-        fast = np.isin(kind, [i for i, each in enumerate(names) if each in FAST_KINDS]) & (speed != 0.0)
-        reach = round(SETTLE_S / period)
-        recent = np.convolve(fast.astype(np.float64), np.ones(reach + 1))[: len(fast)] > 0.5
-        usable = ~(fast | recent)
-        if np.mean(usable) < 0.2:
-            usable[:] = True
     motion = Motion(
         motor_deg=driving,
         time_s=time,
@@ -211,29 +155,58 @@ def _as_recorded(record: Record, ratio: float, legs: Sequence[Segment], independ
         motor_acceleration_deg_s2=acceleration,
         load_deg=driving / ratio,
     )
-    series = Series(
-        motion, error, np.ones(len(time)), usable, zero.astype(np.intp), leg.astype(np.intp), kind
+    part_of = np.repeat(np.arange(len(rows_of)), [rows.stop - rows.start for rows in rows_of])
+    kind, leg, names = _kinds(time, speed, part_of, legs)
+    # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
+    error = (record.load_position_deg - (position if target is None else driving) / ratio) * ARCSEC_PER_DEG
+    still = speed == 0.0
+    standstill = float(np.mean(still)) > 0.02 and int(np.sum(still)) > 50
+    turns = sum(reversals(each, reading.jitter_deg) for each, _, _ in pieces)
+    remarks = list(prepared.remarks)
+    if target is None:
+        remarks.append("no command (motor_target_deg): the encoder's own counts drive the hysteresis")
+    if not standstill:
+        remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
+    if turns < 2:
+        remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
+    counts = (
+        reading.resolution_deg / ratio * ARCSEC_PER_DEG,
+        quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
     )
+    known = expected(motion) if expected is not None else 0.0
+    sigma = noise_arcsec(error - known, still, *counts, target is not None, record.starts)
+    zero = part_of if independent_zeros else np.zeros_like(part_of)
+    fast_kind = np.isin(kind, [i for i, each in enumerate(names) if each in FAST_KINDS])
+    usable = _usable(still, fast_kind, round(SETTLE_S / period))
+    full = Series(motion, error, sigma, usable, zero, leg, kind)
+    runs = _runs(len(time), record.starts)
     return Observed(
         ratio=ratio,
-        points=series,
-        full=series,
-        runs=np.arange(len(time), dtype=np.intp),
+        points=_averaged(full, runs),
+        full=full,
+        runs=runs,
         kinds=names,
         zeros=int(zero[-1]) + 1,
         commanded=target is not None,
-        motor_count_arcsec=reading.resolution_deg / ratio * ARCSEC_PER_DEG,
-        load_count_arcsec=quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG,
+        motor_count_arcsec=counts[0],
+        load_count_arcsec=counts[1],
         period_s=period,
-        standstill=False,
-        reversals=sum(reversals(piece[0], reading.jitter_deg) for piece in pieces),
-        travel_deg=0.0,
-        remarks=(),
+        standstill=standstill,
+        reversals=turns,
+        travel_deg=prepared.travel_deg(independent_zeros),
+        remarks=tuple(remarks),
     )
 
 
+def _usable(still: BoolArray, fast_kind: BoolArray, reach: int) -> BoolArray:
+    """False in legs that only get somewhere, while they move and for so many samples after."""
+    fast = fast_kind & ~still
+    recent = np.convolve(fast, np.ones(reach + 1))[: len(fast)] > 0.5
+    return ~recent if np.mean(~recent) >= 0.2 else np.ones_like(still)
+
+
 def _kinds(
-    time: FloatArray, speed: FloatArray, fresh: BoolArray, legs: Sequence[Segment]
+    time: FloatArray, speed: FloatArray, part: IntArray, legs: Sequence[Segment]
 ) -> tuple[IntArray, IntArray, tuple[str, ...]]:
     """Kind and number of the leg of each sample; without legs by whether it stands, is slow or fast."""
     if legs:
@@ -249,8 +222,7 @@ def _kinds(
     moving = magnitude[magnitude > 0.0]
     border = float(np.median(moving)) if len(moving) else 1.0
     kind = np.where(magnitude == 0.0, 0, np.where(magnitude <= border, 1, 2)).astype(np.intp)
-    leg = np.cumsum(fresh) + 0
-    return kind, leg, ("standing", "slow", "fast")
+    return kind, part + 1, ("standing", "slow", "fast")
 
 
 def _reading(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
@@ -292,19 +264,19 @@ def _averaged(full: Series, runs: IntArray) -> Series:
     size = np.diff(np.append(runs, len(full)))
     middle = runs + size // 2
 
-    def mean(values: FloatArray) -> FloatArray:
-        return means(values, runs)
+    def mean(values: FloatArray | None) -> Any:
+        return None if values is None else means(values, runs)
 
     motion = full.motion
-    channels = {
-        name: None if (value := getattr(motion, name)) is None else mean(value)
-        for name in (
-            "motor_deg", "time_s", "motor_speed_deg_s", "motor_acceleration_deg_s2", "load_deg",
-        )
-    }  # fmt: skip
-    measured = {channel: mean(values) for channel, values in motion.measured.items()}
     return Series(
-        Motion(**channels, measured=measured),  # type: ignore[arg-type]
+        Motion(
+            motor_deg=mean(motion.motor_deg),
+            time_s=mean(motion.time_s),
+            measured={channel: mean(values) for channel, values in motion.measured.items()},
+            motor_speed_deg_s=mean(motion.motor_speed_deg_s),
+            motor_acceleration_deg_s2=mean(motion.motor_acceleration_deg_s2),
+            load_deg=mean(motion.load_deg),
+        ),
         mean(full.error_arcsec),
         np.sqrt(mean(full.sigma_arcsec**2) / size),
         mean(full.usable.astype(np.float64)) > 0.999,

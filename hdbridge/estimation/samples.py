@@ -134,22 +134,24 @@ def gather(
         if numbers[index] != numbers[index - 1] or not follows(segments[index - 1], segments[index])
     ]
     begins = sorted({0, *cuts, *(index for index, each in enumerate(segments) if each.start is not None)})
-    sizes = np.cumsum([0, *(len(each) for each in segments)]).tolist()
-    chains: list[Chain] = []
-    driving: list[FloatArray] = []
-    for first, last in pairwise([*begins, len(segments)]):
-        known = segments[first].start
-        driving.append(_driving(segments[first:last]))
-        rows = slice(sizes[first], sizes[last])
-        chains.append(Chain(rows, start if known is None and first == 0 else known))
+    edges = np.cumsum([0, *map(len, segments)]).tolist()
+    spans = [*pairwise([*begins, len(segments)])]
+    starts = [segments[first].start for first in begins]
+    starts[0] = start if starts[0] is None else starts[0]
+    chains = [
+        Chain(slice(edges[first], edges[last]), known)
+        for (first, last), known in zip(spans, starts, strict=True)
+    ]
+    driving = np.concatenate([_driving(segments[first:last]) for first, last in spans])
     time = np.concatenate([each.time_s for each in segments])
     measured = np.concatenate([_measured(each) for each in segments])
     load = np.concatenate([each.load_deg for each in segments])
-    kind = np.repeat([KINDS.index(each.kind) for each in segments], [len(each) for each in segments])
-    both = [(time[each.rows], angle) for each, angle in zip(chains, driving, strict=True)]
-    speed = np.concatenate([_rate(*each) for each in both])
-    turned = np.concatenate([_has_turned(*each) for each in both])
-    zero = np.repeat([names[number] for number in numbers], [len(each) for each in segments])
+    kind, zero = (
+        np.repeat(each, np.diff(edges))
+        for each in ([KINDS.index(each.kind) for each in segments], [names[number] for number in numbers])
+    )
+    speed = np.concatenate([_rate(time[each.rows], driving[each.rows]) for each in chains])
+    turned = np.concatenate([_has_turned(time[each.rows], driving[each.rows]) for each in chains])
     if not ratio > 0:
         raise InputError(f"{segments[0].name}: the ratio is {ratio:g}; expected more than 0")
     first = zero == zero[0]
@@ -160,7 +162,7 @@ def gather(
         error[zero == index] -= np.median(error[zero == index])
     return Samples(
         ratio=ratio,
-        motion=Motion(np.concatenate(driving), time, measured_by_all([each.measured for each in segments])),
+        motion=Motion(driving, time, measured_by_all([each.measured for each in segments])),
         load_deg=load,
         error_arcsec=error * ARCSEC_PER_DEG,
         speed_deg_s=speed,
@@ -170,7 +172,7 @@ def gather(
         zeros=len(names),
         count_deg=max(quantum_deg(_measured(each)) for each in segments),
         chains=tuple(chains),
-        travel_deg=max(float(np.ptp(each)) for each in np.split(measured, [sizes[index] for index in cuts])),
+        travel_deg=max(float(np.ptp(each)) for each in np.split(measured, [edges[index] for index in cuts])),
     )
 
 
@@ -218,12 +220,11 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
     under_way = moving > STANDING_DEG_S
     fast = under_way & np.isin(kind, [KINDS.index(each) for each in ON_THE_WAY])
     fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(_rate(time, load_speed)) > GENTLE_DEG_S2)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], under_way, [False]]).astype(np.int8)))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        # Motions that follow one another without a rest are distinguished by their kind and direction.
-        other = (np.diff(kind[begin:end]) != 0) | (np.diff(np.sign(load_speed[begin:end])) != 0)
-        for part in np.split(np.arange(begin, end), np.flatnonzero(other) + 1):
-            fast[part] |= bool(np.max(moving[part]) > slow_deg_s)
+    # Motions that follow one another without a rest are distinguished by their kind and direction.
+    changes = [np.diff(each) != 0 for each in (under_way, kind, np.sign(load_speed))]
+    first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
+    fastest = np.repeat(np.maximum.reduceat(moving, first), np.diff(np.append(first, len(time))))
+    fast |= under_way & (fastest > slow_deg_s)
     last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
     return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))
 

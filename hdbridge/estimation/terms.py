@@ -94,10 +94,6 @@ class Nuisances:
         return Nuisances(self.columns[index], self.names, self.prior)
 
 
-def _either(_: Effect) -> float:
-    return 0.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
     """What is fitted to what; arrays of m rows."""
@@ -110,7 +106,7 @@ class Terms:
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
     """By place of the effect, and number of the coefficient or name of the shape."""
-    sign: Callable[[Effect], float] = _either
+    sign: Callable[[Effect], float] = lambda _: 0.0
     """The sign that an effect's coefficients have; 0 where they may have either."""
     moves: frozenset[Moves] = LOCAL
     """Shapes that are moved; the others stay as they are."""

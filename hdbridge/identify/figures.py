@@ -56,26 +56,22 @@ def laps_arcsec(samples: Samples) -> float | None:
     sweep = samples.usable & (samples.kind == KINDS.index(Kind.SWEEP))
     for chain in samples.chains:
         turning, signs = branches(samples.motor_deg[chain.rows])
-        for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
-            rows = np.arange(chain.rows.start + first + 1, chain.rows.start + last + 1)
+        for (first, last), sign in zip(pairwise(turning), signs, strict=True):
+            rows = chain.rows.start + 1 + np.arange(first, last)
             rows = rows[sweep[rows]]
-            if len(rows) < 20:
-                continue
-            cells = np.floor(samples.motor_deg[rows] / LAP_BIN_DEG).astype(np.int64)
-            names, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
-            means = np.bincount(inverse, samples.error_arcsec[rows]) / counts
-            # The first cells of a pass are on the travel across the hysteresis.
-            keep = slice(5, None) if sign > 0 else slice(None, -5)
-            passes[sign].append(dict(zip(names[keep].tolist(), means[keep].tolist(), strict=True)))
+            if len(rows) >= 20:
+                cells, inverse = np.unique(samples.motor_deg[rows] // LAP_BIN_DEG, return_inverse=True)
+                means = np.bincount(inverse, samples.error_arcsec[rows]) / np.bincount(inverse)
+                # The first cells of a pass are on the travel across the hysteresis.
+                keep = slice(5, None) if sign > 0 else slice(None, -5)
+                passes[sign].append(dict(zip(cells[keep].tolist(), means[keep].tolist(), strict=True)))
     differences = [
         earlier[cell] - later[cell]
         for each in passes.values()
         for earlier, later in pairwise(each)
         for cell in earlier.keys() & later.keys()
     ]
-    if len(differences) < 8:
-        return None
-    return float(np.sqrt(np.mean(np.square(differences)) / 2.0))
+    return float(np.sqrt(np.mean(np.square(differences)) / 2.0)) if len(differences) >= 8 else None
 
 
 def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArray, Outliers]:
