@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out, held_out_change
+from hdbridge.diagnose.lookalikes import together
 from hdbridge.diagnose.parameters import parameters_of, polar
 from hdbridge.diagnose.result import UNWEIGHED, Finding, Parameter
 from hdbridge.diagnose.search import Search, Trail
@@ -134,7 +134,7 @@ def _orders(
         return None
     all_of_it = now.fitted(now.coefficients() - given.coefficients())
     seen = 0.5 * float(np.ptp(estimator.does(all_of_it, fitted.hypothesis.start)))
-    was, is_now = (reduce(_both, each) for each in zip(*changed, strict=True))
+    was, is_now = (together(each) for each in zip(*changed, strict=True))
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
     if not causes or difference.largest_piece_arcsec() > scales.extrapolated * seen:
@@ -214,9 +214,3 @@ def causes_of(given: Effect, now: Effect) -> list[Effect]:
     """The causes that can have made one of the other, those that say more of it first."""
     found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
     return sorted(found, key=lambda each: each.changes is None)
-
-
-def _both(piece: Effect, other: Effect) -> Effect:
-    both = piece.joined(other)
-    assert both is not None, "pieces of one effect join"
-    return both

@@ -143,7 +143,7 @@ class _Judge:
         fitted = eliminated(estimator, self.trail.fitted, base, self._stopped, self.considered)
         fitted = eliminated(estimator, fitted, base, self._shadow, self.considered)
         fitted = plausible_only(self.search, fitted)
-        fitted = with_measured(estimator, fitted, base)
+        fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
         fitted, findings = judged.fitted, judged.findings

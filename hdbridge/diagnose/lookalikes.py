@@ -10,83 +10,71 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.diagnose.search import Search
-from hdbridge.effects import CATALOGUE, Effect, Part, Start, aliases_of, unmet
+from hdbridge.effects import CATALOGUE, Effect, Part, Start, aliases_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import orthonormal
+from hdbridge.estimation.screening import proposed
 
 
 def plausible_only(search: Search, fitted: Fitted) -> Fitted:
-    """With the best look-alike in the place of what is refused as it has come out, or with nothing."""
-    estimator = search.estimator
-    base = fitted.hypothesis.effects[: search.base]
-    for place in range(search.base, len(fitted.hypothesis.effects)):
-        effect = fitted.hypothesis.effects[place]
-        reason = effect.implausible(estimator.data) or effect.unidentifiable(estimator.data)
-        if not reason:
-            continue
-        search.refusals[effect.name] = reason
-        without = estimator.fit(fitted.hypothesis.without(place))
-        present = {each.name for each in without.hypothesis.effects}
-        trials = [
-            estimator.fit(fitted.hypothesis.instead(place, each))
-            for name in aliases_of(effect.name)
-            if name not in present and CATALOGUE[name].changes is None and CATALOGUE[name].sought is None
-            for each in CATALOGUE[name].proposals(estimator.data, base)
-            if not unmet([each], estimator.motion.available())
-        ]
-        fine = [
-            each
-            for each in trials
-            if not search.refusal(each.hypothesis.effects[place])
-            and search.peak(each, place) >= search.scales.floor_arcsec
-        ]
-        best = min(fine, key=search.cost, default=without)
-        return plausible_only(
-            search, best if search.cost(best) + search.scales.enter < search.cost(without) else without
-        )
+    """With the best addition in the place of what is refused as it has come out, or with nothing."""
+    data = search.estimator.data
+    gone: set[str] = set()
+    for _ in range(len(CATALOGUE)):
+        reasons = {
+            place: reason
+            for place, each in enumerate(fitted.hypothesis.effects)
+            if place >= search.base and (reason := each.implausible(data) or each.unidentifiable(data))
+        }
+        if not reasons:
+            break
+        place = min(reasons)
+        name = fitted.hypothesis.effects[place].name
+        search.refusals[name] = reasons[place]
+        gone.add(name)
+        without = search.estimator.fit(fitted.hypothesis.without(place))
+        fitted = search.best_of_others(without, gone) or without
     return fitted
 
 
-def with_measured(estimator: Estimator, fitted: Fitted, base: int) -> Fitted:
+def with_measured(search: Search, fitted: Fitted) -> Fitted:
     """What looks like a measured channel's effect, and follows the channel, is that effect.
 
     A wave takes any phase, a wind-up only that of the torque: where it does as well but for what the noise of
     the channel takes from it, the wave would be a coincidence. Together the wave makes up for that noise, and
     takes most of what is the other's.
     """
-    effects, scales = fitted.hypothesis.effects, estimator.scales
-    for place in range(base, len(effects)):
-        for kind, piece in lookalikes(effects[place], estimator.data.ratio):
-            others = [each for each in effects[place].pieces() if each != piece]
-            rest = None
-            for each in others:
-                rest = each if rest is None else rest.joined(each)
-            hypothesis = fitted.hypothesis
-            without = hypothesis.without(place) if rest is None else hypothesis.instead(place, rest)
-            present = [i for i, each in enumerate(without.effects) if i >= base and type(each) is kind]
-            if present:
-                trial = estimator.fit(without)
-            else:
-                proposed = [
-                    each
-                    for each in kind.proposals(estimator.data, effects[:base])
-                    if not unmet([each], estimator.motion.available())
-                ]
-                if not proposed:
-                    continue
+    estimator, scales, base = search.estimator, search.scales, search.base
+    hypothesis = fitted.hypothesis
+    for place, effect in enumerate(hypothesis.effects[base:], base):
+        for kind, piece in lookalikes(effect, estimator.data.ratio):
+            others = [each for each in effect.pieces() if each != piece]
+            without = hypothesis.instead(place, together(others)) if others else hypothesis.without(place)
+            tried = [without]
+            if not any(type(each) is kind for each in without.effects[base:]):
                 # Each of its shapes: a spring that bends is not what a straight one leaves.
-                trials = [estimator.fit(without.plus(each)) for each in proposed]
-                fine = [each for each in trials if not each.hypothesis.effects[-1].violations()]
-                trial = min(fine or trials, key=lambda each: each.chi_square + scales.penalty * each.free())
-            worse = trial.chi_square - fitted.chi_square
-            driven = [each for each in trial.hypothesis.effects if type(each) is kind]
-            if any(each.violations() for each in driven):
-                continue
-            start = trial.hypothesis.start
-            lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
-            if worse < scales.enter + scales.noisy * float(lost):
-                return trial
+                own = proposed(kind, estimator.data, hypothesis.effects[:base])
+                tried = [without.plus(each) for each in own]
+            for trial in sorted((estimator.fit(each) for each in tried), key=search.cost):
+                driven = [each for each in trial.hypothesis.effects if type(each) is kind]
+                if any(each.violations() for each in driven):
+                    continue
+                start = trial.hypothesis.start
+                lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
+                if trial.chi_square - fitted.chi_square < scales.enter + scales.noisy * float(lost):
+                    return trial
+                break
     return fitted
+
+
+def together(pieces: Sequence[Effect]) -> Effect:
+    """One effect of several pieces of it."""
+    whole = pieces[0]
+    for each in pieces[1:]:
+        both = whole.joined(each)
+        assert both is not None, "pieces of one effect join"
+        whole = both
+    return whole
 
 
 def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
@@ -114,8 +102,8 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
     angle = effects[0].coordinate(data.motion, data.ratio).name
     for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
-        proposed = [] if kind is None else [*kind.proposals(data, ())]
-        near = [each for each in proposed if each.waves() and each.part is not Part.LOOP]
+        own = [] if kind is None else [*kind.proposals(data, ())]
+        near = [each for each in own if each.waves() and each.part is not Part.LOOP]
         if not near:
             continue
         if near[0].coordinate(data.motion, data.ratio).name == angle:

@@ -49,15 +49,11 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
     waves = [wave for each in fitted.hypothesis.effects for wave in each.waves()]
-    if speed is None or not waves or not _speeds_differ(estimator):
+    slow = estimator.motion.motor_speed_deg_s
+    moving = np.empty(0) if slow is None else slow[estimator.index]
+    moving = moving[moving != 0.0]
+    if speed is None or not waves or not speeds_differ(moving, np.ones(len(moving))):
         return np.empty((len(estimator.index), 0))
     angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
     both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
     return estimator.at_points(swing_columns(RAD_PER_DEG * speed, both, UNIT_S))
-
-
-def _speeds_differ(estimator: Estimator) -> bool:
-    speed = estimator.motion.motor_speed_deg_s
-    moving = np.empty(0) if speed is None else speed[estimator.index]
-    moving = moving[moving != 0.0]
-    return speeds_differ(moving, np.ones(len(moving)))

@@ -7,7 +7,8 @@ the first picks. What was picked is looked at again in `backward.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +49,7 @@ class Search:
         self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
         """Causes that were refused though the evidence spoke for them, with the reason in words."""
-        self._left_out: str | None = None
+        self._left_out: frozenset[str] = frozenset()
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
@@ -83,11 +84,8 @@ class Search:
             return trail
         nuisance = self.estimator.nuisance
         self.estimator.nuisance = nuisance[:, :0]
-        self._left_out = names[0]
-        self.forget()
-        other = self._greedily()
-        self._left_out = None
-        self.forget()
+        with self._leaving_out({names[0]}):
+            other = self._greedily()
         if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
             return other
         self.estimator.nuisance = nuisance
@@ -167,6 +165,19 @@ class Search:
                 best = (net, trial)
         return None if best is None else best[1]
 
+    def best_of_others(self, fitted: Fitted, causes: Set[str]) -> Fitted | None:
+        """With the best cause more that is none of these."""
+        with self._leaving_out(causes):
+            return self.best_addition(fitted)
+
+    @contextmanager
+    def _leaving_out(self, causes: Set[str]) -> Iterator[None]:
+        self._left_out = frozenset(causes)
+        self.forget()
+        yield
+        self._left_out = frozenset()
+        self.forget()
+
     def _restated(self, trial: Fitted, cause: str) -> Fitted:
         """What was added by another of its conventions, where it makes no sense by the one it has."""
         place = _last(trial, cause)
@@ -243,7 +254,7 @@ class Search:
             for each in self._scores(fitted)
             if _key(each) not in self._refused
             and each.candidate.cause not in present
-            and each.candidate.cause != self._left_out
+            and each.candidate.cause not in self._left_out
             and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.diagnose.lookalikes import lookalikes
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, aliases_of, unmet
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, aliases_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import seen_directions
+from hdbridge.estimation.screening import proposed
 
 
 class Confounded(NamedTuple):
@@ -71,25 +72,21 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
     the channel's noise in their squares.
     """
     effect, ratio = fitted.hypothesis.effects[place], estimator.data.ratio
-    start, available = fitted.hypothesis.start, estimator.motion.available()
-
-    def columns(one: Effect, typical_arcsec: float) -> FloatArray:
-        values = estimator.columns(one, start)
-        values = values[:, np.ptp(values, axis=0) > 0.0]
-        return estimator.weighted(
-            values * (typical_arcsec / np.maximum(np.max(np.abs(values), axis=0), 1e-9))
-        )
-
-    def noise(one: Effect) -> float:
-        square = float(np.sum(estimator.weighted(estimator.columns(one, start)) ** 2))
-        return float(np.sum(estimator.channel_noise(one, start))) / max(square, 1e-300)
-
-    for kind, piece in lookalikes(effect, ratio):
-        proposed = [each for each in kind.proposals(estimator.data, ()) if not unmet([each], available)]
-        if proposed:
-            typical = type(piece).candidate(ratio).largest_piece_arcsec()
-            yield proposed[0], columns(proposed[0], typical), noise(proposed[0])
+    start = fitted.hypothesis.start
+    pairs = [
+        (each, type(piece), each)
+        for kind, piece in lookalikes(effect, ratio)
+        for each in proposed(kind, estimator.data)[:1]
+    ]
     look = effect.unmeasured(ratio)
     if look is not None and look.name in aliases_of(effect.name) and look.name in CATALOGUE:
-        typical = type(look).candidate(ratio).largest_piece_arcsec()
-        yield look, columns(look, typical), noise(effect)
+        pairs.append((look, type(look), effect))
+    for other, wave, driven in pairs:
+        columns = estimator.columns(other, start)
+        columns = columns[:, np.ptp(columns, axis=0) > 0.0]
+        typical = wave.candidate(ratio).largest_piece_arcsec() / np.maximum(
+            np.max(np.abs(columns), axis=0), 1e-9
+        )
+        square = float(np.sum(estimator.weighted(estimator.columns(driven, start)) ** 2))
+        noise = float(np.sum(estimator.channel_noise(driven, start))) / max(square, 1e-300)
+        yield other, estimator.weighted(columns * typical), noise

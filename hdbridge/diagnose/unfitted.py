@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from hdbridge.effects import CATALOGUE, Effect, Part, Start
+from hdbridge.effects import Effect, Part
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 
 MOST = 0.5
@@ -19,27 +17,13 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     """
     if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""
-    sign, estimator.loop_sign = estimator.loop_sign, 0.0  # it may lead or lag
     plain = estimator.fit(Hypothesis(effects))
-    loops = [
-        each
-        for kind in CATALOGUE.values()
-        if kind.part is Part.LOOP
-        for each in kind.proposals(estimator.data, effects)
-    ]
-    fits = [
-        estimator.fit(replace(plain.hypothesis, start=start).plus(loop))
-        for loop in loops
-        for start in (Start.FORWARD, Start.BACKWARD)
-    ]
-    estimator.loop_sign = sign
-    best = min(fits, key=lambda each: each.chi_square)
-    share = 1.0 - best.chi_square / max(plain.chi_square, 1e-300)
+    searched, estimator.nuisance = estimator.nuisance, estimator.free_loop(plain.hypothesis.start)
+    share = 1.0 - estimator.fit(plain.hypothesis).chi_square / max(plain.chi_square, 1e-300)
+    estimator.nuisance = searched
     if share < MOST:
         return ""
-    offset = best.hypothesis.effects[-1].bound_arcsec()
     return (
-        f"the model has no elastic loop, and one of {offset:.3g} arcsec to either side makes up "
-        f"{100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), then "
-        "diagnose"
+        f"the model has no elastic loop, and one makes up {100.0 * share:.0f} % of the squares that it "
+        "leaves: fit a model first (hdbridge fit), then diagnose"
     )

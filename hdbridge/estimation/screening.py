@@ -33,12 +33,16 @@ def candidates(observations: Observations, base: Sequence[Effect], screened: boo
 
     To be ``screened`` are those that would be an addition to the model, and that a grid covers; else all.
     """
-    available = observations.motion.available()
     kinds = [CATALOGUE[each] for each in causes()]
     if screened:
         kinds = [each for each in kinds if each.changes is None and each.sought is None]
-    found = [each for kind in kinds for each in kind.proposals(observations, base)]
-    return [Candidate(each.name, each) for each in found if not unmet([each], available)]
+    return [Candidate(kind.name, each) for kind in kinds for each in proposed(kind, observations, base)]
+
+
+def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
+    """What a kind proposes for a record and the model ``base``, where its channels are there."""
+    available = observations.motion.available()
+    return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
 
 
 @dataclass(frozen=True, slots=True)
