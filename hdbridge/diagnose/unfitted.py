@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from hdbridge.effects import Effect, Part
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 
@@ -19,11 +21,14 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
         return ""
     plain = estimator.fit(Hypothesis(effects))
     searched, estimator.nuisance = estimator.nuisance, estimator.free_loop(plain.hypothesis.start)
-    share = 1.0 - estimator.fit(plain.hypothesis).chi_square / max(plain.chi_square, 1e-300)
+    loose = estimator.fit(plain.hypothesis)
     estimator.nuisance = searched
+    share = 1.0 - loose.chi_square / max(plain.chi_square, 1e-300)
     if share < MOST:
         return ""
+    low, high = np.quantile((plain.residual - loose.residual) / estimator.weight, [0.002, 0.998])
     return (
-        f"the model has no elastic loop, and one makes up {100.0 * share:.0f} % of the squares that it "
-        "leaves: fit a model first (hdbridge fit), then diagnose"
+        f"the model has no elastic loop, and one of {0.5 * (high - low):.3g} arcsec to either side makes up "
+        f"{100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), then "
+        "diagnose"
     )
