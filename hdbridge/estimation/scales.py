@@ -11,8 +11,6 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-BLIND = "blind suites of simulated axes"
-"""Chosen so that wrong names became rare there without a right one being lost."""
 FITTED = "tools/fit_probabilities.py"
 
 
@@ -42,7 +40,6 @@ class Scales:
     # Looking again.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
-    slow: float = _scale(0.8, "share of a large rest that one more than few may leave", math.inf, BLIND)
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
@@ -73,7 +70,6 @@ class Scales:
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
-    foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
 
     # What is left.
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
@@ -82,8 +78,7 @@ class Scales:
         0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
     )
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
-    near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
-    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
+    near: float = _scale(0.5, "share of the largest piece", math.inf, "within 6 dB of each other")
     foretold: float = _scale(
         0.3,
         "share of the square of what is left",
@@ -102,7 +97,7 @@ class Scales:
         12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
     )
     surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
-    named_from: float = _scale(0.3, "probability", 0.0, "below it one name in eleven was right: " + BLIND)
+    named_from: float = _scale(0.5, "probability", 0.0, "more likely there than not")
     one_way: float = _scale(
         0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
     )
