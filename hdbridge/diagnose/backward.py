@@ -1,9 +1,4 @@
-"""Second thoughts on what a search has picked: swap and prune.
-
-A swap takes each finding out and puts the best one in its place, which cures most wrong first picks. What
-remembers the path is fitted anew from each of its shapes. Pruning takes out what no longer earns its keep
-among the others.
-"""
+"""Backward elimination: what no longer earns its keep among the others goes, one after the other."""
 
 from __future__ import annotations
 
@@ -14,53 +9,8 @@ from hdbridge.diagnose.search import Search, Trail
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 
-def reconsidered(search: Search, trail: Trail) -> Trail:
-    """What is left of a trail, and what stands in for the rest."""
-    fitted = trail.fitted
-    if len(fitted.hypothesis.effects) - search.base <= search.scales.few:
-        fitted = _swapped(search, fitted)
-    fitted = _pruned(search, _loops_anew(search, fitted))
-    fitted, law_gain = search.with_best_law(fitted)
-    return replace(trail, fitted=fitted, law_gain=law_gain)
-
-
-def _swapped(search: Search, fitted: Fitted) -> Fitted:
-    """Each finding taken out, the law chosen anew, the best one put in its place."""
-    for _ in range(2):
-        changed = False
-        for place in range(search.base, len(fitted.hypothesis.effects)):
-            search.forget()
-            without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
-            most = search.cost(fitted)
-            other = search.best_addition(without, most)
-            if other is not None and search.cost(other) < most:
-                fitted, changed = other, True
-                break
-        if not changed:
-            break
-    search.forget()
-    return fitted
-
-
-def _loops_anew(search: Search, fitted: Fitted) -> Fitted:
-    """With what remembers the path fitted anew from each proposal.
-
-    From a wide one it ends as part of the loop that the model has.
-    """
-    base = fitted.hypothesis.effects[: search.base]
-    for place in range(search.base, len(fitted.hypothesis.effects)):
-        effect = fitted.hypothesis.effects[place]
-        if effect.tracker().memory_deg > 0.0 and effect.shape:
-            trials = [
-                search.estimator.fit(fitted.hypothesis.instead(place, each))
-                for each in type(effect).proposals(search.estimator.data, base)
-            ]
-            fitted = min((fitted, *trials), key=search.cost)
-    return fitted
-
-
-def _pruned(search: Search, fitted: Fitted) -> Fitted:
-    """Without what no longer earns its keep among the others."""
+def pruned(search: Search, trail: Trail) -> Trail:
+    """What is left of a trail."""
 
     def least(fitted: Fitted) -> tuple[int, str] | None:
         effects = fitted.hypothesis.effects
@@ -71,9 +21,7 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         toll = {
             each: search.scales.penalty * len(fitted.places(each)) + search.scales.enter for each in gains
         }
-        place = min(gains, key=lambda each: gains[each] - toll[each], default=-1)
-        if place < 0:
-            return None
+        place = min(gains, key=lambda each: gains[each] - toll[each])
         small = search.peak(fitted, place) < search.scales.floor_arcsec
         # What the law of a large one gets wrong looks like a small one of its kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
@@ -81,7 +29,9 @@ def _pruned(search: Search, fitted: Fitted) -> Fitted:
         needed = max(toll[place], search.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
-    return eliminated(search.estimator, fitted, search.base, least, [])
+    fitted = eliminated(search.estimator, trail.fitted, search.base, least, [])
+    fitted, law_gain = search.with_best_law(fitted)
+    return replace(trail, fitted=fitted, law_gain=law_gain)
 
 
 def eliminated(

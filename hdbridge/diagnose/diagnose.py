@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.diagnose import changes
 from hdbridge.diagnose.acceptance import gate
-from hdbridge.diagnose.backward import eliminated, reconsidered
+from hdbridge.diagnose.backward import eliminated, pruned
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.holdout import held_out
@@ -101,7 +101,7 @@ def diagnose(
     data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
     estimator.data = data
     progress("searching for causes")
-    trail = reconsidered(search, search.run())
+    trail = pruned(search, search.run())
     progress("judging what was found")
     found = _Judge(estimator, search, trail, model, bool(first)).diagnosis()
     return replace(found, remarks=(*remarks, *found.remarks))

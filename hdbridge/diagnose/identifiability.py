@@ -33,7 +33,7 @@ def identifiability(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> dict[str, Identifiability]:
     """For each cause of the catalogue."""
-    left: dict[str, list[tuple[FloatArray, float, float, Effect]]] = {}
+    best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
     stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
     basis = orthonormal(fitted.basis[::stride])
@@ -46,18 +46,17 @@ def identifiability(
             continue
         unit = weight * columns[:, seen] / (0.5 * span[seen])  # one arcsec at its peak
         rest = unit - basis @ (basis.T @ unit)
-        share = float(np.max(np.sum(rest**2, axis=0) / np.sum(unit**2, axis=0)))
-        size = float(np.sqrt(stride * np.max(np.sum(rest**2, axis=0))))
-        left.setdefault(candidate.cause, []).append((rest, share, size, candidate.effect))
-    names = list(left)
-    best = {name: max(left[name], key=lambda each: each[2]) for name in names}
-    spans = {name: orthonormal(best[name][0]) for name in names}
+        squares = np.sum(rest**2, axis=0)
+        size, share = np.sqrt(stride * np.max(squares)), np.max(squares / np.sum(unit**2, axis=0))
+        if candidate.cause not in best or size > best[candidate.cause][0]:
+            best[candidate.cause] = float(size), float(share), rest, candidate.effect
+    spans = {name: orthonormal(rest) for name, (_, _, rest, _) in best.items()}
     result: dict[str, Identifiability] = {}
     for cause in causes():
         if cause not in best:
             result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
             continue
-        rest, share, size, example = best[cause]
+        size, share, rest, example = best[cause]
         if share < SHARE_LEFT or size <= 0.0:
             result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
             continue
@@ -69,7 +68,7 @@ def identifiability(
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
         alike = [
             name
-            for name in names
+            for name in best
             if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)

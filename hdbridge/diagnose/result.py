@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from hdbridge.diagnose.acceptance import Gate
@@ -30,7 +30,7 @@ class Figures:
 
     def as_dict(self) -> dict[str, float]:
         """For machines."""
-        return {"rms_arcsec": _round(self.rms_arcsec), "three_sigma_arcsec": _round(self.three_sigma_arcsec)}
+        return {name: _round(each) for name, each in asdict(self).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,25 +86,20 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """For machines."""
-        data: dict[str, Any] = {
+        gain = self.gain
+        words = {"lives_in": self.lives_in, "note": self.note, "not_offered": self.refusal()}
+        return {
             "cause": self.cause,
             "probability": round(self.probability, 3),
             "aliases": list(self.aliases),
             "parameters": {name: each.as_dict() for name, each in self.parameters.items()},
             "gain": {
-                "held_out_rms_before_arcsec": _round(self.gain.before_arcsec) if self.gain else None,
-                "held_out_rms_after_arcsec": _round(self.gain.after_arcsec) if self.gain else None,
+                "held_out_rms_before_arcsec": None if gain is None else _round(gain.before_arcsec),
+                "held_out_rms_after_arcsec": None if gain is None else _round(gain.after_arcsec),
             },
             "experiment": self.experiment,
             "peak_arcsec": _round(self.peak_arcsec),
-        }
-        if self.lives_in:
-            data["lives_in"] = self.lives_in
-        if self.note:
-            data["note"] = self.note
-        if refused := self.refusal():
-            data["not_offered"] = refused
-        return data
+        } | {name: each for name, each in words.items() if each}
 
     @property
     def within(self) -> bool:
@@ -147,12 +142,12 @@ class Identifiability:
         """For machines."""
         limit = self.detection_limit_arcsec
         data: dict[str, Any] = {
-            "detectable": self.detectable,
+            **asdict(self),
             "detection_limit_arcsec": None if limit is None else _round(limit),
             "aliases": list(self.aliases),
             "share_left": float(f"{self.share_left:.3g}"),
         }
-        return data | ({"reason": self.reason} if self.reason else {})
+        return {name: each for name, each in data.items() if name != "reason" or each}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

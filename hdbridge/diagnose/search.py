@@ -31,8 +31,6 @@ class Trail:
     """Where a search ended."""
 
     fitted: Fitted
-    base: int
-    """How many of the hypothesis's effects are the baseline's."""
     law_gain: float
     """Chi square by which the chosen elastic law is better than the other; 0 without one."""
 
@@ -44,6 +42,7 @@ class Search:
         self.estimator = estimator
         self.scales = estimator.scales
         self.base = len(base)
+        """How many effects of each hypothesis are the baseline's."""
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self._refused: set[object] = set()
@@ -107,7 +106,7 @@ class Search:
                 break  # piece by piece at something that is none of them
             if number < ANEW:
                 fitted, law_gain = self.with_best_law(fitted)
-        return Trail(fitted, self.base, law_gain)
+        return Trail(fitted, law_gain)
 
     def _begin(self) -> Fitted:
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
