@@ -97,7 +97,7 @@ class Scales:
         12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
     )
     surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
-    named_from: float = _scale(0.5, "probability", 0.0, "more likely there than not")
+    named_from: float = _scale(0.3, "probability", 0.0, "of the names below it one in eleven was right")
     one_way: float = _scale(
         0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
     )
