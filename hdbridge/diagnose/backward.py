@@ -1,4 +1,6 @@
-"""Backward elimination: what no longer earns its keep among the others goes, one after the other."""
+"""Second looks at what a search has picked: each finding is taken out, and the best one put in its place, which
+cures most wrong first picks; and what no longer earns its keep among the others goes.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,24 @@ def pruned(search: Search, trail: Trail) -> Trail:
         needed = max(toll[place], search.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
-    fitted = eliminated(search.estimator, trail.fitted, search.base, least, [])
+    fitted = trail.fitted
+    if len(fitted.hypothesis.effects) - search.base <= search.scales.few:
+        fitted = _swapped(search, fitted)
+    fitted = eliminated(search.estimator, fitted, search.base, least, [])
     fitted, law_gain = search.with_best_law(fitted)
     return replace(trail, fitted=fitted, law_gain=law_gain)
+
+
+def _swapped(search: Search, fitted: Fitted) -> Fitted:
+    """With the best one in the place of each finding that is taken out, and the law chosen anew."""
+    for place in range(search.base, len(fitted.hypothesis.effects)):
+        without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
+        search.forget()
+        other = search.best_addition(without, search.cost(fitted))
+        if other is not None and search.cost(other) < search.cost(fitted):
+            fitted = other
+    search.forget()
+    return fitted
 
 
 def eliminated(
