@@ -1,5 +1,7 @@
-"""Second looks at what a search has picked: each finding is taken out, and the best one put in its place, which
-cures most wrong first picks; and what no longer earns its keep among the others goes.
+"""Second looks at what a search has picked: swap and prune.
+
+Each finding is taken out, and the best one put in its place, which cures most wrong first picks. What no
+longer earns its keep among the others goes.
 """
 
 from __future__ import annotations

@@ -142,8 +142,7 @@ def tones(
 ) -> Iterator[tuple[float]]:
     """Frequencies (Hz) of the highest lines over absolute time, apart from the feet of those ``present``.
 
-    A line that swells and fades, no faster than the axis turns round, has feet, and is one source all the
-    same.
+    A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
     """
     data = estimator.data
     time_s = data.full.time_s
@@ -162,7 +161,7 @@ def tones(
     lobe = max(4, size // length * 4)
     for each in present:
         own_hz = shape_value(each, each.shape[0].name)
-        power[np.abs(frequency - own_hz) <= data.reversals / (length * data.period_s)] = 0.0
+        power[np.abs(frequency - own_hz) < estimator.scales.foot_lines / (length * data.period_s)] = 0.0
     for at in _highest(power, lobe, 0.0):
         yield (float(frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]),)
 

@@ -70,6 +70,9 @@ class Scales:
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
+    foot_lines: float = _scale(
+        50.0, "lines of the record's resolution", 0.0, "blind suites of simulated axes"
+    )
 
     # What is left.
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
