@@ -93,6 +93,9 @@ def joint_axis() -> AxisConfig:
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
     """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
 
+    The robot tells the torque on the load as what the gear delivers: where a joint rests against its weight,
+    it has the sense of the motor's. Here it is what pushes the load forward.
+
     The joint's zero is some thirty motor turns away. Whole turns are taken off, for a replay begins at the
     zero of the simulated drive. Its way there goes backwards, as the recordings do: so friction holds the
     axis in the same sense before them.
@@ -102,7 +105,8 @@ def joint_recordings(folder: Path, joint: int) -> list[Recording]:
         record = Record.read_csv(path)
         torque = record.columns["motor_torque_nm"] / NOTHING.ratio
         turns_deg = 360.0 * math.ceil(record.motor_position_deg[0] / 360.0)
-        columns = {**record.columns, "motor_torque_nm": torque}
+        outer = -record.columns["load_torque_nm"]
+        columns = {**record.columns, "motor_torque_nm": torque, "load_torque_nm": outer}
         for name, way_deg in (
             ("motor_target_deg", turns_deg),
             ("motor_position_deg", turns_deg),

@@ -51,6 +51,7 @@ class EvenLoops(AnyLoops, Protocol):
         substeps: IntArray,
         heat: Heat,
         limit_nm: float,
+        outer_nm: FloatArray,
     ) -> tuple[FloatArray, FloatArray]: ...
 
 
@@ -94,7 +95,7 @@ def _agree(loops: Loops) -> bool:
     from hdbridge.sim import compiled  # noqa: PLC0415
 
     other = compiled.CompiledLoops(loops)
-    slow = (loops.plant.now.temperature_c, 1.0, loops.servo.limit_nm, 0.0)
+    slow = (loops.plant.now.temperature_c, 1.0, loops.servo.limit_nm, 0.0, 0.0)
     place_deg = loops.power_on(slow)
     if other.power_on(slow) != place_deg:
         return False

@@ -190,8 +190,8 @@ class LoadedPlant(Plant):
         self._turn_encoder(load, new_load)
 
     def _outer_nm(self, load_deg: float, load_speed: float) -> float:
-        """Gravity, viscous drag and shaking, on the load."""
-        outer = 0.0
+        """What comes from outside, gravity, viscous drag and shaking, on the load."""
+        outer = self.outer_nm
         if self._arm_nm:
             outer += self.weight_nm(load_deg)
         if self._viscous:

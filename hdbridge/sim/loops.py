@@ -20,9 +20,10 @@ shaft when it was sampled, and the shift of that encoder's body; the gear's outp
 speed as the drive measures it (deg/s); gravity's torque on the load (Nm); the motor's torque (Nm), and its
 square, added up over the substeps; the friction's work at the motor shaft (J)."""
 
-Slow = tuple[float, float, float, float]
+Slow = tuple[float, float, float, float, float]
 """What changes only from cycle to cycle: the temperature, the motor's friction by it against that of the
-truth file, the torque limit (Nm), what the motor encoder has lost (deg)."""
+truth file, the torque limit (Nm), what the motor encoder has lost (deg), the torque on the load from outside
+(Nm)."""
 
 
 @state
@@ -47,10 +48,11 @@ class Loops:
     _with_late_load: bool
     _with_late_motor: bool
 
-    def __init__(self, truth: Truth) -> None:
+    def __init__(self, truth: Truth, *, loaded: bool = False) -> None:
+        """``loaded``: there may be a torque on the load from outside."""
         dt_s = self.dt_s = truth.substep_s
         motor, load = truth.motor.encoder, truth.load_.encoder
-        self.plant = LoadedPlant(truth) if LoadedPlant.needed(truth) else Plant(truth)
+        self.plant = LoadedPlant(truth) if loaded or LoadedPlant.needed(truth) else Plant(truth)
         self.servo = Servo(truth)
         self._torque_nm = 0.0
         self._with_disc = motor.disc is not None
@@ -123,8 +125,9 @@ class Loops:
 
     def _take(self, slow: Slow) -> float:
         """What changes only from cycle to cycle; what the motor encoder has lost."""
-        temperature_c, friction, self.servo.limit_nm, lost_deg = slow
+        temperature_c, friction, self.servo.limit_nm, lost_deg, outer_nm = slow
         self.plant.now.temperature_c = temperature_c
+        self.plant.outer_nm = outer_nm
         self.plant.scale_friction(friction)
         return lost_deg
 

@@ -37,12 +37,14 @@ class Cycles(NamedTuple):
 class Machine:
     """A servo axis at rest at the angle zero, its power stage off."""
 
-    def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False) -> None:
-        """``may_compile``: it may stand still for some seconds until it goes on faster; see `sim.fast`."""
+    def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
+        """``may_compile``: it may stand still for some seconds until it goes on faster; see `sim.fast`.
+        ``loaded``: `follow_all` may tell a torque on the load from outside.
+        """
         self.truth = truth
         self.dt_s = truth.substep_s
         """Length of a substep."""
-        loops = Loops(truth)
+        loops = Loops(truth, loaded=loaded)
         self._loops: fast.AnyLoops = loops
         self._to_compile = loops if may_compile else None
         self._powered = False
@@ -54,6 +56,7 @@ class Machine:
         self._load_counts_per_deg = load.direction * load.counts_per_turn / DEG_PER_TURN
         self._load_zero = load.zero_counts
         self._noise_deg = load.noise_arcsec / ARCSEC_PER_DEG
+        self._torque_sense = float(truth.load_.torque_sense)
         self._noise = random.Random(f"load encoder {seed}")
         self._noise_now_deg = 0.0
         self._rated_nm = truth.motor.rated_torque_nm
@@ -66,7 +69,7 @@ class Machine:
         self._load_losses = Losses(load.losses) if load.losses else None
         self._see(loops.seen())
 
-    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+    def follow(self, start_counts: float, end_counts: float, substeps: int, outer_nm: float = 0.0) -> None:
         """Closed loop: the demand moves evenly from start to end, in motor counts (may be fractional).
 
         When the power stage was off before, the loops start from where the motor stands: a demand that rests
@@ -77,7 +80,7 @@ class Machine:
         if self._to_compile is not None and fast.waiting.over():
             self._loops = fast.compiled_loops(self._to_compile)
             self._to_compile = None
-        loops, slow = self._loops, self._slow()
+        loops, slow = self._loops, self._slow(outer_nm)
         engaged = not self._powered
         if engaged:
             self._powered = True
@@ -98,24 +101,29 @@ class Machine:
         self._see(loops.follow(demand_deg, speed_deg_s, substeps, slow))
         self._finish(elapsed_s)
 
-    def follow_all(self, counts: Sequence[float], substeps: Sequence[int]) -> Cycles:
+    def follow_all(
+        self, counts: Sequence[float], substeps: Sequence[int], outer_nm: FloatArray | None = None
+    ) -> Cycles:
         """Closed loop over many cycles, each from the demand before it; the same numbers as by `follow`.
 
-        ``counts`` has the demand at the begin and at the end of each cycle, ``substeps`` how many each has.
+        ``counts`` has the demand at the begin and at the end of each cycle, ``substeps`` how many each has,
+        ``outer_nm`` the torque on the load from outside in each, in addition to its weight.
         """
+        outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
         told = Cycles(*(np.empty(len(substeps)) for _ in Cycles._fields))
         done = 0
         while done < len(substeps):
             if self._evenly(substeps):
-                self._follow_compiled(counts[done:], substeps[done:], Cycles(*(each[done:] for each in told)))
+                rest = Cycles(*(each[done:] for each in told))
+                self._follow_compiled(counts[done:], substeps[done:], outer_nm[done:], rest)
                 break
-            self.follow(counts[done], counts[done + 1], substeps[done])
+            self.follow(counts[done], counts[done + 1], substeps[done], float(outer_nm[done]))
             told.motor_reading[done] = self.motor_reading
             told.load_reading[done] = self.load_reading
             told.torque_nm[done] = self.torque_nm
             told.torque_permille[done] = self.torque_permille
             told.temperature_c[done] = self.temperature_c
-            told.load_torque_nm[done] = self.load_torque_nm
+            told.load_torque_nm[done] = self._torque_sense * (self._weight_nm + outer_nm[done])
             done += 1
         return told
 
@@ -127,7 +135,9 @@ class Machine:
             return False
         return isinstance(self._loops, fast.EvenLoops) and min(substeps) > 0
 
-    def _follow_compiled(self, counts: Sequence[float], substeps: Sequence[int], told: Cycles) -> None:
+    def _follow_compiled(
+        self, counts: Sequence[float], substeps: Sequence[int], outer_nm: FloatArray, told: Cycles
+    ) -> None:
         per_deg, steps = self._motor_counts_per_deg, np.array(substeps, dtype=np.int64)
         demand = np.array(counts, dtype=np.float64)
         start_deg = (demand[:-1] - self._motor_zero) / per_deg
@@ -139,7 +149,7 @@ class Machine:
         speed_deg_s = (demand[1:] - demand[:-1]) / per_deg / (steps * self.dt_s)
         assert isinstance(self._loops, fast.EvenLoops)
         seen, told.temperature_c[:] = self._loops.follow_all(
-            start_deg, speed_deg_s, steps, self._heat, self._limit_nm
+            start_deg, speed_deg_s, steps, self._heat, self._limit_nm, outer_nm
         )
         noise = np.array([self._noise.gauss(0.0, self._noise_deg) if self._noise_deg else 0.0 for _ in steps])
         self._see(tuple(seen[-1].tolist()))
@@ -149,7 +159,7 @@ class Machine:
         told.load_reading[:] = (load_deg + body_deg + noise) * self._load_counts_per_deg + self._load_zero
         told.torque_nm[:] = self.truth.motor.encoder.direction * torque_nm
         told.torque_permille[:] = np.round(self._sense_permille * torque_nm / self._rated_nm)
-        told.load_torque_nm[:] = weight_nm
+        told.load_torque_nm[:] = self._torque_sense * (weight_nm + outer_nm)
 
     def coast(self, substeps: int, braked: bool) -> None:
         """Power stage off: friction, or the brake, slows the motor and holds it."""
@@ -217,11 +227,11 @@ class Machine:
 
     @property
     def load_torque_nm(self) -> float:
-        """Torque of gravity on the load, as a sensor at the load's flange tells it; positive forward.
+        """Torque of gravity on the load, as a sensor at the load's flange tells it; its sense is the file's.
 
         Drag of the gear's own bearings and the load's inertia are not in it.
         """
-        return self._weight_nm
+        return self._torque_sense * self._weight_nm
 
     @property
     def elapsed_s(self) -> float:
@@ -243,9 +253,9 @@ class Machine:
         """The gear's output before its spring, for tests: where the load comes to rest."""
         return self._output_deg
 
-    def _slow(self) -> Slow:
+    def _slow(self, outer_nm: float = 0.0) -> Slow:
         """What the loops have to know for the next cycle."""
-        return self._heat.body_c, self._heat.rub, self._limit_nm, self._lost_deg()
+        return self._heat.body_c, self._heat.rub, self._limit_nm, self._lost_deg(), outer_nm
 
     def _see(self, seen: Seen) -> None:
         """What the loops say after a cycle."""

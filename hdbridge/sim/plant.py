@@ -35,6 +35,8 @@ class Plant:
     encoder_deg: float
     loss_j: float
     """Friction work at the motor shaft since it was last set to zero."""
+    outer_nm: float
+    """Torque on the load from outside, in addition to its weight; only a `LoadedPlant` yields to it."""
     _arm: float
     _cold_coulomb: float
     _cold_drag: float
@@ -83,7 +85,7 @@ class Plant:
         self.output_deg = self._gear.turned_deg(self.now)
         self.now.load_deg = self.encoder_deg = self.output_deg
         self.motor_deg_s = self.load_deg_s = self._encoder_rate = 0.0
-        self.loss_j = 0.0
+        self.loss_j = self.outer_nm = 0.0
 
     def step(self, torque_nm: float, brake_nm: float) -> None:
         """One substep under a motor torque; the brake adds to the Coulomb friction."""

@@ -5,6 +5,9 @@ afford the hundreds of replays that it needs.
 
 Before each part of a recording nothing is known of the axis, so each begins on a drive that is switched on
 at its angle zero and led to the first command at the axis's limits.
+
+What acted on the axis from outside is part of a recording as its commands are: where it tells the torque on
+the load, the simulated load is pushed by as much, in place of its own weight.
 """
 
 from __future__ import annotations
@@ -50,6 +53,8 @@ class Commands:
     time_s: FloatArray
     """Time of each row."""
     cycle_s: float
+    told_nm: FloatArray | None = None
+    """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +72,9 @@ class Traces:
 def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
     """The record of a simulated drive that got the recording's commands over real frames.
 
-    One row for each of the recording's, with its time. InputError where the recording has no command, or
-    leaves what the axis file allows. SafetyStop where the simulated drive cannot follow the commands as
-    closely as the axis file asks.
+    One row for each of the recording's, with its time. Nothing acts on the load from outside: no drive is
+    told what does. InputError where the recording has no command, or leaves what the axis file allows.
+    SafetyStop where the simulated drive cannot follow the commands as closely as the axis file asks.
     """
     records = []
     for part in recording.record.parts():
@@ -122,7 +127,10 @@ def run(
     smooth: bool = False,
 ) -> Traces:
     """The commands through the machine alone; a ``smooth`` one reports what it does unrounded."""
-    machine = Machine(truth, seed, may_compile=True)
+    outer_nm = None
+    if commands.told_nm is not None:
+        truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
+    machine = Machine(truth, seed, may_compile=True, loaded=outer_nm is not None)
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
@@ -132,7 +140,7 @@ def run(
         substeps.append(int(owed_s / dt_s + 1e-6))
         owed_s -= substeps[-1] * dt_s
     demand = [float(counts) for counts in (commands.counts[0], *commands.counts)]
-    told = Cycles(*(each[commands.lead :] for each in machine.follow_all(demand, substeps)))
+    told = Cycles(*(each[commands.lead :] for each in machine.follow_all(demand, substeps, outer_nm)))
     motor, load = told.motor_reading, told.load_reading
     if not smooth:
         motor, load = np.floor(motor + 0.5), np.floor(load + 0.5)
@@ -170,7 +178,19 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
     recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).astype(np.int64).tolist()
     approach = _approach(truth, axis, demand_deg, cycle_s)
-    return Commands((*approach, *recorded), len(approach), cycles, time_s, cycle_s)
+    told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
+    if told_nm is not None:
+        told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
+    return Commands((*approach, *recorded), len(approach), cycles, time_s, cycle_s, told_nm)
+
+
+def _weightless(truth: Truth) -> Truth:
+    """The truth with the inertia of the mass on it, and without its weight."""
+    mass = truth.load_.gravity
+    if mass is None:
+        return truth
+    upright = truth.load_.model_copy(update={"gravity": mass.model_copy(update={"tilt_deg": 90.0})})
+    return truth.model_copy(update={"load_": upright})
 
 
 def cycle_of(part: Record, axis: AxisConfig) -> float:

@@ -70,6 +70,8 @@ def compliance(effect: Compliance, draft: Draft) -> Said:
         }
     if times != 1.0:
         notes.append("by the motor's torque times the ratio, friction included")
+    else:
+        draft.load["torque_sense"] = effect.sense
     return Said("gear.stiffness_nm_per_rad, gear.stiffening", tuple(dict.fromkeys(notes)))
 
 

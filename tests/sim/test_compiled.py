@@ -266,6 +266,21 @@ def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:
     assert known <= set(compiled.STATES)
 
 
+def test_a_torque_from_outside_acts_alike_whether_compiled_or_not() -> None:
+    """The load yields as the spring does: this torque does not break the motor away."""
+    made = truth({})
+    outer_nm = np.concatenate([np.zeros(20), np.full(300, 0.2)])
+    told = [
+        Machine(made, 7, may_compile=each, loaded=True).follow_all([0.0] * 321, [4] * 320, outer_nm)
+        for each in (False, True)
+    ]
+    assert all(np.array_equal(getattr(told[0], name), getattr(told[1], name)) for name in told[0]._fields)
+    per_arcsec = made.load_.encoder.counts_per_turn / 1_296_000.0
+    yields_arcsec = np.diff(told[0].load_reading[[19, 319]])[0] / per_arcsec
+    assert yields_arcsec == pytest.approx(0.2 * 206_265.0 / made.gear.stiffness_nm_per_rad, rel=0.02)
+    assert told[0].load_torque_nm[-1] == 0.2
+
+
 def test_many_cycles_at_once_are_the_same_as_one_after_the_other() -> None:
     noisy = {"motor__encoder__late_ms": 0.3, "load__encoder__noise_arcsec": 1.0}
     made = truth(noisy | {"temperature__friction_growth_per_k": -0.01, "temperature__copper_loss_w": 40.0})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from hdbridge.sim.truth.encoder import TrueLoadEncoder
@@ -63,6 +65,9 @@ class TrueLoad(Part):
     thinning: TrueThinning | None = Field(None, description="shear thinning of the viscous friction")
     gravity: TrueGravity | None = Field(None, description="a mass on the axis; without it: balanced")
     vibration: tuple[TrueVibration, ...] = Field((), max_length=16, description="shaking from outside")
+    torque_sense: Literal[1, -1] = Field(
+        1, description="of the torque that is told: 1 pushes the load forward, -1 is what the gear delivers"
+    )
     encoder: TrueLoadEncoder = Field(description="encoder at the load")
 
     @property
