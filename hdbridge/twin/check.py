@@ -1,8 +1,9 @@
 """What has changed since a twin was made: a new recording against its replay, named cause by cause.
 
-Forward selection: of all causes the one whose parameters, fitted alone, explain most is taken in if it has
-moved by more than the new recording and the twin itself leave open, and by as much as matters; then the next,
-with those before fitted along. At the end each has to earn its place once more.
+Forward selection: each parameter alone is moved by several sizes; the causes that explain most so are
+fitted, and the best of them is taken in if it has moved by more than the new recording and the twin itself
+leave open, and by as much as matters; then the next, with those before fitted along. At the end each has to
+earn its place once more.
 """
 
 from __future__ import annotations
@@ -17,24 +18,36 @@ from scipy.stats import chi2
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
-from hdbridge.errors import InputError
 from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
-from hdbridge.twin.least_squares import Fitted, information_of, solve
+from hdbridge.twin.known import Known, change_of
+from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, scaled, softened, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, noise_floor, prepare
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
-from hdbridge.twin.parameters import Parameter, coordinates
+from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 
 MOST_CAUSES = 4
 """Changes that are looked for at most."""
 CHECK_S = 40.0
 """A longer recording is checked on pieces that take about so long."""
+SIZES = (1.0, 2.5, 6.0)
+"""Each parameter is moved by so many of the changes that matter, either way: what a spring or a load rings by
+goes out of step at a small share of a larger change already, and slopes say nothing of it."""
 CONTENDERS = 3
-"""So many causes are fitted in earnest; the others are behind by the linear reckoning already."""
+"""So many causes are fitted; the others are behind with one parameter alone already."""
 STEPS = 6
+DRAWS = 8
+"""Rounded and noisy replays about a place, within what the twin leaves open. A recording is held against
+their mean: rounding is no noise (see `bootstrap`). And a sample counts by how far they are apart: how a motor
+breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
+LEAST_SUSPECT = 0.25
+"""Share of that which the slopes have to promise: they say little of what goes out of step."""
+TOLERATED = 1.3**2 - 1.0
+"""Mean square that a cause has to explain of some channel, in squares of its noise: a twin that leaves no
+more than 1.3 times the noise counts as right, so it may be off by as much itself."""
 OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
 """Looked at in addition to what a fit changes."""
 
@@ -68,61 +81,56 @@ def check(
 
     InputError where the twin was not fitted, or the recording has no command.
     """
-    known = _Known.of(twin)
+    known = Known.of(twin)
     data = coarse(prepare(recording, axis, twin), CHECK_S)
-    parameters = free_parameters(twin, OWN)
     floor = noise_floor(data)
     scale = {name: max(known.noise.get(name, 0.0), floor[name]) for name in CHANNELS}
-    groups: dict[str, tuple[Parameter, ...]] = {}
-    for each in parameters:
-        groups[each.cause] = (*groups.get(each.cause, ()), each)
     with Replays(data, workers) as replays:
-        search = _Search(replays, twin, known, scale, groups)
-        chosen: tuple[str, ...] = ()
-        best: Fitted | None = None
-        while len(chosen) < MOST_CAUSES:
-            step = search.next_after(chosen, best)
-            progress(len(chosen) / MOST_CAUSES)
+        search = _Search(replays, twin, known, scale, free_parameters(twin, OWN))
+        (before,) = replays([twin])
+        best = search.at((), twin)
+        while len(best.causes) < MOST_CAUSES:
+            progress(len(best.causes) / MOST_CAUSES)
+            step = search.next_after(best)
             if step is None:
                 break
-            chosen, best = step
-        chosen, best = search.without_idle(chosen, best)
-        (before,) = replays([twin])
-        after = best.residuals if best is not None else before
+            best = step
+        best = search.without_idle(best)
+        (after,) = replays([best.truth])
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
-    changes = tuple(search.change(cause, best, gain) for cause in chosen) if best is not None else ()
+    changes = tuple(search.change(cause, best, gain) for cause in best.causes)
     return Check(changes, _in_scales(before, scale), _in_scales(after, scale))
 
 
-@dataclass(frozen=True)
-class _Known:
-    """What a twin's file says of its own fit."""
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """The twin with some causes' parameters fitted, and what the recording says there of all parameters."""
 
-    names: tuple[str, ...]
+    causes: tuple[str, ...]
+    truth: Truth
+    off: FloatArray
+    """How far each parameter is from the twin's."""
+    slopes: FloatArray
+    """The scaled residuals' derivatives by all of them."""
+    left: FloatArray
+    """The scaled residuals."""
+    apart: FloatArray
+    """How far rounded and noisy replays are apart there, in scales; 1 at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """A cause's parameters: where they are among all, how far from the twin's, and how sure that is."""
+
+    places: list[int]
+    off: FloatArray
     covariance: FloatArray
-    noise: dict[str, float]
 
-    @classmethod
-    def of(cls, twin: Truth) -> _Known:
-        about: Any = twin.provenance.get("fit")
-        if not isinstance(about, dict):
-            raise InputError(
-                f"the truth '{twin.name}' does not say how sure it is (provenance.fit); expected a twin that "
-                "was fitted: make one with hdbridge twin"
-            )
-        names = tuple(about["parameters"])
-        return cls(names, np.array(about["covariance"], dtype=np.float64), dict(about["noise"]))
-
-    def block(self, parameters: Sequence[Parameter]) -> FloatArray:
-        """Covariance of the twin's own coordinates; nothing for what it has not fitted."""
-        block = np.zeros((len(parameters), len(parameters)))
-        places = [self.names.index(each.name) if each.name in self.names else None for each in parameters]
-        for row, one in enumerate(places):
-            for column, other in enumerate(places):
-                if one is not None and other is not None:
-                    block[row, column] = self.covariance[one, other]
-        return block
+    @property
+    def distance(self) -> float:
+        """In squared standard deviations."""
+        return float(self.off @ np.linalg.solve(self.covariance, self.off))
 
 
 class _Search:
@@ -132,99 +140,162 @@ class _Search:
         self,
         replays: Replays,
         twin: Truth,
-        known: _Known,
+        known: Known,
         scale: dict[str, float],
-        groups: dict[str, tuple[Parameter, ...]],
+        parameters: tuple[Parameter, ...],
     ) -> None:
-        self._replays, self._twin, self._known, self._scale = replays, twin, known, scale
-        self._groups = groups
-        self._alone: Fitted | None = None
+        self._replays, self._twin, self._scale = replays, twin, scale
+        self._every = parameters
+        self._causes = tuple(dict.fromkeys(each.cause for each in parameters))
+        self._root = known.root(parameters)
+        self._rows = fitted_rows(replays.data, everything=True)
+        self._legs = legs_of_rows(replays.data, self._rows)
+        self._channels = np.repeat(np.arange(len(CHANNELS)), len(self._rows) // len(CHANNELS))[self._rows]
 
-    def next_after(
-        self, chosen: tuple[str, ...], best: Fitted | None
-    ) -> tuple[tuple[str, ...], Fitted] | None:
-        """The causes with one more, and their fit; None where no other has earned it."""
-        left = [cause for cause in self._groups if cause not in chosen]
-        ranked = self._ranked(chosen, best, left)
-        fits = {cause: self._fit((*chosen, cause), best) for cause in ranked[:CONTENDERS]}
+    def at(self, causes: tuple[str, ...], truth: Truth) -> _Place:
+        """What the recording says at a truth, to which these causes have led."""
+        twin = np.array(coordinates(self._twin, self._every))
+        here = solve(self._replays, truth, self._every, twin, 0, known=self._scale, everything=True)
+        rng = np.random.default_rng(0)
+        low, high = np.array([each.bounds for each in self._every]).T
+        places = [
+            np.clip(here.place + self._root @ rng.standard_normal(self._root.shape[1]), low, high)
+            for _ in range(DRAWS)
+        ]
+        drawn = self._replays.drawn([at_coordinates(truth, self._every, each.tolist()) for each in places])
+        left = np.stack(
+            [
+                softened(scaled(shown, self._scale)[self._rows]) - here.jacobian @ (each - here.place)
+                for each, shown in zip(places, drawn, strict=True)
+            ]
+        )
+        apart = np.maximum(np.std(left, axis=0, ddof=1), 1.0)
+        slopes, mean = here.jacobian / apart[:, None], np.mean(left, axis=0) / apart
+        return _Place(causes, truth, here.place - twin, slopes, mean, apart)
+
+    def next_after(self, best: _Place) -> _Place | None:
+        """The causes with one more; None where no other has earned it."""
+        others = [cause for cause in self._causes if cause not in best.causes]
+        suspects = [cause for cause in others if self._suspect(cause, best)]
+        contenders = self._contenders(best, suspects) if suspects else []
+        fits = [self._fit((*best.causes, cause), start, best) for cause, start in contenders]
         # The best first: what is significant next to it may only stand in for it.
-        for cause in sorted(fits, key=lambda cause: fits[cause].cost + 0.5 * self._price(cause)):
-            if self._significant(cause, fits[cause]):
-                return (*chosen, cause), fits[cause]
+        for causes, fitted in sorted(fits, key=lambda each: each[1].cost + 0.5 * self._price(each[0][-1])):
+            found = self.at(causes, fitted.truth)
+            if self._significant(causes[-1], found) and self._matters(best, found):
+                return found
         return None
 
-    def without_idle(
-        self, chosen: tuple[str, ...], best: Fitted | None
-    ) -> tuple[tuple[str, ...], Fitted | None]:
+    def without_idle(self, best: _Place) -> _Place:
         """Only the causes that are still significant next to the others."""
-        while best is not None:
-            idle = [cause for cause in chosen if not self._significant(cause, best)]
-            if not idle:
-                break
-            chosen = tuple(cause for cause in chosen if cause not in idle)
-            best = self._fit(chosen, None) if chosen else None
-        return chosen, best
+        while True:
+            kept = tuple(cause for cause in best.causes if self._significant(cause, best))
+            if kept == best.causes:
+                return best
+            truth = self._fit(kept, self._twin, best)[1].truth if kept else self._twin
+            best = self.at(kept, truth)
 
-    def change(self, cause: str, fitted: Fitted, gain: tuple[float, float]) -> Finding:
+    def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
         """What is said of a cause."""
-        places, off, covariance = self._moved(cause, fitted)
-        parameters = [fitted.parameters[place] for place in places]
-        reach = NORMAL_95 * np.sqrt(np.diag(covariance))
+        moved = self._moved(cause, best)
+        parameters = [self._every[place] for place in moved.places]
+        now = np.array(coordinates(self._twin, parameters)) + moved.off
+        reach = NORMAL_95 * np.sqrt(np.diag(moved.covariance))
         intervals = {
             each.name: (each.value(float(at - r)), each.value(float(at + r)))
-            for each, at, r in zip(parameters, fitted.place[places], reach, strict=True)
+            for each, at, r in zip(parameters, now, reach, strict=True)
         }
-        distance = float(off @ np.linalg.solve(covariance, off))
-        return finding(parameters, self._twin, fitted.truth, intervals, distance, gain)
+        after = at_coordinates(best.truth, parameters, now.tolist())
+        return finding(parameters, self._twin, after, intervals, moved.distance, gain)
 
-    def _fit(self, causes: Sequence[str], start: Fitted | None) -> Fitted:
-        parameters = tuple(each for cause in causes for each in self._groups[cause])
-        truth = start.truth if start is not None else self._twin
+    def _contenders(self, best: _Place, suspects: Sequence[str]) -> list[tuple[str, Truth]]:
+        """The suspects of which a parameter, moved alone, explains more than it costs, and where it does."""
+        moves = [
+            (each, way * size * each.least_change)
+            for each in self._every
+            if each.cause in suspects
+            for size in SIZES
+            for way in (-1.0, 1.0)
+        ]
+        truths = [best.truth, *(_shifted(best.truth, each, by) for each, by in moves)]
+        here, *costs = (self._cost(found, best) for found in self._replays(truths))
+        nearest: dict[str, tuple[float, Truth]] = {}
+        for (each, _), cost, there in zip(moves, costs, truths[1:], strict=True):
+            price = 0.5 * self._price(each.cause)
+            if cost + price < nearest.get(each.cause, (here, there))[0]:
+                nearest[each.cause] = (cost + price, there)
+        ranked = sorted(nearest, key=lambda cause: nearest[cause][0])
+        return [(cause, nearest[cause][1]) for cause in ranked[:CONTENDERS]]
+
+    def _cost(self, found: dict[str, FloatArray], near: _Place) -> float:
+        left = softened(scaled(found, self._scale_at(near))[self._rows])
+        return 0.5 * float(left @ left)
+
+    def _scale_at(self, near: _Place) -> dict[str, Any]:
+        """The scale of each channel, row by row."""
+        rows = np.ones(len(self._rows))
+        rows[self._rows] = near.apart
+        by_channel = zip(CHANNELS, np.split(rows, len(CHANNELS)), strict=True)
+        return {name: self._scale[name] * each for name, each in by_channel}
+
+    def _fit(self, causes: tuple[str, ...], start: Truth, near: _Place) -> tuple[tuple[str, ...], Fitted]:
+        parameters = tuple(each for each in self._every if each.cause in causes)
         prior = np.array(coordinates(self._twin, parameters))
-        return solve(self._replays, truth, parameters, prior, STEPS, known=self._scale, everything=True)
+        known = self._scale_at(near)
+        return causes, solve(self._replays, start, parameters, prior, STEPS, known=known, everything=True)
 
-    def _ranked(self, chosen: tuple[str, ...], best: Fitted | None, left: list[str]) -> list[str]:
-        """The causes by what each would explain of the residuals, reckoned linearly."""
-        every = tuple(each for cause in (*chosen, *left) for each in self._groups[cause])
-        truth = best.truth if best is not None else self._twin
-        prior = np.array(coordinates(self._twin, every))
-        here = solve(self._replays, truth, every, prior, 0, known=self._scale, everything=True)
-        names = [each.cause for each in every]
-        gradient = here.jacobian.T @ here.vector
-        information = information_of(here.jacobian, np.array([each.spread for each in every]))
-
-        def gain(causes: Sequence[str]) -> float:
-            places = [number for number, name in enumerate(names) if name in causes]
-            if not places:
-                return 0.0
-            part = gradient[places]
-            return 0.5 * float(part @ np.linalg.solve(information[np.ix_(places, places)], part))
-
-        base = gain(chosen)
-        earned = {cause: gain((*chosen, cause)) - base - 0.5 * self._price(cause) for cause in left}
-        return sorted((cause for cause in left if earned[cause] > 0.0), key=lambda cause: -earned[cause])
+    def _moved(self, cause: str, at: _Place, *more: str) -> _Moved:
+        """How far a cause has moved next to the place's own, all other parameters as the twin leaves them."""
+        free = [number for number, each in enumerate(self._every) if each.cause in (*at.causes, *more)]
+        precision = np.array([each.spread for each in self._every]) ** -2.0
+        found = change_of(free, at.slopes, at.left, self._legs, self._root, precision, at.off)
+        own = [number for number, place in enumerate(free) if self._every[place].cause == cause]
+        places = [free[number] for number in own]
+        return _Moved(places, at.off[places] + found.by[own], found.covariance[np.ix_(own, own)])
 
     def _price(self, cause: str) -> float:
         """What a cause costs by its number of parameters (Schwarz)."""
-        rows = sum(len(each.leg) for each in self._replays.data.pieces)
-        return len(self._groups[cause]) * math.log(max(rows, 2))
+        count = sum(each.cause == cause for each in self._every)
+        return count * math.log(max(len(self._replays.data.leg), 2))
 
-    def _significant(self, cause: str, fitted: Fitted) -> bool:
-        """Whether a cause has moved beyond what is open, and by as much as matters."""
-        places, off, covariance = self._moved(cause, fitted)
-        distance = float(off @ np.linalg.solve(covariance, off))
-        certain = float(chi2.sf(distance, len(places))) < FALSE_ALARM / len(self._groups)
-        spread = np.sqrt(np.diag(covariance))
-        least = np.array([fitted.parameters[place].least_change for place in places])
-        return certain and bool(np.any((np.abs(off) > least) & (np.abs(off) > 2.0 * spread)))
+    def _suspect(self, cause: str, best: _Place) -> bool:
+        """Whether the slopes leave it open that a cause explains what matters."""
+        free = [number for number, each in enumerate(self._every) if each.cause in (*best.causes, cause)]
+        slopes = best.slopes[:, free]
+        after = best.left - slopes @ np.linalg.lstsq(slopes, best.left, rcond=None)[0]
+        explained = self._squares(best.left) - self._squares(after)
+        return bool(np.any(explained > LEAST_SUSPECT * TOLERATED)) and self._certain(
+            self._moved(cause, best, cause)
+        )
 
-    def _moved(self, cause: str, fitted: Fitted) -> tuple[list[int], FloatArray, FloatArray]:
-        """A cause's parameters: where in the fit, how far from the twin, and how sure that is."""
-        places = [number for number, each in enumerate(fitted.parameters) if each.cause == cause]
-        parameters = [fitted.parameters[place] for place in places]
-        off = fitted.place[places] - np.array(coordinates(self._twin, parameters))
-        covariance = fitted.covariance[np.ix_(places, places)] + self._known.block(parameters)
-        return places, off, covariance
+    def _matters(self, best: _Place, found: _Place) -> bool:
+        """Whether one cause more explains more than a twin that is right may leave."""
+        alike = [each.left * each.apart / np.maximum(best.apart, found.apart) for each in (best, found)]
+        return bool(np.any(self._squares(alike[0]) - self._squares(alike[1]) > TOLERATED))
+
+    def _squares(self, left: FloatArray) -> FloatArray:
+        """Mean square by channel."""
+        counts = np.bincount(self._channels, minlength=len(CHANNELS))
+        sums = np.bincount(self._channels, np.square(left), minlength=len(CHANNELS))
+        return np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
+
+    def _certain(self, moved: _Moved) -> bool:
+        """Whether a cause has moved beyond what is open."""
+        return float(chi2.sf(moved.distance, len(moved.places))) < FALSE_ALARM / len(self._causes)
+
+    def _significant(self, cause: str, at: _Place) -> bool:
+        """... and by as much as matters."""
+        moved = self._moved(cause, at)
+        off, spread = np.abs(moved.off), np.sqrt(np.diag(moved.covariance))
+        least = np.array([self._every[place].least_change for place in moved.places])
+        return self._certain(moved) and bool(np.any((off > least) & (off > 2.0 * spread)))
+
+
+def _shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
+    """The truth with one coordinate moved, within its bounds."""
+    low, high = parameter.bounds
+    (now,) = coordinates(truth, [parameter])
+    return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
 
 
 def _in_scales(found: Mapping[str, FloatArray], scale: Mapping[str, float]) -> dict[str, float]:

@@ -1,0 +1,112 @@
+"""How sure a change against a twin is: by the new recording, and by what the twin's own recordings left open.
+
+The twin is off by an error of the covariance that its file tells. A new recording of the same motion does
+not show that error either, however long the valley is in which the twin lies: what counts is not how well a
+parameter is known but how well its change is, all others being what they were (generalised least squares
+with the twin's error as a nuisance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from hdbridge.effects import FloatArray
+from hdbridge.errors import InputError
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import Parameter
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What a twin's file says of its own fit."""
+
+    names: tuple[str, ...]
+    """Of the parameters that were fitted."""
+    covariance: FloatArray
+    """Of their coordinates."""
+    noise: dict[str, float]
+    """Scale of each channel's residuals."""
+
+    @classmethod
+    def of(cls, twin: Truth) -> Self:
+        """InputError where the twin was not fitted."""
+        about: Any = twin.provenance.get("fit")
+        if not isinstance(about, dict):
+            raise InputError(
+                f"the truth '{twin.name}' does not say how sure it is (provenance.fit); expected a twin that "
+                "was fitted: make one with hdbridge twin"
+            )
+        names = tuple(about["parameters"])
+        return cls(names, np.array(about["covariance"], dtype=np.float64), dict(about["noise"]))
+
+    def root(self, parameters: Sequence[Parameter]) -> FloatArray:
+        """A root of the covariance of these parameters' coordinates, shape (p, fitted).
+
+        A parameter that the twin has not fitted has no error there.
+        """
+        deviation = np.sqrt(np.diag(self.covariance))
+        # A file has some digits of it: what they leave of the smallest eigenvalues may be below zero.
+        worth, directions = np.linalg.eigh(self.covariance / np.outer(deviation, deviation))
+        whole = deviation[:, None] * directions * np.sqrt(np.maximum(worth, 0.0))
+        root = np.zeros((len(parameters), len(self.names)))
+        for row, each in enumerate(parameters):
+            if each.name in self.names:
+                root[row] = whole[self.names.index(each.name)]
+        return root
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What a recording says of some coordinates, the others being the twin's."""
+
+    by: FloatArray
+    """How far they are from where the slopes were taken."""
+    covariance: FloatArray
+
+
+def change_of(
+    places: Sequence[int],
+    slopes: FloatArray,
+    left: FloatArray,
+    legs: FloatArray,
+    root: FloatArray,
+    precision: FloatArray,
+    off: FloatArray,
+) -> Change:
+    """Generalised least squares of the coordinates at these places.
+
+    ``left`` are the scaled residuals, ``slopes`` their derivatives by all coordinates, ``legs`` the number
+    of each residual's leg, ``root`` a root of the twin's covariance. The prior has this ``precision`` about
+    a point from which all coordinates are ``off`` already.
+    """
+    count = slopes.shape[1]
+    gram, some = slopes.T @ slopes, list(places)
+    noise = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    variance = max(1.0, float(noise @ noise) / max(len(left) - count, 1))
+    seen = gram @ root
+    inner = variance * np.eye(root.shape[1]) + root.T @ seen
+    # The weights of the residuals are the slopes times this.
+    weights = ((np.eye(count) - root @ np.linalg.solve(inner, seen.T)) / variance)[:, some]
+    held = np.diag(precision[some])
+    inverse = np.linalg.inv(weights.T @ gram[:, some] + held)
+    by = -inverse @ (weights.T @ (slopes.T @ left) + precision[some] * off[some])
+    louder = _louder(slopes, noise, legs, variance)
+    spread = variance * gram * np.outer(louder, louder) + seen @ seen.T
+    covariance = inverse @ (weights.T @ spread @ weights + held) @ inverse
+    return Change(np.asarray(by, dtype=np.float64), np.asarray(covariance, dtype=np.float64))
+
+
+def _louder(slopes: FloatArray, noise: FloatArray, legs: FloatArray, variance: float) -> FloatArray:
+    """By coordinate, how much more residuals that go together within a leg weigh than white ones."""
+    order = np.argsort(legs, kind="stable")
+    firsts = np.flatnonzero(np.diff(legs[order], prepend=-1.0))
+    by_leg = np.add.reduceat((slopes * noise[:, None])[order], firsts, axis=0)
+    few = len(by_leg) / max(len(by_leg) - 1, 1)
+    white = variance * np.sum(np.square(slopes), axis=0)
+    squares = few * np.sum(np.square(by_leg), axis=0)
+    times = np.divide(squares, white, out=np.ones_like(white), where=white > 0.0)
+    return np.asarray(np.sqrt(np.maximum(times, 1.0)), dtype=np.float64)
