@@ -1,0 +1,122 @@
+"""Calibrate and step axes drawn at random and their twins, and hold the two against each other.
+
+    .venv/bin/python tools/twin_agreement.py --first 500 --axes 2
+
+The axes are those of tools/twin_random_axes.py. Each goes the way of an axis at a bench: calibrated with the
+stepping test, recorded on the plan ``dynamics``, twinned from usual values that err as the model says. Then
+the twin is calibrated and stepped in the same way. Printed for each axis: 3 sigma of the stepping test
+without compensation, the offset of the loop, and how far apart the orders are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from twin_random_axes import bench, draw
+
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration import Calibration, calibrate, start_journal
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import Hysteresis, HysteresisMemory, Synchronous
+from hdbridge.errors import SafetyStop
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.plan import Plan
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.making import fit_twin
+from hdbridge.twin.translation import translate
+
+DATE = datetime(2026, 1, 1, tzinfo=UTC)
+STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02
+"""What the issue asks for: a share of 3 sigma, each order's phasor, a share of the offset."""
+
+
+def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:
+    """A calibration with its stepping test, of an axis without a model."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with (
+            simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+            Drive(bus, axis, clock) as drive,
+        ):
+            drive.boot()
+            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
+            return calibrate(drive, journal, folder, DATE)
+
+
+def three_sigma_arcsec(found: Calibration) -> float:
+    """Of the stepping test without compensation."""
+    return found.validation.before.pooled.three_sigma_arcsec if found.validation else float("nan")
+
+
+def offset_arcsec(model: TransmissionModel) -> float:
+    """Of the loop; none is zero."""
+    return sum(
+        each.offset_arcsec for each in model.effects if isinstance(each, Hysteresis | HysteresisMemory)
+    )
+
+
+def phasors(model: TransmissionModel) -> dict[int, complex]:
+    """By order of the motor."""
+    return {
+        each.order: each.amplitude_arcsec * np.exp(1j * np.radians(each.phase_deg))
+        for effect in model.effects
+        if isinstance(effect, Synchronous)
+        for each in effect.orders
+    }
+
+
+def one(seed: int, plan: str, workers: int) -> str:
+    """Both calibrations of one axis, in a line."""
+    began_s = time.perf_counter()
+    axis, truth = draw(seed)
+    own = calibrated(axis, truth, plan, seed)
+    recording = bench(axis, truth, Plan.load("dynamics"), seed + 1000)
+    start = translate(axis, own.model).truth
+    twin = fit_twin([recording], axis, start, workers=workers).truth
+    again = calibrated(axis, twin, plan, seed + 2000)
+    stepped = three_sigma_arcsec(own), three_sigma_arcsec(again)
+    offsets = offset_arcsec(own.model), offset_arcsec(again.model)
+    one, other = phasors(own.model), phasors(again.model)
+    apart = {order: abs(one.get(order, 0.0) - other.get(order, 0.0)) for order in {*one, *other}}
+    worst = max(apart, key=lambda order: apart[order], default=0)
+    off = apart.get(worst, 0.0)
+    law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
+    verdicts = (
+        abs(stepped[1] / stepped[0] - 1.0) <= STEPPING,
+        abs(offsets[1] / offsets[0] - 1.0) <= OFFSET,
+        off <= ORDERS_ARCSEC,
+    )
+    return (
+        f"{seed:4d} {law:16s} | 3 sigma {stepped[0]:6.2f} {stepped[1]:6.2f} "
+        f"({100 * (stepped[1] / stepped[0] - 1):+.1f} %) | offset {offsets[0]:6.2f} {offsets[1]:6.2f} "
+        f"({100 * (offsets[1] / offsets[0] - 1):+.1f} %) | order {worst} {off:.2f} arcsec apart | "
+        f"{' '.join('ok' if each else 'OUT' for each in verdicts)} | {time.perf_counter() - began_s:.0f} s"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--axes", type=int, default=4)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
+    parser.add_argument("--plan", default="quick", help="of the calibrations")
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    print("the axis, its twin (how far that is off)")
+    for seed in range(options.first, options.first + options.axes):
+        try:
+            print(one(seed, options.plan, options.workers), flush=True)
+        except SafetyStop as stop:
+            print(f"{seed:4d} left out: {stop}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
