@@ -148,6 +148,20 @@ def test_the_spectrum_sets_the_threshold_against_the_orders_that_it_is_for(plain
     assert max(alone["x"]) <= 16
 
 
+@pytest.mark.parametrize("order", [2, 15])
+def test_the_line_of_each_order_alone_peaks_at_the_order_with_its_amplitude(order):
+    """Though four bins in ten hold no sample, and their width takes 2.2 % off order 15."""
+    fit = fitted()
+    wave = 5.0 * np.cos(np.radians(order * fit.traces.motor_deg + 20.0))
+    drawn = dataclasses.replace(fit, traces=dataclasses.replace(fit.traces, orders_arcsec=wave))
+    _, charts = read(dataclasses.replace(result(), fit=drawn))
+    (alone,) = (
+        each for chart in charts.values() for each in chart["series"] if each["label"] == "one order alone"
+    )
+    assert alone["x"][np.argmax(alone["y"])] == pytest.approx(order)
+    assert max(alone["y"]) == pytest.approx(5.0, rel=0.01)
+
+
 def test_figures_have_the_digits_that_their_interval_allows(plain):
     text, _ = plain
     row = re.search(r"synchronous, order 2: amplitude.*?</tr>", text).group(0)
