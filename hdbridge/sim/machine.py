@@ -161,11 +161,11 @@ class Machine:
         told.torque_permille[:] = np.round(self._sense_permille * torque_nm / self._rated_nm)
         told.load_torque_nm[:] = self._torque_sense * (weight_nm + outer_nm)
 
-    def coast(self, substeps: int, braked: bool) -> None:
+    def coast(self, substeps: int, braked: bool, outer_nm: float = 0.0) -> None:
         """Power stage off: friction, or the brake, slows the motor and holds it."""
         self._powered = False
         brake_nm = self.truth.motor.brake_nm if braked else 0.0
-        self._see(self._loops.coast(brake_nm, substeps, self._slow()))
+        self._see(self._loops.coast(brake_nm, substeps, self._slow(outer_nm)))
         self._finish(substeps * self.dt_s)
 
     @property

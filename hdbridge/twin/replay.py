@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
@@ -31,11 +31,15 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Cycles, Machine
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.stretches import continuous, just_on
 
 LATENCY_CYCLES = 4
 """A command shows as demand at most so many cycles after it was given."""
 STANDING_S = 0.3
 """The axis stands so long between the approach and a recording that begins at rest."""
+OFF_AFTER, ON_BEFORE = 2, 1
+"""The bench switches a drive off so many cycles after the last row of a procedure, once it has come to rest,
+and on again so many before the first row of the next."""
 UNEVEN = 0.25
 """Share of a cycle by which a sample's time may be off the cycle's grid without being interpolated."""
 
@@ -55,6 +59,8 @@ class Commands:
     cycle_s: float
     told_nm: FloatArray | None = None
     """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
+    off: tuple[slice, ...] = ()
+    """Cycles in which the drive is switched off and its brake is on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,8 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
     SafetyStop where the simulated drive cannot follow the commands as closely as the axis file asks.
     """
     records = []
-    for part in recording.record.parts():
+    for rows in continuous(recording.record):
+        part = recording.record.rows(rows.start, rows.stop)
         commands = commands_of(part, axis, truth)
         bench_axis = at_cycle(axis, commands.cycle_s)
         with (
@@ -85,8 +92,7 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
             Drive(bus, bench_axis, clock) as drive,
         ):
             drive.boot()
-            measured = Bench(drive).run(_Again(commands, bench_axis)).record
-        records.append(_at_rows(measured, commands, bench_axis))
+            records += _benched(Bench(drive), commands, axis)
     return records[0] if len(records) == 1 else concatenate(records)
 
 
@@ -96,7 +102,8 @@ def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: 
     What the drive's supervision or its limits would stop or cut is let pass.
     """
     records = []
-    for part in recording.record.parts():
+    for rows in continuous(recording.record):
+        part = recording.record.rows(rows.start, rows.stop)
         commands = commands_of(part, axis, truth)
         traces = run(commands, axis, truth, seed)
         target = _between(_degrees(commands.counts[commands.lead :], axis), commands.row_cycles)
@@ -114,7 +121,7 @@ def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: 
         for key in axis.channels:
             if BY_KEY[key] in known:
                 columns[BY_KEY[key].value] = known[BY_KEY[key]]
-        records.append(Record(columns))
+        records.append(Record(columns, starts=part.starts))
     return records[0] if len(records) == 1 else concatenate(records)
 
 
@@ -140,7 +147,7 @@ def run(
         substeps.append(int(owed_s / dt_s + 1e-6))
         owed_s -= substeps[-1] * dt_s
     demand = [float(counts) for counts in (commands.counts[0], *commands.counts)]
-    told = Cycles(*(each[commands.lead :] for each in machine.follow_all(demand, substeps, outer_nm)))
+    told = _told(machine, demand, substeps, commands, outer_nm)
     motor, load = told.motor_reading, told.load_reading
     if not smooth:
         motor, load = np.floor(motor + 0.5), np.floor(load + 0.5)
@@ -151,6 +158,54 @@ def run(
     load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
     place = commands.row_cycles
     return Traces(*(_between(each, place) for each in (motor, load, torque, warmth, outer)))
+
+
+def _benched(bench: Bench, commands: Commands, axis: AxisConfig) -> list[Record]:
+    """The bench's records of the commands, one for each time that it has the drive switched on."""
+    load_deg = _degrees(commands.counts, axis) / axis.gear.ratio
+    starts = [0, *(each.stop + ON_BEFORE for each in commands.off)]
+    ends = [*(each.start for each in commands.off), len(load_deg)]
+    found = []
+    for start, end in zip(starts, ends, strict=True):
+        # What a drive shows in the first cycles after it was switched on was told it by nobody.
+        path = load_deg[start + (OFF_AFTER if start else 0) : end]
+        if end == len(load_deg):
+            path = np.append(path, np.full(LATENCY_CYCLES, load_deg[-1]))
+        measured = bench.run(_Again(path, commands.cycle_s)).record
+        if end > commands.lead:
+            found.append(_at_rows(measured, slice(start, end), commands, axis))
+    return found
+
+
+def _told(
+    machine: Machine,
+    demand: list[float],
+    substeps: list[int],
+    commands: Commands,
+    outer_nm: FloatArray | None,
+) -> Cycles:
+    """What the machine tells of each cycle after the approach."""
+    outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
+    told: list[Cycles] = []
+    done = 0
+    for off in (*commands.off, slice(len(substeps), len(substeps))):
+        on = slice(done, off.start)
+        told.append(machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on]))
+        told.append(_coasted(machine, substeps[off], outer_nm[off]))
+        demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # where the drive is on again
+        done = off.stop
+    whole = Cycles(*(np.concatenate(each) for each in zip(*told, strict=True)))
+    return Cycles(*(each[commands.lead :] for each in whole))
+
+
+def _coasted(machine: Machine, substeps: Sequence[int], outer_nm: FloatArray) -> Cycles:
+    """What the machine tells of cycles in which the drive is switched off; the brake closes at rest."""
+    rows = []
+    for count, outer in zip(substeps, outer_nm.tolist(), strict=True):
+        at_rest = abs(machine.velocity_counts_s) * count * machine.dt_s < 1.0
+        machine.coast(count, at_rest, outer)
+        rows.append([getattr(machine, name) for name in Cycles._fields])
+    return Cycles(*np.array(rows, dtype=np.float64).reshape(-1, len(Cycles._fields)).T)
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
@@ -171,7 +226,16 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     if np.max(np.abs(cycles - nearest)) <= UNEVEN and np.all(np.diff(nearest) >= 1.0):
         cycles = nearest
     grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
-    demand_deg = np.interp(grid, cycles, target)
+    gaps = [first for first in part.starts[1:] if just_on(part, first)]
+    nodes, values = cycles, target
+    for first in gaps:
+        # After its last row a procedure comes to rest where the next one begins: a parabola of the last two rows
+        # and of that.
+        before, last, rest = target[first - 2 : first + 1]
+        nodes = np.append(nodes, cycles[first - 1] + np.arange(1.0, OFF_AFTER + 1.0))
+        values = np.append(values, [last + (rest - before) / 3.0, rest])
+    order = np.argsort(nodes, kind="stable")
+    demand_deg = np.interp(grid, nodes[order], values[order])
     if grid[-1] > cycles[-1]:
         # The motion goes on to the end of its cycle: the last row lies within that.
         speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
@@ -181,7 +245,15 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
     if told_nm is not None:
         told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
-    return Commands((*approach, *recorded), len(approach), cycles, time_s, cycle_s, told_nm)
+    lead = len(approach)
+    off = [
+        slice(lead + math.floor(cycles[first - 1]) + 1 + OFF_AFTER, lead + math.floor(cycles[first]) - ON_BEFORE)
+        for first in gaps
+    ]
+    if target[0] == target[1] and just_on(part, 0):
+        off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
+    off = [each for each in off if each.stop > each.start]
+    return Commands((*approach, *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off))
 
 
 def _weightless(truth: Truth) -> Truth:
@@ -215,22 +287,14 @@ def at_cycle(axis: AxisConfig, cycle_s: float) -> AxisConfig:
 
 
 class _Again:
-    """A procedure that gives a recording's commands."""
+    """A procedure that gives commands, one for each cycle."""
 
-    def __init__(self, commands: Commands, axis: AxisConfig) -> None:
-        load_deg = _degrees(commands.counts, axis) / axis.gear.ratio
-        self._legs = [
-            _Leg(load_deg[: commands.lead], commands.cycle_s, "approach"),
-            _Leg(load_deg[commands.lead :], commands.cycle_s, "replay"),
-            _Leg(np.full(LATENCY_CYCLES, load_deg[-1]), commands.cycle_s, "approach"),
-        ]
+    def __init__(self, load_deg: FloatArray, cycle_s: float) -> None:
+        self._leg = _Leg(load_deg, cycle_s, "replay")
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """The approach, the commands, and as long as the last of them takes to show."""
-        approach, again, after = self._legs
-        yield approach
-        yield again
-        yield after
+        """The commands."""
+        yield self._leg
 
 
 class _Leg:
@@ -255,22 +319,25 @@ class _Leg:
         return True
 
 
-def _at_rows(measured: Record, commands: Commands, axis: AxisConfig) -> Record:
-    """The rows of the recording, from a run that began before them."""
-    wanted = np.array(commands.counts[commands.lead :], dtype=np.float64)
+def _at_rows(measured: Record, on: slice, commands: Commands, axis: AxisConfig) -> Record:
+    """The rows of the recording that lie in some cycles, from a run that began with these."""
+    cycles = commands.row_cycles + commands.lead
+    inside = (cycles >= on.start) & (cycles < on.stop)
+    first = max(on.start, commands.lead)
+    wanted = np.array(commands.counts[first : math.ceil(cycles[inside][-1]) + 1], dtype=np.float64)
     target = measured.motor_target_deg
     assert target is not None  # the bench records it
-    demand = np.round(axis.motor_encoder.counts(1.0) * target)
+    demand = np.round(axis.motor_encoder.counts(1.0) * target)[first - on.start :]
     off = [
-        float(np.sum(np.abs(demand[commands.lead + late :][: len(wanted)] - wanted)))
-        for late in range(LATENCY_CYCLES + 1)
+        float(np.sum(np.abs(demand[late:][: len(wanted)] - wanted)))
+        for late in range(min(LATENCY_CYCLES, len(demand) - len(wanted)) + 1)
     ]
-    first = commands.lead + int(np.argmin(off))
+    begin = first - on.start + int(np.argmin(off))
     columns = {
-        name: _between(column[first:][: len(wanted)], commands.row_cycles)
+        name: _between(column[begin:][: len(wanted)], cycles[inside] - first)
         for name, column in measured.columns.items()
     }
-    return Record(columns | {"time_s": commands.time_s})
+    return Record(columns | {"time_s": commands.time_s[inside]})
 
 
 def _between(column: FloatArray, cycles: FloatArray) -> FloatArray:

@@ -18,6 +18,10 @@ GAP_S = 0.5
 """A master that goes from task to task records nothing for some cycles; the command may stay the same."""
 SAME_DEG = 1e-6
 """Of the motor: the same count, told with as many digits."""
+STOPPED_DEG = 5.0
+"""Of the motor: as far as it goes at most from the last row of a procedure until it has stopped."""
+IDLE = 0.002
+"""Share of a record's largest torque that is as good as none."""
 RUN_IN_S = 2.0
 """What happened so long before a stretch is no longer to be seen in it: the ringing of a load that is hardly
 damped (15 Hz, 0.03) has come down to a three-hundredth."""
@@ -41,13 +45,29 @@ def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
 
 
 def continuous(record: Record) -> list[slice]:
-    """The rows of parts that follow each other within `GAP_S` and with the same command, in order."""
-    target, time_s = record.motor_target_deg, record.time_s
+    """The rows of parts that follow each other, in order: within `GAP_S`, the axis standing where it stood.
+
+    In between the drive was switched off, as the bench does between two procedures, or it holds the command.
+    """
+    target, motor, time_s = record.motor_target_deg, record.motor_position_deg, record.time_s
     firsts = [0]
     for first in record.starts[1:]:
         gap_s = float(time_s[first] - time_s[first - 1])
         # Records that were put together afterwards are one row apart.
         follows = 1.5 * float(np.median(np.diff(time_s))) < gap_s <= GAP_S
-        if not follows or target is None or abs(float(target[first] - target[first - 1])) > SAME_DEG:
+        held = target is not None and abs(float(target[first] - target[first - 1])) <= SAME_DEG
+        stood = abs(float(motor[first] - motor[first - 1])) <= STOPPED_DEG
+        if not follows or not (held or (stood and just_on(record, first))):
             firsts.append(first)
     return [slice(first, end) for first, end in pairwise([*firsts, len(record)])]
+
+
+def just_on(record: Record, row: int) -> bool:
+    """Whether a row is of a drive that has just been switched on: it has no torque yet.
+
+    Of a record without torque that is taken for granted: power is on only while a procedure runs.
+    """
+    torque_nm = record.columns.get("motor_torque_nm")
+    if torque_nm is None:
+        return True
+    return bool(abs(torque_nm[row]) <= IDLE * np.max(np.abs(torque_nm)))

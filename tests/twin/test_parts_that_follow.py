@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
@@ -17,6 +18,7 @@ from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import prepare, residuals
 from hdbridge.twin.parameters import LOAD
+from hdbridge.twin.replay import commands_of, replay, replay_directly
 from hdbridge.twin.stretches import continuous
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -36,6 +38,12 @@ def recorded() -> Recording:
         return Recording.joined([bench.run(Stepping(2, start_deg=0.0)) for _ in range(2)])
 
 
+def without_noise() -> Truth:
+    """The load encoder's noise is another draw."""
+    encoder = TRUTH.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
+    return TRUTH.model_copy(update={"load_": TRUTH.load_.model_copy(update={"encoder": encoder})})
+
+
 def moved(recording: Recording, later_s: float) -> Recording:
     """The second part later, as it would be in another recording."""
     record = recording.record
@@ -49,6 +57,31 @@ def test_parts_soon_after_each_other_follow_and_later_ones_do_not() -> None:
     assert len(recorded().record.starts) == 2
     assert len(continuous(recorded().record)) == 1
     assert len(continuous(moved(recorded(), 5.0).record)) == 2
+
+
+def test_a_replay_switches_the_drive_off_between_parts_as_the_bench_does() -> None:
+    """With frames and without: else a load that rings or a spring that is wound up would begin anew."""
+    axis, truth, recording = AXIS, without_noise(), recorded()
+    for again in (replay(recording, axis, truth), replay_directly(recording, axis, truth)):
+        for name in ("motor_target_deg", "motor_position_deg", "motor_torque_nm"):
+            assert np.array_equal(again.columns[name], recording.record.columns[name]), name
+
+
+def test_a_part_that_ends_in_motion_comes_to_rest_where_the_next_one_begins() -> None:
+    record = recorded().record
+    target = record.motor_target_deg
+    assert target is not None
+    cut = record.starts[1] - 40  # rows before the stop, as of a procedure that ends so
+    kept = np.r_[0:cut, record.starts[1] : len(record)]
+    columns = {name: column[kept] for name, column in record.columns.items()}
+    part = Record(columns, starts=(0, cut))
+    commands = commands_of(part, AXIS, TRUTH)
+    counts = np.array(commands.counts[commands.lead :])
+    assert AXIS.motor_encoder.counts(target[record.starts[1]]) == pytest.approx(counts[cut + 2], abs=1.0)
+    (approach, off) = commands.off
+    assert approach.stop <= commands.lead
+    assert off.start == commands.lead + cut + 2
+    assert off.stop == commands.lead + len(counts) - (len(record) - record.starts[1]) - 1
 
 
 def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_before() -> None:
