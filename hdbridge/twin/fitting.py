@@ -13,6 +13,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.bootstrap import unbiased
 from hdbridge.twin.least_squares import WORTH, Fitted, Progress, solve
 from hdbridge.twin.misfit import coarse, prepare, scales
+from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
     BY_NAME,
     LOAD,
@@ -40,7 +41,7 @@ SURE = 4.0
 FILTER_SHARES = (0.3, 0.6)
 """Shares of the lag that may be the command filter's, to begin with."""
 STEPS = 30
-"""Steps at most of a fit; of each of those to short pieces that it begins with `FIRST_STEPS`."""
+"""Steps at most of a fit; of each of those that it begins with `FIRST_STEPS`."""
 FIRST_STEPS = 12
 AGAIN = 3
 """So often at most a fit goes on from where its bias has been taken off: where that is nearer to the record
@@ -78,17 +79,25 @@ def fit(
     parameters = free_parameters(begun, more)
     prior = np.array(coordinates(begun, parameters))
     with Replays(rough, workers) as replays:
-        most = scales(rough, *replays([start]))
         begun = _at_best_frequency(replays, begun)
         progress(0.1)
-        starts = [solve(replays, each, parameters, prior, FIRST_STEPS, most=most) for each in _filters(begun)]
-        first = min(starts, key=lambda each: each.misfit)
+        noise = expected(rough)
+        starts = [
+            solve(replays, each, parameters, prior, FIRST_STEPS, known=noise) for each in _filters(begun)
+        ]
+        first = min(starts, key=lambda each: each.cost)
     progress(0.3)
     with Replays(data, workers) as replays:
         most = scales(data, *replays([start]))
+        # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel that
+        # tells it from the right one.
+        near = solve(
+            replays, first.truth, parameters, prior, FIRST_STEPS, lambda share: progress(0.3 + 0.2 * share),
+            known=expected(data), near=first,
+        )  # fmt: skip
         best = solve(
-            replays, first.truth, parameters, prior, STEPS, lambda share: progress(0.3 + 0.6 * share),
-            most=most, near=first,
+            replays, near.truth, parameters, prior, STEPS, lambda share: progress(0.5 + 0.4 * share),
+            most=most, near=near,
         )  # fmt: skip
         for name in LAST:
             wider = (*parameters, BY_NAME[name])

@@ -31,9 +31,9 @@ UNKNOWN_DEG = 60.0
 """Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
 recording."""
 UNKNOWN_S = 1.0
-"""... and time after which a load that was ringing before is at rest, where a recording begins in motion."""
+"""... and time after which a load that was ringing before is at rest, where that is not known."""
 LARGEST_UNKNOWN = 0.25
-"""Of such a recording, the largest share that is left out for that."""
+"""Of a part of a recording, the largest share that is left out for that."""
 RINGING_S = 0.25
 """So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
 STANDS_COUNTS = 1.5
@@ -130,7 +130,10 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
         for each in held:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
         judged = np.arange(led, end) >= first
-        pieces.append(_piece(part, commands, numbers, kinds, out, judged, axis.motor_encoder.counts_per_turn))
+        unknown = _unknown(part, axis.motor_encoder.counts_per_turn)
+        pieces.append(
+            _piece(part, commands, numbers, kinds, out, judged, unknown, axis.motor_encoder.counts_per_turn)
+        )
         first = end
     return Data(axis, base, tuple(pieces))
 
@@ -285,6 +288,7 @@ def _piece(
     kinds: tuple[str, ...],
     out: FloatArray,
     judged: NDArray[np.bool_],
+    unknown: NDArray[np.bool_],
     counts_per_turn: int,
 ) -> Piece:
     target = part.motor_target_deg
@@ -294,10 +298,7 @@ def _piece(
     last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
-    since_s = part.time_s - part.time_s[0]
-    rests = not np.any(moved[since_s < RINGING_S] > 0.0)
-    rings = since_s < (0.0 if rests else min(UNKNOWN_S, LARGEST_UNKNOWN * since_s[-1]))
-    elastic = rings | (np.cumsum(travelled) <= UNKNOWN_DEG)
+    elastic = unknown | (np.cumsum(travelled) <= UNKNOWN_DEG)
     # Between two parts a drive's loops may have begun anew.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * 360.0 / counts_per_turn)
@@ -308,11 +309,37 @@ def _piece(
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }
     counts = {
-        FOLLOWING: everywhere,
+        FOLLOWING: np.where(unknown, 0.0, everywhere),
         TORQUE: np.where(stuck | stands | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
         LOAD: np.where(elastic, 0.0, everywhere),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
+
+
+def _unknown(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:
+    """For each row whether the load may still ring of what nobody knows.
+
+    Where a recording begins in motion that is what was before it; where a procedure ended in motion, the
+    cycles until the drive was switched off.
+    """
+    target, time_s = part.motor_target_deg, part.time_s
+    assert target is not None  # commands_of has refused it
+    begins = []
+    if np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0):
+        begins.append(0)
+    count_deg = 360.0 / counts_per_turn
+    begins += [
+        first
+        for first in part.starts[1:]
+        if abs(target[first] - target[first - 1]) > STANDS_COUNTS * count_deg
+    ]
+    unknown = np.zeros(len(part), dtype=np.bool_)
+    ends = (*part.starts[1:], len(part))
+    for begin in begins:
+        end = next(each for each in ends if each > begin)
+        length_s = min(UNKNOWN_S, LARGEST_UNKNOWN * float(time_s[end - 1] - time_s[begin]))
+        unknown[begin:end] = time_s[begin:end] - time_s[begin] < length_s
+    return unknown
 
 
 def _stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
@@ -60,7 +60,7 @@ class Commands:
     told_nm: FloatArray | None = None
     """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
     off: tuple[slice, ...] = ()
-    """Cycles in which the drive is switched off and its brake is on."""
+    """Cycles in which the drive is switched off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,11 +229,13 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     gaps = [first for first in part.starts[1:] if just_on(part, first)]
     nodes, values = cycles, target
     for first in gaps:
-        # After its last row a procedure comes to rest where the next one begins: a parabola of the last two rows
-        # and of that.
-        before, last, rest = target[first - 2 : first + 1]
-        nodes = np.append(nodes, cycles[first - 1] + np.arange(1.0, OFF_AFTER + 1.0))
-        values = np.append(values, [last + (rest - before) / 3.0, rest])
+        # After its last row a procedure goes on as it slowed down, no further than where the next one begins.
+        later = np.arange(1.0, OFF_AFTER + 1.0)
+        earlier, before, last, rest = target[[max(first - 3, 0), first - 2, first - 1, first]]
+        slowing = last - 2.0 * before + earlier
+        goes_on = last + later * (last - before) + 0.5 * later * (later + 1.0) * slowing
+        nodes = np.append(nodes, cycles[first - 1] + later)
+        values = np.append(values, np.clip(goes_on, min(last, rest), max(last, rest)))
     order = np.argsort(nodes, kind="stable")
     demand_deg = np.interp(grid, nodes[order], values[order])
     if grid[-1] > cycles[-1]:
@@ -247,7 +249,9 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
     lead = len(approach)
     off = [
-        slice(lead + math.floor(cycles[first - 1]) + 1 + OFF_AFTER, lead + math.floor(cycles[first]) - ON_BEFORE)
+        slice(
+            lead + math.floor(cycles[first - 1]) + 1 + OFF_AFTER, lead + math.floor(cycles[first]) - ON_BEFORE
+        )
         for first in gaps
     ]
     if target[0] == target[1] and just_on(part, 0):

@@ -67,21 +67,23 @@ def test_a_replay_switches_the_drive_off_between_parts_as_the_bench_does() -> No
             assert np.array_equal(again.columns[name], recording.record.columns[name]), name
 
 
-def test_a_part_that_ends_in_motion_comes_to_rest_where_the_next_one_begins() -> None:
+def test_a_part_that_ends_in_motion_slows_down_as_before_and_is_switched_off() -> None:
     record = recorded().record
-    target = record.motor_target_deg
+    target, second = record.motor_target_deg, record.starts[1]
     assert target is not None
-    cut = record.starts[1] - 40  # rows before the stop, as of a procedure that ends so
-    kept = np.r_[0:cut, record.starts[1] : len(record)]
+    moves = np.flatnonzero(np.diff(target[:second]) != 0.0)
+    cut = int(moves[-1]) - 3  # the command of the first rows that are left out still moves
+    kept = np.r_[0:cut, second : len(record)]
     columns = {name: column[kept] for name, column in record.columns.items()}
-    part = Record(columns, starts=(0, cut))
-    commands = commands_of(part, AXIS, TRUTH)
+    commands = commands_of(Record(columns, starts=(0, cut)), AXIS, TRUTH)
     counts = np.array(commands.counts[commands.lead :])
-    assert AXIS.motor_encoder.counts(target[record.starts[1]]) == pytest.approx(counts[cut + 2], abs=1.0)
-    (approach, off) = commands.off
-    assert approach.stop <= commands.lead
+    assert AXIS.motor_encoder.counts(1.0) * target[cut : cut + 2] == pytest.approx(
+        counts[cut : cut + 2], abs=6
+    )
+    approach, off = commands.off
+    assert approach.stop < commands.lead
     assert off.start == commands.lead + cut + 2
-    assert off.stop == commands.lead + len(counts) - (len(record) - record.starts[1]) - 1
+    assert off.stop == commands.lead + len(counts) - (len(record) - second) - 1
 
 
 def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_before() -> None:
