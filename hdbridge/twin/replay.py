@@ -3,8 +3,9 @@
 Both ways give the same numbers. The frames show that a twin is what a master meets; without them a fit can
 afford the hundreds of replays that it needs.
 
-Before each part of a recording nothing is known of the axis, so each begins on a drive that is switched on
-at its angle zero and led to the first command at the axis's limits.
+Before a recording nothing is known of the axis, so the replay begins on a drive that is switched on at its
+angle zero and led to the first command at the axis's limits; so does each part that does not follow another
+one. Between parts that follow each other the drive is switched off, as the bench does, and the load rings on.
 
 What acted on the axis from outside is part of a recording as its commands are: where it tells the torque on
 the load, the simulated load is pushed by as much, in place of its own weight.
