@@ -45,9 +45,9 @@ their mean: rounding is no noise (see `bootstrap`). And a sample counts by how f
 breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
 LEAST_SUSPECT = 0.25
 """Share of that which the slopes have to promise: they say little of what goes out of step."""
-TOLERATED = 1.3**2 - 1.0
-"""Mean square that a cause has to explain of some channel, in squares of its noise: a twin that leaves no
-more than 1.3 times the noise counts as right, so it may be off by as much itself."""
+TOLERATED = (1.0 / 3.0) ** 2
+"""Mean square that a cause has to explain of some channel, in squares of its noise: what adds less than a
+third of the noise to every channel nobody at the bench would see, and a twin may be off by as much."""
 OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
 """Looked at in addition to what a fit changes."""
 
@@ -269,7 +269,7 @@ class _Search:
         )
 
     def _matters(self, best: _Place, found: _Place) -> bool:
-        """Whether one cause more explains more than a twin that is right may leave."""
+        """Whether one cause more explains more than a twin may leave."""
         alike = [each.left * each.apart / np.maximum(best.apart, found.apart) for each in (best, found)]
         return bool(np.any(self._squares(alike[0]) - self._squares(alike[1]) > TOLERATED))
 
