@@ -31,8 +31,8 @@ NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 
 
 @cache
-def recorded(seed: int = 0, **changes: float) -> Recording:
-    """Three long steps each way on the demo axis, with some of its values changed (by their names)."""
+def recorded(seed: int = 0, count: int = 3, **changes: float) -> Recording:
+    """Some long steps each way on the demo axis, with some of its values changed (by their names)."""
     values = {name.replace("_", " "): value for name, value in changes.items()}
     truth = with_values(TRUTH, values) if values else TRUTH
     with (
@@ -40,7 +40,7 @@ def recorded(seed: int = 0, **changes: float) -> Recording:
         Drive(bus, AXIS, clock) as drive,
     ):
         drive.boot()
-        return Bench(drive).run(Stepping(3, step_deg=150.0))
+        return Bench(drive).run(Stepping(count, step_deg=150.0))
 
 
 @cache
@@ -116,7 +116,7 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
 
 
 def test_a_check_names_what_has_changed() -> None:
-    changed = recorded(seed=2, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
+    changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
     told = check(changed, AXIS, twin(), workers=1)
     assert [each.cause for each in told.changes] == ["load inertia"]
     (inertia,) = told.changes[0].parameters
