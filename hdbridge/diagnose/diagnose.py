@@ -329,11 +329,8 @@ class _Judge:
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
-        squares = left.arcsec**2 * float(np.sum(self.estimator.weight**2))
-        if many is not None:
-            squares = sum(each.robust for each in many)
-        most = max((each.robust for each in findings), default=0.0)
-        return [*findings, unknown] if most > scales.shadow * squares else [unknown, *findings]
+        largest = max((each.peak_arcsec for each in findings), default=0.0)
+        return [*findings, unknown] if largest > scales.leads * size else [unknown, *findings]
 
     def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """What a prediction for the usable points leaves of them, about the zeros that suit it best."""

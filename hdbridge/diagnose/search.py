@@ -101,8 +101,10 @@ class Search:
                     continue
             if found is None:
                 break
+            left = found.chi_square
+            slow = left > self.scales.slow * fitted.chi_square
             fitted = found
-            if number + 1 >= self.scales.few and fitted.chi_square > self.scales.large * len(fitted.residual):
+            if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # piece by piece at something that is none of them
             if number < ANEW:
                 fitted, law_gain = self.with_best_law(fitted)

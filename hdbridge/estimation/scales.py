@@ -40,6 +40,12 @@ class Scales:
     # Looking again.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
+    slow: float = _scale(
+        0.8,
+        "share of a large rest that one more than few may leave",
+        math.inf,
+        "blind suites of simulated axes",
+    )
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
@@ -81,7 +87,8 @@ class Scales:
         0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
     )
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
-    near: float = _scale(0.5, "share of the largest piece", math.inf, "within 6 dB of each other")
+    near: float = _scale(0.4, "share of the largest piece", math.inf, "blind suites of simulated axes")
+    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, "blind suites of simulated axes")
     foretold: float = _scale(
         0.3,
         "share of the square of what is left",
