@@ -67,7 +67,7 @@ class Blocks:
     locked_arcsec: FloatArray
     """Standard deviation of an error that is the same over a leg, from reading the motor in whole counts."""
     blur: FloatArray
-    """Variance of each block, arcsec squared, because the driving angle is known to a count only."""
+    """Variance of each block, arcsec squared, because turns of the driving angle are known so well only."""
 
     def __len__(self) -> int:
         """Number of blocks."""

@@ -69,13 +69,13 @@ class Design:
         return np.asarray(sum(parts, start=np.zeros(len(self.blocks))))
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
-        """What a count further at the turn before would change, arcsec (b,), and which turn that is.
+        """What a reach further at the turn before would change, arcsec (b,), and which turn that is.
 
+        The reach is within what a turn is known: the count, and twice what may lie between two samples.
         Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
         """
         change = np.zeros(len(self.blocks))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
-        shift = 0.5 * self.samples.count_deg
         last = 0
         for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
             picked, middles = self.sketch[number]
@@ -84,15 +84,17 @@ class Design:
             inside = self.blocks.chain == number
             turn[inside] = last + np.searchsorted(turning, middles, "left")
             last += len(turning) + 1
-            if shift <= 0 or not signs:
+            at = picked[turning[1:-1]]
+            reach = self.samples.count_deg + 2.0 * missed_deg(self.samples.motor_deg[chain.rows], at)
+            if not np.any(reach):
                 continue
             moved_motor = motion.motor_deg.copy()
-            moved_motor[turning[1:-1]] += shift * np.array(signs[:-1])
+            moved_motor[turning[1:-1]] += 0.5 * reach * np.array(signs[:-1])
             other = replace(motion, motor_deg=moved_motor)
             for effect in effects:
                 if not isinstance(effect.tracker(), Memoryless):
                     change[inside] += (effect.predict(other, start) - effect.predict(motion, start))[middles]
-        return change / max(shift, 1e-12) * self.samples.count_deg, turn
+        return 2.0 * change, turn
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
         """The same, each block's variance raised by what rounding of the driving angle does to the effects.
@@ -143,3 +145,18 @@ def clusters(blocks: Blocks, number: int) -> IntArray:
     span_s = max(float(gone[-1]) / number, 1e-9)
     cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
     return np.concatenate([[0], np.cumsum(cut)]).astype(np.intp)
+
+
+def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
+    """How much further than at the sample of each turn the motor may have been, shape of ``turns``.
+
+    Between two samples at one speed each way the lines before and after meet so far outside. A motor that
+    rests where it turns was read there.
+    """
+
+    def step(way: int) -> FloatArray:
+        other = np.clip(turns + way, 0, len(motor_deg) - 1)
+        return np.asarray(np.abs(motor_deg[other] - motor_deg[turns]))
+
+    longest = np.minimum(step(-2), step(2))
+    return np.asarray(0.5 * np.minimum(np.abs(step(1) - step(-1)), longest))

@@ -3,10 +3,11 @@
 A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole
 counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a
 count *in the direction of motion*: that looks like hysteresis too, and the fraction changes with speed.
-Each turn is known to within a count only, and a hysteresis that is narrow or steep cannot be known better
-than its turns. Each has a column; a fraction of a count it cannot exceed. With fine encoders these columns
-vanish by themselves. The load on the gear's spring swings beyond the error that shakes it, the more the
-faster. Two speeds distinguish that from the orders' amplitudes; at one speed they are less well known.
+Each turn is known to within a count and the way between two samples only (its reach), and a hysteresis that
+is narrow or steep cannot be known better than its turns. Each has a column; a fraction of its reach it cannot
+exceed. With fine encoders that are read often these columns vanish by themselves. The load on the gear's
+spring swings beyond the error that shakes it, the more the faster. Two speeds distinguish that from the
+orders' amplitudes; at one speed they are less well known.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ SWING_COUNT_ARCSEC = 2.0
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
-"""Standard deviation that an unknown place within a count has."""
+"""Standard deviation that an unknown place within a count, or within the reach of a turn, has."""
 SPEEDS_COUNTS_S = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0, np.inf)
 """Edges of the classes of speed that round alike; at rest is a class of its own."""
 SHARE = 0.1
@@ -85,7 +86,7 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
 
 
 def turn_columns(design: Design, effects: Sequence[Effect]) -> FloatArray:
-    """A column for each turn that matters, shape (b, turns): what a count further out would change."""
+    """A column for each turn that matters, shape (b, turns): what its reach further out would change."""
     change, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
     most = np.argsort(weight)[::-1][:MOST_TURNS]

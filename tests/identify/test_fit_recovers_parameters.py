@@ -249,3 +249,26 @@ def test_a_load_that_lags_is_fitted_as_well_as_one_that_leads(bench):
     assert {each.order.number for each in found.orders} == set(axis.orders)
     assert found.interval("synchronous", "orders[6].amplitude_arcsec").half_width < 0.2
     assert found.noise.residual_arcsec == pytest.approx(0.5, rel=0.1)
+
+
+def test_turns_between_two_samples_bend_no_parameter_of_the_loop(bench):
+    """Read at every fifth place of the path, a turn at 40 deg/s may lie 0.4 deg beyond the nearest sample."""
+    axis, every = bench.axis(width=10.0, noise=0.1, motor_counts=3e6), 5
+    legs = [
+        ("sweep", bench.ramp(0.0, 1440.0, 200.3 / every)),
+        ("sweep", bench.ramp(1440.0, 0.0, 200.3 / every)),
+    ]
+    for depth in (3.0, 5.0, 8.0, 12.0, 16.0):
+        for begin, to in ((0.0, -60.0), (-60.0, 0.0), (0.0, -depth), (-depth, -depth / 2), (-depth / 2, 0.0)):
+            legs.append(("reversal", bench.ramp(begin, to, 40.3 / every)))
+    segments, at = [], 0
+    for each in axis.record(legs):
+        kept = slice(-at % every, None, every)
+        time_s, motor_deg, load_deg = each.time_s[kept] / every, each.motor_deg[kept], each.load_deg[kept]
+        segments.append(Segment(time_s, motor_deg, load_deg, each.kind))
+        at += len(each)
+    result = fit(segments, axis.ratio, bench.options)
+    assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0
+    assert off(result, "hysteresis", "width_deg", axis.width) < 2.0
+    assert off(result, "hysteresis", "exponent", axis.exponent) < 2.0
+    assert result.interval("hysteresis", "width_deg").half_width < 0.3
