@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import yaml
 from twin_random_axes import bench, draw
 
 from hdbridge.axis import AxisConfig
@@ -41,6 +42,8 @@ def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibrat
     """A calibration with its stepping test, of an axis without a model."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
+        (folder / "axis.yaml").write_text(yaml.safe_dump(content))
         with (
             simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
             Drive(bus, axis, clock) as drive,
@@ -73,7 +76,7 @@ def phasors(model: TransmissionModel) -> dict[int, complex]:
 
 
 def one(seed: int, plan: str, workers: int) -> str:
-    """Both calibrations of one axis, in a line."""
+    """One axis, in a line."""
     began_s = time.perf_counter()
     axis, truth = draw(seed)
     own = calibrated(axis, truth, plan, seed)
@@ -81,23 +84,28 @@ def one(seed: int, plan: str, workers: int) -> str:
     start = translate(axis, own.model).truth
     twin = fit_twin([recording], axis, start, workers=workers).truth
     again = calibrated(axis, twin, plan, seed + 2000)
+    law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
+    return f"{seed:4d} {law:16s} | {compared(own, again)} | {time.perf_counter() - began_s:.0f} s"
+
+
+def compared(own: Calibration, again: Calibration) -> str:
+    """Two calibrations, of the axis and of its twin."""
     stepped = three_sigma_arcsec(own), three_sigma_arcsec(again)
     offsets = offset_arcsec(own.model), offset_arcsec(again.model)
     one, other = phasors(own.model), phasors(again.model)
     apart = {order: abs(one.get(order, 0.0) - other.get(order, 0.0)) for order in {*one, *other}}
     worst = max(apart, key=lambda order: apart[order], default=0)
     off = apart.get(worst, 0.0)
-    law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
     verdicts = (
         abs(stepped[1] / stepped[0] - 1.0) <= STEPPING,
         abs(offsets[1] / offsets[0] - 1.0) <= OFFSET,
         off <= ORDERS_ARCSEC,
     )
     return (
-        f"{seed:4d} {law:16s} | 3 sigma {stepped[0]:6.2f} {stepped[1]:6.2f} "
+        f"3 sigma {stepped[0]:6.2f} {stepped[1]:6.2f} "
         f"({100 * (stepped[1] / stepped[0] - 1):+.1f} %) | offset {offsets[0]:6.2f} {offsets[1]:6.2f} "
         f"({100 * (offsets[1] / offsets[0] - 1):+.1f} %) | order {worst} {off:.2f} arcsec apart | "
-        f"{' '.join('ok' if each else 'OUT' for each in verdicts)} | {time.perf_counter() - began_s:.0f} s"
+        f"{' '.join('ok' if each else 'OUT' for each in verdicts)}"
     )
 
 
