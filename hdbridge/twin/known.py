@@ -46,12 +46,14 @@ class Known:
     def root(self, parameters: Sequence[Parameter]) -> FloatArray:
         """A root of the covariance of these parameters' coordinates, shape (p, fitted).
 
-        A parameter that the twin has not fitted has no error there.
+        In no direction is it wider than the prior, whatever the residuals of a few legs say. A parameter that
+        the twin has not fitted has no error there.
         """
-        deviation = np.sqrt(np.diag(self.covariance))
+        spread = {each.name: each.spread for each in parameters}
+        prior = np.array([spread.get(name, 1.0) for name in self.names])
         # A file has some digits of it: what they leave of the smallest eigenvalues may be below zero.
-        worth, directions = np.linalg.eigh(self.covariance / np.outer(deviation, deviation))
-        whole = deviation[:, None] * directions * np.sqrt(np.maximum(worth, 0.0))
+        worth, directions = np.linalg.eigh(self.covariance / np.outer(prior, prior))
+        whole = prior[:, None] * directions * np.sqrt(np.clip(worth, 0.0, 1.0))
         root = np.zeros((len(parameters), len(self.names)))
         for row, each in enumerate(parameters):
             if each.name in self.names:
