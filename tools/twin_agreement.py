@@ -35,7 +35,7 @@ from hdbridge.twin.translation import translate
 
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
 STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02
-"""What the issue asks for: a share of 3 sigma, each order's phasor, a share of the offset."""
+"""How far a twin may be off: a share of 3 sigma, each order's phasor, a share of the offset."""
 
 
 def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:

@@ -291,7 +291,5 @@ class ProcessImage:
         if not math.isfinite(motor_deg):
             raise InputError(f"target of {motor_deg!r} deg is not a finite angle; the target was not sent")
         counts = round(self.axis.motor_encoder.counts(motor_deg))
-        least, greatest = self.limits_counts
-        if not least <= counts <= greatest:
-            self.check_target(counts)
+        self.check_target(counts)
         return counts

@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+BLIND = "blind suites of simulated axes"
+"""Chosen so that wrong names became rare there without a right one being lost."""
 FITTED = "tools/fit_probabilities.py"
 
 
@@ -44,7 +46,7 @@ class Scales:
         0.8,
         "share of a large rest that one more than few may leave",
         math.inf,
-        "blind suites of simulated axes",
+        BLIND,
     )
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
@@ -76,9 +78,7 @@ class Scales:
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
-    foot_lines: float = _scale(
-        50.0, "lines of the record's resolution", 0.0, "blind suites of simulated axes"
-    )
+    foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
 
     # What is left.
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
@@ -87,8 +87,8 @@ class Scales:
         0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
     )
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
-    near: float = _scale(0.4, "share of the largest piece", math.inf, "blind suites of simulated axes")
-    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, "blind suites of simulated axes")
+    near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
+    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
     foretold: float = _scale(
         0.3,
         "share of the square of what is left",

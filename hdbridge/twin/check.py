@@ -218,7 +218,8 @@ class _Search:
             for way in (-1.0, 1.0)
         ]
         truths = [best.truth, *(_shifted(best.truth, each, by) for each, by in moves)]
-        here, *costs = (self._cost(found, best) for found in self._replays(truths))
+        scale = self._scale_at(best)
+        here, *costs = (self._cost(found, scale) for found in self._replays(truths))
         nearest: dict[str, tuple[float, Truth]] = {}
         for (each, _), cost, there in zip(moves, costs, truths[1:], strict=True):
             price = 0.5 * self._price(each.cause)
@@ -227,8 +228,8 @@ class _Search:
         ranked = sorted(nearest, key=lambda cause: nearest[cause][0])
         return [(cause, nearest[cause][1]) for cause in ranked[:CONTENDERS]]
 
-    def _cost(self, found: dict[str, FloatArray], near: _Place) -> float:
-        left = softened(scaled(found, self._scale_at(near))[self._rows])
+    def _cost(self, found: dict[str, FloatArray], scale: dict[str, Any]) -> float:
+        left = softened(scaled(found, scale)[self._rows])
         return 0.5 * float(left @ left)
 
     def _scale_at(self, near: _Place) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.least_squares import over_legs
 from hdbridge.twin.parameters import Parameter
 
 
@@ -104,11 +105,7 @@ def change_of(
 
 def _louder(slopes: FloatArray, noise: FloatArray, legs: FloatArray, variance: float) -> FloatArray:
     """By coordinate, how much more residuals that go together within a leg weigh than white ones."""
-    order = np.argsort(legs, kind="stable")
-    firsts = np.flatnonzero(np.diff(legs[order], prepend=-1.0))
-    by_leg = np.add.reduceat((slopes * noise[:, None])[order], firsts, axis=0)
-    few = len(by_leg) / max(len(by_leg) - 1, 1)
     white = variance * np.sum(np.square(slopes), axis=0)
-    squares = few * np.sum(np.square(by_leg), axis=0)
+    squares = np.sum(np.square(over_legs(slopes * noise[:, None], legs)), axis=0)
     times = np.divide(squares, white, out=np.ones_like(white), where=white > 0.0)
     return np.asarray(np.sqrt(np.maximum(times, 1.0)), dtype=np.float64)

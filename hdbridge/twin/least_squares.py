@@ -18,6 +18,8 @@ from scipy.optimize import lsq_linear
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.intervals import NORMAL_95
+from hdbridge.estimation.stretches import counted as numbered
+from hdbridge.estimation.stretches import sums
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, Data, counted, scales
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
@@ -258,17 +260,18 @@ def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
 
 
+def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
+    """Sums of rows (n, p) over each leg, shape (legs, p); their squares make up for few legs."""
+    by_leg = sums(rows, numbered(legs.astype(np.intp)))
+    return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
+
+
 def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
     """Covariance of the coordinates where residuals of one leg go together and legs are independent."""
     information = information_of(slopes, spread)
     inverse = np.linalg.inv(information)
-    gradients = slopes * left[:, None]
-    order = np.argsort(legs, kind="stable")
-    firsts = np.flatnonzero(np.diff(legs[order], prepend=-1.0))
-    by_leg = np.add.reduceat(gradients[order], firsts, axis=0)
-    count = len(by_leg)
-    few = count / max(count - 1, 1)
-    meat = few * by_leg.T @ by_leg + np.diag(spread**-2.0)
+    by_leg = over_legs(slopes * left[:, None], legs)
+    meat = by_leg.T @ by_leg + np.diag(spread**-2.0)
     covariance = inverse @ meat @ inverse
     # Never better than what independent residuals of the present size would give.
     white = inverse * max(1.0, float(left @ left) / max(len(left) - len(spread), 1))

@@ -135,10 +135,10 @@ def run(
     smooth: bool = False,
 ) -> Traces:
     """The commands through the machine alone; a ``smooth`` one reports what it does unrounded."""
-    outer_nm = None
+    outer_nm = np.zeros(len(commands.counts))
     if commands.told_nm is not None:
         truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
-    machine = Machine(truth, seed, may_compile=True, loaded=outer_nm is not None)
+    machine = Machine(truth, seed, may_compile=True, loaded=commands.told_nm is not None)
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
@@ -183,10 +183,9 @@ def _told(
     demand: list[float],
     substeps: list[int],
     commands: Commands,
-    outer_nm: FloatArray | None,
+    outer_nm: FloatArray,
 ) -> Cycles:
     """What the machine tells of each cycle after the approach."""
-    outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
     told: list[Cycles] = []
     done = 0
     for off in (*commands.off, slice(len(substeps), len(substeps))):
