@@ -100,7 +100,7 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
 def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
     """As `replay`, without bus and master; the load encoder's noise is another draw.
 
-    What the drive's supervision or its limits would stop or cut is let pass.
+    What the drive's supervision would stop, or its limits of speed would cut, is let pass.
     """
     records = []
     for rows in continuous(recording.record):
@@ -139,6 +139,7 @@ def run(
     if commands.told_nm is not None:
         truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
     machine = Machine(truth, seed, may_compile=True, loaded=commands.told_nm is not None)
+    machine.torque_limit_permille = 10.0 * axis.limits.torque_percent  # as the master tells the drive
     dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)

@@ -48,9 +48,13 @@ def benched(axis: AxisConfig, truth: Truth, procedure: Any) -> Recording:
         return Bench(drive).run(procedure)
 
 
-@pytest.mark.parametrize("dead_time_ms", [0.0, 1.3])
-def test_the_replay_on_the_true_axis_is_its_recording_with_frames_and_without(dead_time_ms: float) -> None:
+@pytest.mark.parametrize(("dead_time_ms", "torque_percent"), [(0.0, 100.0), (1.3, 100.0), (0.0, 20.0)])
+def test_the_replay_on_the_true_axis_is_its_recording_with_frames_and_without(
+    dead_time_ms: float, torque_percent: float
+) -> None:
     axis, truth = demo(dead_time_ms=dead_time_ms)
+    limits = axis.limits.model_copy(update={"torque_percent": torque_percent})
+    axis = axis.model_copy(update={"limits": limits})
     recording = benched(axis, truth, Stepping(2, start_deg=0.0))
     over_frames = replay(recording, axis, truth)
     directly = replay_directly(recording, axis, truth)
