@@ -148,11 +148,18 @@ def draw(seed: int) -> tuple[AxisConfig, Truth]:
 
 
 def _gain_margin(truth: dict[str, Any]) -> float:
-    """By how much the velocity gain may fall until the loops of a rigid axis hunt (Routh)."""
-    servo, ratio = truth["servo"], truth["gear"]["ratio"]
-    inertia = truth["motor"]["inertia_kg_m2"] + truth["load"]["inertia_kg_m2"] / ratio**2
+    """By how much the velocity gain may fall or rise until the loops are unstable.
+
+    It may fall until those of a rigid axis are (Routh). It may rise until the motor alone is: the loop
+    sees the mean speed of the substep before, so at two inertias in a substep.
+    """
+    servo, motor, ratio = truth["servo"], truth["motor"], truth["gear"]["ratio"]
+    gain, inertia = servo["velocity_gain_nm_s_per_rad"], motor["inertia_kg_m2"]
+    whole = inertia + truth["load"]["inertia_kg_m2"] / ratio**2
     position, integral = servo["position_gain_per_s"], 1e3 / servo["integral_time_ms"]
-    return float(servo["velocity_gain_nm_s_per_rad"] / inertia * (1.0 / position + 1.0 / integral))
+    least = whole / (1.0 / position + 1.0 / integral)
+    most = 2.0 * inertia / (1e-3 * truth["substep_ms"])
+    return float(min(gain / least, most / gain))
 
 
 def _law(law: str, rng: np.random.Generator) -> dict[str, Any]:
