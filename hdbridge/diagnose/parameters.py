@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from hdbridge.diagnose.acceptance import BLOCKS_S
 from hdbridge.diagnose.result import Parameter
@@ -51,7 +51,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
         if not normal:
             share = sums((tangent @ inverse) ** 2, number)
             carried = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
-            wider = student.ppf(0.975, np.maximum(carried - 1.0, 1.0)) / NORMAL_95
+            wider = stdtrit(np.maximum(carried - 1.0, 1.0), 0.975) / NORMAL_95
             spread = spread * np.outer(wider, wider)
         larger = np.sqrt(np.maximum(np.diag(spread), 0.0) / np.maximum(np.diag(best), 1e-300))
         grow = np.maximum(larger, 1.0)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
@@ -347,5 +346,14 @@ class Estimator:
 
 
 def _smooth(values: FloatArray) -> FloatArray:
-    """A channel without the noise of its readings, of which parabolas through `SMOOTH` keep a sixth."""
-    return np.asarray(savgol_filter(values, SMOOTH, 2)) if len(values) > SMOOTH else values
+    """A channel without the noise of its readings, of which parabolas through `SMOOTH` keep a sixth.
+
+    Savitzky and Golay's filter; scipy.signal has it, and takes a second to load.
+    """
+    if len(values) <= SMOOTH:
+        return values
+    half = SMOOTH // 2
+    parabolas = np.linalg.qr(np.vander(np.arange(-half, half + 1.0), 3))[0]
+    fit = parabolas @ parabolas.T
+    inside = np.convolve(values, fit[half], "valid")
+    return np.concatenate([fit[:half] @ values[:SMOOTH], inside, fit[-half:] @ values[-SMOOTH:]])

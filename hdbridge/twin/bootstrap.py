@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.intervals import NORMAL_95
@@ -64,7 +64,7 @@ def unbiased(replays: Replays, fitted: Fitted) -> Fitted:
             left.append(off - slopes @ (each - fitted.place))
         bias = np.mean(missed, axis=0)
         place = np.clip(fitted.place - bias, *low_high)
-        few = float(t.ppf(0.975, count - 1)) / NORMAL_95 * np.sqrt(1.0 + 1.0 / count)
+        few = float(stdtrit(count - 1, 0.975)) / NORMAL_95 * np.sqrt(1.0 + 1.0 / count)
         deviation = few * np.std(missed, axis=0, ddof=1)
         covariance = _scaled_to(inverse, np.minimum(deviation, np.sqrt(np.diag(fitted.covariance))))
     own = fitted.vector - np.mean(left, axis=0)

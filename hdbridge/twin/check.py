@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
@@ -282,7 +282,7 @@ class _Search:
 
     def _certain(self, moved: _Moved) -> bool:
         """Whether a cause has moved beyond what is open."""
-        return float(chi2.sf(moved.distance, len(moved.places))) < FALSE_ALARM / len(self._causes)
+        return float(chdtrc(len(moved.places), moved.distance)) < FALSE_ALARM / len(self._causes)
 
     def _significant(self, cause: str, at: _Place) -> bool:
         """... and by as much as matters."""

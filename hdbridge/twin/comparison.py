@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
@@ -358,6 +357,8 @@ def _spectrum(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
     length = min(SPECTRUM_SAMPLES, longest.stop - longest.start)
     if length < 4 * LEAST_SAMPLES:
         return None
+    from scipy.signal import welch  # noqa: PLC0415 - takes a second to load
+
     powers: list[FloatArray] = []
     weights: list[int] = []
     frequency = np.empty(0)
@@ -370,7 +371,7 @@ def _spectrum(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
             continue
         values = (trace.measured[part], trace.simulated[part], trace.difference[part])
         even = np.stack([np.interp(grid, time_s, each) for each in values])
-        frequency, power = signal.welch(even, 1.0 / period_s, nperseg=length, detrend="linear")
+        frequency, power = welch(even, 1.0 / period_s, nperseg=length, detrend="linear")
         powers.append(power)
         weights.append(len(grid))
     if not powers:

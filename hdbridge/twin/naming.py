@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
@@ -98,7 +98,7 @@ def name_causes(replays: Replays, start: Truth, fitted: Fitted, sets: Sequence[A
     tried: list[tuple[str, list[int], float]] = []
     for cause, places in groups.items():
         distance = _moved(fitted, start, places)
-        if chi2.sf(distance, len(places)) < FALSE_ALARM / len(groups) and _matters(fitted, start, places):
+        if chdtrc(len(places), distance) < FALSE_ALARM / len(groups) and _matters(fitted, start, places):
             tried.append((cause, places, distance))
     if not tried:
         return ()
@@ -144,8 +144,8 @@ def finding(
 
 def _evidence(distance: float, count: int) -> float:
     """Natural logarithm of one over the probability of a distance by chance."""
-    exact = -float(chi2.logsf(distance, count))
-    return exact if math.isfinite(exact) else 0.5 * distance
+    chance = float(chdtrc(count, distance))
+    return -math.log(chance) if chance > 0.0 else 0.5 * distance
 
 
 def alike(fitted: Fitted) -> tuple[Alike, ...]:

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from hdbridge.daemon.adaptation.measuring import Observation
 from hdbridge.daemon.adaptation.prior import bounds_arcsec, estimator_of
@@ -174,7 +174,7 @@ class Judge:
         ]
         if zero is not None and (found := self._zero_moved(rows, observed, zero)):
             moved.append(found)
-        left_allowed = self._noise * float(np.sqrt(chi2.isf(self.alpha, free) / free))
+        left_allowed = self._noise * float(np.sqrt(chdtri(free, self.alpha) / free))
         return Evidence(
             places=count,
             rms_arcsec=as_calibrated,
@@ -205,7 +205,7 @@ class Judge:
         free = max(len(observed) - nuisance.shape[1], 1)
         calibrated = self._calibrated[:zero, :zero]
         allowed = float(np.mean(np.einsum("ij,jk,ik->i", followed, calibrated, followed))) if zero else 0.0
-        share = chi2.isf(self.alpha, free) / free
+        share = chdtri(free, self.alpha) / free
         return float(np.sqrt(about @ about / free)), float(np.sqrt(share * (self._noise**2 + allowed)))
 
     def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
@@ -213,7 +213,7 @@ class Judge:
         at, allowed = term.columns, self._allowed
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
-        if float(own @ np.linalg.solve(variance, own)) < chi2.isf(self.alpha, len(own)):
+        if float(own @ np.linalg.solve(variance, own)) < chdtri(len(own), self.alpha):
             return None
         does = rows[:, at] @ own
         size = float(np.std(does))
@@ -242,7 +242,7 @@ class Judge:
         change, spread = self._fit(rows[:, known], observed - rows[:, disc] @ before[1:], known)
         by = float(change[zero] - before[0])
         error = float(np.sqrt(2.0 * spread[zero, zero]))
-        if abs(by) < max(self._allowed.zero_arcsec, norm.isf(0.5 * self.alpha) * error):
+        if abs(by) < max(self._allowed.zero_arcsec, -ndtri(0.5 * self.alpha) * error):
             return None
         return Moved("zero", f"zero: by {by:+.1f} arcsec", abs(by), abs(by) <= float(self._bounds[-1]))
 
