@@ -15,7 +15,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.jobwork import Told, Work, run
+from hdbridge.daemon.service.joborder import Told, Work
+from hdbridge.daemon.service.jobwork import run
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.files.profile import Profile
 from hdbridge.model import TransmissionModel

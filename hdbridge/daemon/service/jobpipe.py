@@ -22,7 +22,7 @@ from hdbridge.control.bench import Run
 from hdbridge.control.compensation import Compensation
 from hdbridge.control.rig import Rig
 from hdbridge.control.survived import Survived
-from hdbridge.daemon.service.jobwork import Told, Work
+from hdbridge.daemon.service.joborder import Told, Work
 from hdbridge.errors import DaemonError
 from hdbridge.procedures.moves import Procedure
 from hdbridge.records.record import REQUIRED, Record

@@ -17,7 +17,6 @@ from socket import socketpair
 from typing import Final
 
 from hdbridge.daemon.service.jobpipe import Begin, PipedRig, Result, telling_failure, told_over
-from hdbridge.daemon.service.jobwork import run
 from hdbridge.errors import InputError
 
 NICENESS: Final = 10
@@ -70,6 +69,8 @@ def job_process(begin: Begin) -> Iterator[JobProcess]:
 
 def main(arguments: list[str]) -> int:
     """The job's process itself."""
+    from hdbridge.daemon.service.jobwork import run  # noqa: PLC0415 - the service, which starts it, does no job
+
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Any, Final
 from hdbridge.client import messages
 from hdbridge.client.messages import JobKind, JobState
 from hdbridge.daemon.memory import CommandKind
-from hdbridge.daemon.service import jobwork
 from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.joborder import Told, Work, options_of
 from hdbridge.daemon.service.jobpipe import Begin, Served
 from hdbridge.daemon.service.jobprocess import job_process
-from hdbridge.daemon.service.jobwork import Told, Work
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.errors import HdbridgeError, InputError
 
@@ -91,7 +90,7 @@ class JobBook:
 
     def begin(self, axis: ServiceAxis, holder: str, kind: JobKind, given: Mapping[str, Any]) -> messages.Job:
         """Begin a job; it runs when this returns. InputError for options that it does not have."""
-        options = jobwork.options_of(kind, given)
+        options = options_of(kind, given)
         axis.check_free()
         now = datetime.now(UTC)
         work = Work(
