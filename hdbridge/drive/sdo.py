@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import struct
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -79,6 +80,16 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
         raise InputError(
             f"{path}: cannot be read as an EDS: {reason}; give drive.eds the drive's own EDS file"
         ) from error
+
+
+def shared_eds(path: Path, node_id: int) -> ObjectDictionary:
+    """As `load_eds`, parsed once, which takes longer than to boot a simulated drive: not to be changed."""
+    return _read_as_of(path.stat().st_mtime_ns if path.exists() else 0, path, node_id)
+
+
+@lru_cache(maxsize=8)
+def _read_as_of(_: int, path: Path, node_id: int) -> ObjectDictionary:
+    return load_eds(path, node_id)
 
 
 class SdoAbortError(SdoError):

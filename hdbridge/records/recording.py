@@ -12,6 +12,7 @@ import importlib.metadata
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -193,10 +194,14 @@ class Recording:
 
 def versions_here() -> dict[str, str]:
     """The software that makes a recording or a model in this process."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
     packages = ("hdbridge", "numpy", "scipy", "python-can", "canopen")
-    return {each: importlib.metadata.version(each) for each in packages} | {
-        "python": platform.python_version()
-    }
+    named = [(each, importlib.metadata.version(each)) for each in packages]
+    return (*named, ("python", platform.python_version()))
 
 
 def sha256_of(path: Path) -> str:
