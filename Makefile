@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+# The tests begin hundreds of processes: without bytecode on disk, each compiles the package anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test unit check format test-socketcan test-socketcan-daemon test-socketcan-bus test-slow blind bench-realtime docs clean
 

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, settings
 
 for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line does, see hdbridge/__main__.py
     os.environ.setdefault(each, "1")
-os.environ["HDBRIDGE_COMPILE"] = "0"  # not worth it in short tests; those of the compiled loops switch it on
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # A change fails or it does not, but not by lot.
 settings.register_profile("same", slow_machines, derandomize=True)
