@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, settings
 for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line does, see hdbridge/__main__.py
     os.environ.setdefault(each, "1")
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-# A change fails or it does not, but not by lot.
-settings.register_profile("same", slow_machines, derandomize=True)
+# A change fails or it does not, but not by lot: more of always the same examples would tell little more.
+settings.register_profile("same", slow_machines, derandomize=True, max_examples=50)
 settings.register_profile("random", slow_machines)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 

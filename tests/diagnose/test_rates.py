@@ -14,7 +14,7 @@ from support.trials import CAUSES, NONE, PAIRS, SHORT, SPECIAL, UNKNOWN, Verdict
 
 from hdbridge.diagnose import diagnose
 
-MORE = range(2, 5)
+MORE = range(1, 5)
 """Seeds of the slow tests."""
 
 
@@ -41,15 +41,10 @@ def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
     assert len(verdicts) - len(bad) >= least(len(verdicts), rate), bad
 
 
-@pytest.mark.parametrize("third", range(3))
-def test_a_hidden_cause_is_named_first(third: int) -> None:
-    verdicts = judged(CAUSES[third::3], [1])
+def test_a_hidden_cause_is_named_first() -> None:
+    verdicts = judged(CAUSES[::3], [1])
     holds(verdicts, 0.95, "first_right")
     holds(verdicts, 0.95, "silent")
-
-
-def test_what_the_catalogue_does_not_have_is_unexplained() -> None:
-    holds(judged(UNKNOWN[::2], [1]), 0.9, "unexplained")
 
 
 def test_where_nothing_is_hidden_nothing_is_named() -> None:

@@ -114,7 +114,7 @@ def test_with_nothing_hidden_nothing_is_proposed_and_no_file_changes(cell):
     assert (cell.folder / "rec" / "recording.yaml").exists()
 
 
-@pytest.mark.parametrize("cause", ["flexspline_order", "hysteresis_parameters", "hysteresis_memory"])
+@pytest.mark.parametrize("cause", ["hysteresis_parameters", "hysteresis_memory"])
 def test_what_can_be_compensated_brings_stepping_back_to_the_floor(cell, cause):
     cell.hide(cause, 15.0 if cause == "hysteresis_memory" else 8.0)
     result, *_ = cell.improve()

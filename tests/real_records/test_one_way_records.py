@@ -65,7 +65,7 @@ def baseline(rng: np.random.Generator) -> TransmissionModel:
     return TransmissionModel(50.0, parts[kind])
 
 
-@settings(max_examples=25, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**32 - 1))
 @example(133954)  # play was named once
 def test_no_confident_name_and_no_wild_model(seed: int) -> None:
