@@ -191,7 +191,7 @@ def test_neither_token_nor_lease_gets_into_the_log(api, caplog, capfd):
         client.post("/axes/joint-1/enable", headers={"X-Lease": lease})
         client.get("/state", params={"token": TOKEN})
         client.get("/lease")
-    with httpx.Client(trust_env=False) as bad:
+    with httpx.Client(trust_env=False, verify=False) as bad:
         bad.get(f"http://127.0.0.1:{api.port}/api/v1/state", headers={"Authorization": f"Bearer {TOKEN}x"})
     own = [each for each in caplog.records if each.name.startswith(("hdbridge", "uvicorn", "websockets"))]
     logged = "\n".join(f"{each.getMessage()} {each.args} {each.__dict__}" for each in own)
