@@ -12,6 +12,7 @@ import errno
 import io
 import os
 import sys
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -92,7 +93,13 @@ class _LoadedToRun(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, _, rest = super().resolve_command(ctx, args)
         assert name is not None
-        return name, get_group(load(name)).commands[name], rest
+        return name, _built(name), rest
+
+
+@cache
+def _built(name: str) -> Any:
+    """The command with its options; once, where a process runs it more often."""
+    return get_group(load(name)).commands[name]
 
 
 app = typer.Typer(
