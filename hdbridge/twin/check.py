@@ -25,9 +25,10 @@ from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, scaled, softened, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, noise_floor, prepare
-from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
+from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.rivals import FALSE_ALARM
 
 MOST_CAUSES = 4
 """Changes that are looked for at most."""

@@ -9,8 +9,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import Comparison, compare
-from hdbridge.twin.fitting import fit
-from hdbridge.twin.least_squares import Fitted
+from hdbridge.twin.fitting import FIT_S, fit
+from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
 from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
 from hdbridge.twin.noise import noise_in_motion, with_load_noise
@@ -18,9 +18,6 @@ from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import legs_of, replay_directly
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import HELD_OUT, Twin
-
-NAMING_S = 60.0
-"""Causes are named on pieces that take the axis about so long."""
 
 
 def fit_twin(
@@ -37,16 +34,16 @@ def fit_twin(
     """
     whole = Recording.joined(list(recordings))
     fitted = fit(whole, axis, start, lambda share: progress(0.9 * share), workers)
-    data = coarse(prepare(whole, axis, start), NAMING_S)
-    with Replays(data, workers) as replays:
-        sets = alike(fitted)
-        findings = name_causes(replays, start, fitted, sets)
+    data = coarse(prepare(whole, axis, start), FIT_S)
+    with Replays(data, workers) as replays, Replays(coarse(data), workers) as rough:
+        findings, rivals = name_causes(replays, rough, start, fitted)
         (left,) = replays([fitted.truth])
+        sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
         rest = unexplained(data, left, noise_in_motion(data))
     truth = with_knowledge(fitted)
     before, after = (_compared(whole, axis, each) for each in (start, truth))
     progress(1.0)
-    return Twin(truth, findings, sets, rest, before, after)
+    return Twin(truth, findings, tuple(sets), rest, before, after)
 
 
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:

@@ -1,8 +1,7 @@
 """What was wrong with the simulation: causes by the evidence that they earn, and what cannot be told apart.
 
-A cause earns evidence by how far its parameters had to move against how well they are known, and is held
-against legs that the fit has not seen: the fitted truth, with this cause's parameters put back to where they
-were.
+A cause is held against legs that the fit has not seen: the twin with this cause's parameters where they were,
+and then the best that can be done so (`hdbridge.twin.rivals`).
 """
 
 from __future__ import annotations
@@ -18,11 +17,10 @@ from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import Fitted
 from hdbridge.twin.misfit import CHANNELS, Data, counted
-from hdbridge.twin.parameters import Parameter, value_in, with_values
+from hdbridge.twin.parameters import Parameter, coordinates, value_in
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.rivals import held_out, put_back, told_apart, without
 
-FALSE_ALARM = 0.02
-"""Probability with which a simulation that is right has any cause named."""
 ALIKE = 0.4
 """Share of a parameter in a direction that the motion does not show, from which it belongs to the set."""
 
@@ -90,28 +88,73 @@ class Unexplained:
     kind: str
 
 
-def name_causes(replays: Replays, start: Truth, fitted: Fitted, sets: Sequence[Alike]) -> tuple[Finding, ...]:
-    """The causes in which the start was wrong, the most telling first; ``sets`` as `alike` gives them."""
-    groups: dict[str, list[int]] = {}
-    for number, each in enumerate(fitted.parameters):
-        groups.setdefault(each.cause, []).append(number)
-    tried: list[tuple[str, list[int], float]] = []
-    for cause, places in groups.items():
-        distance = _moved(fitted, start, places)
-        if chdtrc(len(places), distance) < FALSE_ALARM / len(groups) and _matters(fitted, start, places):
-            tried.append((cause, places, distance))
-    if not tried:
-        return ()
-    backs = [_put_back(fitted, start, [fitted.parameters[p] for p in places]) for _, places, _ in tried]
-    here, *there = (_held_out_misfit(replays, each, fitted) for each in replays([fitted.truth, *backs]))
-    found = []
+def name_causes(
+    replays: Replays, rough: Replays, start: Truth, fitted: Fitted
+) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
+    """The causes in which the start was wrong, the most telling first, and what cannot be told apart there.
+
+    A cause without which held-out legs come out worse, whatever else makes up for it, is named. If the twin
+    needs more than those, the others are named with what may stand in for them; if not, nothing tells what
+    they came to from the start, and that is a set. Rivals are fitted to ``rough`` ones of the pieces.
+    """
+    contest = _Contest(replays, start, fitted)
+    groups: dict[str, list[Parameter]] = {}
+    for each in fitted.parameters:
+        groups.setdefault(each.cause, []).append(each)
+    suspects = {cause: own for cause, own in groups.items() if _further(start, fitted.truth, own)}
+    alone = replays([put_back(start, fitted.truth, own) for own in suspects.values()])
+    matter = [cause for cause, there in zip(suspects, alone, strict=True) if contest.lost(there)]
+    moved = [each for own in suspects.values() for each in own]
+    rivals = {cause: without(rough, start, fitted, groups[cause], moved) for cause in matter}
+    shown = dict(zip(rivals, replays(rivals.values()), strict=True))
+    needed = {cause: groups[cause] for cause in matter if contest.lost(shown[cause])}
+    aliases: dict[str, list[Parameter]] = {cause: [] for cause in needed}
+    rest = [each for each in fitted.parameters if each.cause not in needed]
+    least = without(rough, start, fitted, rest, moved) if rest else fitted.truth
+    sets: list[Alike] = []
+    (shown_least,) = replays([least])
+    if contest.lost(shown_least):
+        for cause in (each for each in matter if each not in needed):
+            others = [each for each in rest if each.cause != cause]
+            aliases[cause] = contest.needed(rivals[cause], _further(start, rivals[cause], others))
+            sets.append(_set([*groups[cause], *aliases[cause]]))
+    elif apart := _further(fitted.truth, least, rest):
+        sets.append(_set(apart))
+    found: list[Finding] = []
     intervals = fitted.intervals()
-    for (_, places, distance), worse in zip(tried, there, strict=True):
-        if worse <= here:
-            continue
-        parameters = [fitted.parameters[place] for place in places]
-        found.append(finding(parameters, start, fitted.truth, intervals, distance, (worse, here), sets))
-    return tuple(sorted(found, key=lambda each: -each.gain[0]))
+    distances = {cause: _moved(fitted, start, groups[cause]) for cause in aliases}
+    for cause in sorted(aliases, key=lambda each: -distances[each]):
+        own, instead = groups[cause], aliases[cause]
+        if (instead or cause in needed) and not any(
+            each.name in other.aliases for each in own for other in found
+        ):
+            gain = (_rms(contest.left_by(shown[cause])), _rms(contest.left))
+            found.append(finding(own, start, fitted.truth, intervals, distances[cause], gain, instead))
+    return tuple(sorted(found, key=lambda each: -each.gain[0])), tuple(dict.fromkeys(sets))
+
+
+class _Contest:
+    """A fit against its rivals, on legs that it has not seen."""
+
+    def __init__(self, replays: Replays, start: Truth, fitted: Fitted) -> None:
+        self._replays, self._start, self._fitted = replays, start, fitted
+        (shown,) = replays([fitted.truth])
+        self.left, self._legs = held_out(replays, shown, fitted)
+
+    def left_by(self, shown: dict[str, FloatArray]) -> FloatArray:
+        """The scaled residuals of a rival."""
+        return held_out(self._replays, shown, self._fitted)[0]
+
+    def lost(self, shown: dict[str, FloatArray]) -> bool:
+        """Whether a rival has lost."""
+        return told_apart(self.left, self.left_by(shown) - self.left, self._legs)
+
+    def needed(self, rival: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
+        """Those that a rival cannot do without, each alone where it was."""
+        truths = [rival, *(put_back(self._start, rival, [each]) for each in parameters)]
+        left, *without = (self.left_by(shown) for shown in self._replays(truths))
+        pairs = zip(parameters, without, strict=True)
+        return [each for each, worse in pairs if told_apart(left, worse - left, self._legs)]
 
 
 def finding(
@@ -121,24 +164,24 @@ def finding(
     intervals: Mapping[str, tuple[float, float]],
     distance: float,
     gain: tuple[float, float],
-    sets: Sequence[Alike] = (),
+    instead: Sequence[Parameter] = (),
 ) -> Finding:
-    """What is said of one cause's parameters; ``distance`` in squared standard deviations."""
+    """What is said of one cause's parameters; ``distance`` in squared standard deviations.
+
+    ``instead`` are those that may have changed in their place.
+    """
     moved = tuple(
         Moved(each.name, each.unit, _value(before, each), _value(after, each), *intervals[each.name])
         for each in parameters
     )
-    own = {each.name for each in parameters}
-    touched = [each for each in sets if own & set(each.names)]
-    aliases = tuple(dict.fromkeys(name for each in touched for name in each.names if name not in own))
     return Finding(
         parameters[0].cause,
         moved,
         tuple(name for name in CHANNELS if any(name in each.shows_in for each in parameters)),
         _evidence(distance, len(parameters)),
         gain,
-        aliases,
-        "; ".join(dict.fromkeys(move for each in touched for move in each.moves)) if aliases else "",
+        tuple(each.name for each in instead),
+        "; ".join(dict.fromkeys(each.move for each in instead)),
     )
 
 
@@ -148,20 +191,26 @@ def _evidence(distance: float, count: int) -> float:
     return -math.log(chance) if chance > 0.0 else 0.5 * distance
 
 
-def alike(fitted: Fitted) -> tuple[Alike, ...]:
-    """The sets of parameters along which the residuals hardly change, against what the prior allows."""
+def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
+    """The sets of parameters that may move together by as much as the prior allows without being told.
+
+    ``legs`` is the number of the leg of each fitted row.
+    """
     spread = np.array([each.spread for each in fitted.parameters])
     scaled = fitted.jacobian * spread
-    worth, directions = np.linalg.eigh(scaled.T @ scaled)
+    _, directions = np.linalg.eigh(scaled.T @ scaled)
     sets: list[Alike] = []
-    for value, direction in zip(worth, directions.T, strict=True):
-        if value > fitted.inflation:
+    for direction in directions.T:
+        if told_apart(fitted.vector, scaled @ direction, legs):
             continue
         members = [each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > ALIKE]
         if members:
-            moves = tuple(dict.fromkeys(each.move for each in members))
-            sets.append(Alike(tuple(each.name for each in members), moves))
+            sets.append(_set(members))
     return tuple(sets)
+
+
+def _set(members: Sequence[Parameter]) -> Alike:
+    return Alike(tuple(each.name for each in members), tuple(dict.fromkeys(each.move for each in members)))
 
 
 def unexplained(
@@ -183,24 +232,17 @@ def unexplained(
     return tuple(found)
 
 
-def _moved(fitted: Fitted, start: Truth, places: Sequence[int]) -> float:
+def _moved(fitted: Fitted, start: Truth, own: Sequence[Parameter]) -> float:
     """How far some parameters have moved, in squared standard deviations."""
-    off = np.array([fitted.place[place] - _coordinate(start, fitted.parameters[place]) for place in places])
-    block = fitted.covariance[np.ix_(places, places)]
-    return float(off @ np.linalg.solve(block, off))
+    places = [number for number, each in enumerate(fitted.parameters) if each in own]
+    off = fitted.place[places] - np.array(coordinates(start, own))
+    return float(off @ np.linalg.solve(fitted.covariance[np.ix_(places, places)], off))
 
 
-def _matters(fitted: Fitted, start: Truth, places: Sequence[int]) -> bool:
-    """Whether one of them has moved by more than anybody would care about."""
-    return any(
-        abs(fitted.place[place] - _coordinate(start, fitted.parameters[place]))
-        > fitted.parameters[place].least_change
-        for place in places
-    )
-
-
-def _coordinate(truth: Truth, parameter: Parameter) -> float:
-    return parameter.coordinate(min(max(_value(truth, parameter), parameter.least), parameter.most))
+def _further(one: Truth, other: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Those that differ by more than anybody would care about."""
+    apart = np.subtract(coordinates(one, parameters), coordinates(other, parameters))
+    return [each for each, off in zip(parameters, apart, strict=True) if abs(off) > each.least_change]
 
 
 def _value(truth: Truth, parameter: Parameter) -> float:
@@ -209,18 +251,5 @@ def _value(truth: Truth, parameter: Parameter) -> float:
     return value
 
 
-def _put_back(fitted: Fitted, start: Truth, parameters: Sequence[Parameter]) -> Truth:
-    return with_values(fitted.truth, {each.name: _value(start, each) for each in parameters})
-
-
-def _held_out_misfit(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> float:
-    """Rms of the scaled residuals on held-out legs; outliers count as three scales."""
-    data = replays.data
-    out = data.out
-    counts = counted(data)
-    if not out.any():
-        out = np.ones(len(out))
-    values = [
-        np.minimum(np.square(found[n] / fitted.scales[n]), 9.0)[(counts[n] * out) > 0.0] for n in CHANNELS
-    ]
-    return math.sqrt(float(np.mean(np.concatenate(values))))
+def _rms(values: FloatArray) -> float:
+    return math.sqrt(float(np.mean(np.square(values))))

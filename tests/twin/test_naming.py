@@ -1,0 +1,88 @@
+"""What is named after a fit, on residuals that are known functions of the plant's parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from hdbridge.effects import FloatArray
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve
+from hdbridge.twin.naming import Alike, Finding, alike, name_causes
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
+
+TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
+NAMES = ("Coulomb friction", "servo dead time", "command filter")
+ROWS, LEGS = 1200, 24
+
+
+class Known:
+    """In place of replays: a lag at some speeds, friction by the speed's sign, and noise.
+
+    Dead time and filter are one lag but for the share of the acceleration that a ``quick`` motion has.
+    """
+
+    def __init__(self, axis: Truth, quick: float) -> None:
+        rng = np.random.default_rng(0)
+        self.speed = np.sin(np.arange(ROWS) / 9.0)
+        self.quick = quick * np.cos(np.arange(ROWS) / 9.0)
+        shown = self._shown(axis)
+        self.measured = {name: each + rng.standard_normal(ROWS) for name, each in shown.items()}
+        leg = np.repeat(np.arange(float(LEGS)), ROWS // LEGS)
+        ones = {name: np.ones(ROWS) for name in shown}
+        out = np.where(leg % 4.0 == 3.0, 1.0, 0.0)
+        self.data: Any = SimpleNamespace(
+            leg=leg, out=out, pieces=(SimpleNamespace(counts=ones, leg=leg, out=out),), duration_s=1.0
+        )
+
+    def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
+        return [
+            {name: self.measured[name] - each for name, each in self._shown(truth).items()}
+            for truth in truths
+        ]
+
+    def _shown(self, truth: Truth) -> dict[str, FloatArray]:
+        filtered, dead = truth.servo.command_filter_ms, truth.servo.dead_time_ms
+        lag = 20.0 * (2.0 * filtered + dead) * self.speed
+        return {
+            FOLLOWING: lag + filtered**2 * self.quick,
+            TORQUE: 1000.0 * truth.motor.coulomb_nm * np.sign(self.speed),
+            LOAD: np.zeros(ROWS),
+        }
+
+
+def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
+    """What is said of an axis by a fit that begins at `TRUTH`; and what its slopes cannot tell apart."""
+    replays: Any = Known(axis, quick)
+    parameters = tuple(BY_NAME[name] for name in NAMES)
+    prior = np.array(coordinates(TRUTH, parameters))
+    noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
+    fitted = solve(replays, TRUTH, parameters, prior, 12, known=noise)
+    found, sets = name_causes(replays, replays, TRUTH, fitted)
+    return found, (*sets, *alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data))))
+
+
+def test_nothing_is_named_where_the_start_was_right() -> None:
+    found, _ = named(TRUTH, quick=50.0)
+    assert found == ()
+
+
+def test_only_what_was_wrong_is_named_where_the_motion_tells() -> None:
+    found, sets = named(with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=50.0)
+    assert {each.cause for each in found} == {"servo dead time", "friction"}
+    assert all(each.aliases == () for each in found)
+    assert sets == ()
+
+
+def test_a_lag_is_a_set_where_the_motion_does_not_tell_a_dead_time_from_a_filter() -> None:
+    found, sets = named(with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=0.01)
+    (lag,) = (each for each in found if each.cause != "friction")
+    assert {lag.cause, *lag.aliases} == {"servo dead time", "command filter"}
+    assert "sines of several frequencies" in lag.move
+    assert {"servo dead time", "command filter"} in [set(each.names) for each in sets]
+    (friction,) = (each for each in found if each.cause == "friction")
+    assert friction.aliases == ()

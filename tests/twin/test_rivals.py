@@ -1,0 +1,37 @@
+"""Whether what is left of a recording distinguishes a twin from a rival."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hdbridge.twin.rivals import told_apart
+
+LEGS = np.repeat(np.arange(12.0), 100)
+CHANGE = np.sin(np.arange(len(LEGS)) / 7.0)
+
+
+def noise(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(len(LEGS))
+
+
+@pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0.005, 0.05), (0.5, 1.0, 1.0)])
+def test_a_change_below_the_noise_is_told_as_seldom_as_a_false_alarm_may_be(
+    size: float, least: float, most: float
+) -> None:
+    told = [told_apart(noise(seed), size * CHANGE, LEGS) for seed in range(400)]
+    assert least <= np.mean(told) <= most
+
+
+def test_residuals_that_go_together_within_a_leg_hide_a_change_that_white_noise_would_show() -> None:
+    """In each leg they are as large as the change, of a sign of its own; white ones are as large in all."""
+    change = 0.5 * CHANGE
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
+    together = (2.0 * change * signs[LEGS.astype(int)]) - change * (2.0 * np.mean(signs))
+    white = np.random.default_rng(4).permutation(together)
+    assert not told_apart(together, change, LEGS)
+    assert told_apart(white, change, LEGS)
+
+
+def test_a_rival_that_leaves_less_is_not_told_apart() -> None:
+    assert not told_apart(CHANGE, -CHANGE, LEGS)
