@@ -20,10 +20,10 @@ _UNITS: Final = {
     "arcsec_per_k": "arcsec/K",
     "percent_per_nm": "%/Nm",
     "percent_per_k": "%/K",
-    "stiffness_s2": "s^2",
     "percent": "%",
     "arcsec": "arcsec",
     "deg_s2": "deg/s^2",
+    "s2": "s^2",
     "deg_s": "deg/s",
     "deg": "deg",
     "ms2": "ms^2",
@@ -31,11 +31,19 @@ _UNITS: Final = {
     "hz": "Hz",
     "nm": "Nm",
     "s": "s",
+    "k": "K",
 }
 
 
 def unit_of(name: str) -> str:
     """The unit that a parameter's name ends with; 1 where it has none."""
-    return next(
-        (unit for ending, unit in _UNITS.items() if name == ending or name.endswith("_" + ending)), "1"
-    )
+    return _UNITS.get(_ending(name), "1")
+
+
+def without_unit(name: str) -> str:
+    """A parameter's name without its unit."""
+    return name.removesuffix("_" + _ending(name))
+
+
+def _ending(name: str) -> str:
+    return next((each for each in _UNITS if name == each or name.endswith("_" + each)), "")

@@ -11,6 +11,7 @@ from hdbridge.calibration.validation import Stepped, Validation
 from hdbridge.identify import FitResult
 from hdbridge.model import TransmissionModel
 from hdbridge.model.difference import diff
+from hdbridge.units import unit_of
 
 __all__ = ["Calibration", "Offer", "Stepped"]
 
@@ -135,9 +136,3 @@ class Calibration:
 def _number(value: float) -> float | None:
     """JSON knows no infinity."""
     return float(value) if math.isfinite(value) else None
-
-
-def unit_of(parameter: str) -> str:
-    """The unit that a parameter's name ends with; empty for a number without one."""
-    unit = parameter.rsplit("_", 1)[-1] if "_" in parameter else ""
-    return unit if unit in {"arcsec", "deg", "s", "ms", "nm", "k", "c"} else ""

@@ -22,8 +22,8 @@ TAKEN_OFF = 0.95
 
 def print_calibration(result: Calibration) -> None:
     """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
-    from hdbridge.calibration.result import unit_of
     from hdbridge.model.difference import diff
+    from hdbridge.units import unit_of
 
     fit = result.fit
     before = (

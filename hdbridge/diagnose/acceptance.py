@@ -102,7 +102,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     if robust < needed:
         return Gate(robust, needed, "not seen in enough independent stretches")
     if effect.tracker().memory_deg > 0.0:
-        free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start))
+        free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
         robust = min(robust, robust_chi_square(estimator, fitted, place, free))
         if robust < needed:
             return Gate(robust, needed, "an elastic loop of another shape does as well")

@@ -98,14 +98,12 @@ def _loop(
 
 def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
-    searched, scales = estimator.nuisance, estimator.scales
-    if not searched.shape[1]:
+    scales, free = estimator.scales, fitted.hypothesis.nuisances
+    if free is None:
         return 0.0
-    estimator.nuisance = searched[:, :0]
-    plain = estimator.fit(fitted.hypothesis)
-    estimator.nuisance = searched
+    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
     apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 0.998))
-    gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * searched.shape[1]
+    gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * len(free.names)
     return apart if gained and apart > scales.plain_arcsec else 0.0
 
 

@@ -221,7 +221,7 @@ class _Judge:
         """The findings, without those that are not likely enough to be named, which leave the fit too, and
         without those that any axis has.
         """
-        nuisance, base = self.estimator.nuisance, len(self.model.effects)
+        base = len(self.model.effects)
         while True:
             judged, words = self._judged(fitted)
             likely = [
@@ -237,7 +237,6 @@ class _Judge:
             ]
             if len(kept) == len(fitted.hypothesis.effects):
                 break  # what is left of them are changes of the baseline, which it keeps
-            self.estimator.nuisance = nuisance
             fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend([*words, *(f"{cause}: no more than usual" for cause in sorted(usual))])
@@ -256,9 +255,8 @@ class _Judge:
         findings += changes.findings(self.search, self.model, trail, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        if estimator.nuisance.shape[1]:  # a model cannot hold a free-form loop: figures are without it
-            estimator.nuisance = estimator.nuisance[:, :0]
-            fitted = estimator.fit(fitted.hypothesis)
+        # A model cannot hold a free-form loop: figures are without it.
+        fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         words: list[str] = []

@@ -33,7 +33,8 @@ def plausible_only(search: Search, fitted: Fitted) -> Fitted:
         search.refusals[name] = reasons[place]
         gone.add(name)
         without = search.estimator.fit(fitted.hypothesis.without(place))
-        fitted = search.best_of_others(without, gone) or without
+        search.forget()
+        fitted = search.best_addition(without, left_out=gone) or without
     return fitted
 
 

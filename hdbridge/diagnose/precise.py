@@ -9,15 +9,15 @@ model, and what it takes over would be missing in the loop's own parameters.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
 from hdbridge.effects.orders import RAD_PER_DEG
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.nuisances import speeds_differ, swing_columns
-from hdbridge.estimation.terms import FOUND, Effort
+from hdbridge.estimation.nuisances import SWING, SWING_LAG, speeds_differ, swing_columns
+from hdbridge.estimation.terms import FOUND, Effort, Nuisances, unknown
 
 UNIT_S: Final = 1.0 / 30.0
 """Time in which the columns count: about that of a radian of the motor."""
@@ -28,23 +28,16 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
     What its waves shake is left out where the record has one speed only: it is part of the orders there.
     """
-    shaken = _shaken(estimator, fitted)
-    searched = estimator.nuisance
-    try:
-        estimator.nuisance = shaken
-        plain = estimator.fit(fitted.hypothesis)
-        found = estimator.fit(plain.hypothesis, moves=FOUND)
-        if any(each.violations() for each in found.hypothesis.effects):
-            return estimator.fit(plain.hypothesis, FOUND, Effort(steps=1))
-        return found
-    finally:
-        estimator.nuisance = searched
+    plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
+    found = estimator.fit(plain.hypothesis, moves=FOUND)
+    if any(each.violations() for each in found.hypothesis.effects):
+        return estimator.fit(plain.hypothesis, FOUND, Effort(steps=1))
+    return found
 
 
-def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
-    """In phase by the square of frequency, lagging by its cube; shape (m, 2).
-
-    The second is odd in the direction, as a lag is. Shape (m, 0) without orders, and at one speed.
+def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
+    """In phase by the square of frequency, and lagging by its cube; the second is odd in the direction, as a
+    lag is. None without orders, and at one speed.
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
@@ -53,7 +46,8 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> FloatArray:
     moving = np.empty(0) if slow is None else slow[estimator.index]
     moving = moving[moving != 0.0]
     if speed is None or not waves or not speeds_differ(moving, np.ones(len(moving))):
-        return np.empty((len(estimator.index), 0))
+        return None
     angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
     both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
-    return estimator.at_points(swing_columns(RAD_PER_DEG * speed, both, UNIT_S))
+    columns = estimator.at_points(swing_columns(RAD_PER_DEG * speed, both, UNIT_S))
+    return unknown(columns, [SWING, SWING_LAG])

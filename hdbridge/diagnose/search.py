@@ -7,8 +7,7 @@ the first picks. What was picked is looked at again in `backward.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence, Set
-from contextlib import contextmanager
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +47,6 @@ class Search:
         self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
         """Causes that were refused though the evidence spoke for them, with the reason in words."""
-        self._left_out: frozenset[str] = frozenset()
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
@@ -81,20 +79,18 @@ class Search:
         left = np.mean((trail.fitted.residual**2 - 1.0) / self.estimator.weight**2)
         if not names or left < self.scales.floor_arcsec**2:
             return trail
-        nuisance = self.estimator.nuisance
-        self.estimator.nuisance = nuisance[:, :0]
-        with self._leaving_out({names[0]}):
-            other = self._greedily()
+        self.forget()
+        other = self._greedily({names[0]})
+        self.forget()
         if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
             return other
-        self.estimator.nuisance = nuisance
         return trail
 
-    def _greedily(self) -> Trail:
+    def _greedily(self, left_out: Set[str] = frozenset()) -> Trail:
         fitted, law_gain = self.with_best_law(self._begin())
         for number in range(MOST):
-            found = self.best_addition(fitted)
-            if number < ANEW and not self.estimator.nuisance.shape[1]:
+            found = self.best_addition(fitted, left_out=left_out)
+            if number < ANEW and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
                     fitted, law_gain = self.with_best_law(loose)
@@ -127,15 +123,12 @@ class Search:
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
         """With a hysteresis of any shape added to the law, where that does more than the best cause."""
-        self.estimator.nuisance = self.estimator.free_loop(fitted.hypothesis.start)
-        loose = self.estimator.fit(fitted.hypothesis)
+        free = self.estimator.free_loop(fitted.hypothesis.start)
+        loose = self.estimator.fit(replace(fitted.hypothesis, nuisances=free))
         added = loose.free() - fitted.free()
         gain = fitted.chi_square - loose.chi_square - self.scales.penalty * added - self.scales.enter
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
-        if gain > max(rival, 0.0):
-            return loose
-        self.estimator.nuisance = self.estimator.nuisance[:, :0]
-        return None
+        return loose if gain > max(rival, 0.0) else None
 
     # --- one more cause
 
@@ -143,13 +136,15 @@ class Search:
         """Candidates that were refused with other findings in the fit are looked at again."""
         self._refused.clear()
 
-    def best_addition(self, fitted: Fitted, most: float = math.inf) -> Fitted | None:
-        """With the best cause more, refitted; None where none earns its keep.
+    def best_addition(
+        self, fitted: Fitted, most: float = math.inf, left_out: Set[str] = frozenset()
+    ) -> Fitted | None:
+        """With the best cause more, none of those ``left_out``, refitted; None where none earns its keep.
 
         One that costs more than ``most`` is of no use, and need not be the best that there is.
         """
         best: tuple[float, Fitted] | None = None
-        for score in self._shortlist(fitted):
+        for score in self._shortlist(fitted, left_out):
             cause = score.candidate.cause
             trial = self._restated(self._with(fitted, score, most), cause)
             toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
@@ -163,19 +158,6 @@ class Search:
             elif best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
-
-    def best_of_others(self, fitted: Fitted, causes: Set[str]) -> Fitted | None:
-        """With the best cause more that is none of these."""
-        with self._leaving_out(causes):
-            return self.best_addition(fitted)
-
-    @contextmanager
-    def _leaving_out(self, causes: Set[str]) -> Iterator[None]:
-        self._left_out = frozenset(causes)
-        self.forget()
-        yield
-        self._left_out = frozenset()
-        self.forget()
 
     def _restated(self, trial: Fitted, cause: str) -> Fitted:
         """What was added by another of its conventions, where it makes no sense by the one it has."""
@@ -242,18 +224,17 @@ class Search:
         low, high = np.quantile(values, [0.002, 0.998])
         return 0.5 * float(high - low)
 
-    def _shortlist(self, fitted: Fitted, most: int = BEST) -> list[Score]:
+    def _shortlist(self, fitted: Fitted, left_out: Set[str]) -> list[Score]:
         """The best candidate of each of the best causes, and of each number of parameters that it may have.
 
         One of more parameters gains more only once its shapes are fitted.
         """
-        present = {each.name for each in fitted.hypothesis.effects if each.usual == 1}
+        passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | left_out
         scores = [
             each
             for each in self._scores(fitted)
             if _key(each) not in self._refused
-            and each.candidate.cause not in present
-            and each.candidate.cause not in self._left_out
+            and each.candidate.cause not in passed
             and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
@@ -261,7 +242,7 @@ class Search:
         for each in sorted(scores, key=lambda each: -net[id(each)]):
             if net[id(each)] > self.scales.enter:
                 best.setdefault((each.candidate.cause, each.freedom), each)
-        causes = list(dict.fromkeys(cause for cause, _ in best))[:most]
+        causes = list(dict.fromkeys(cause for cause, _ in best))[:BEST]
         return [each for (cause, _), each in best.items() if cause in causes]
 
     def _scores(self, fitted: Fitted) -> list[Score]:
@@ -308,10 +289,8 @@ class Search:
         most = self.cost(fitted) + margin
         self.forget()
         best: dict[str, Fitted] = {}
-        for score in self._shortlist(without, BEST + 1):
+        for score in self._shortlist(without, {cause}):
             name = score.candidate.cause
-            if name == cause:
-                continue
             trial = self._with(without, score, most)
             if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
                 continue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hdbridge.effects import Effect, Part
@@ -20,9 +22,8 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""
     plain = estimator.fit(Hypothesis(effects))
-    searched, estimator.nuisance = estimator.nuisance, estimator.free_loop(plain.hypothesis.start)
-    loose = estimator.fit(plain.hypothesis)
-    estimator.nuisance = searched
+    free = estimator.free_loop(plain.hypothesis.start)
+    loose = estimator.fit(replace(plain.hypothesis, nuisances=free))
     share = 1.0 - loose.chi_square / max(plain.chi_square, 1e-300)
     if share < MOST:
         return ""

@@ -21,7 +21,7 @@ from hdbridge.estimation.observed import Observed
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
-from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms
+from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms, unknown
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 """A search compares hypotheses whose chi squares are tens and more apart."""
@@ -41,10 +41,14 @@ STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Effects (the baseline's first) and the elastic state at the first sample."""
+    """Effects (the baseline's first), the elastic state at the first sample, and what may be fitted in
+    addition to them.
+    """
 
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
+    nuisances: Nuisances | None = None
+    """In addition to the zeros, rows of the usable points; the same only where it is the same object."""
 
     def plus(self, effect: Effect) -> Hypothesis:
         """With one more effect."""
@@ -156,14 +160,13 @@ class Estimator:
         self._fits: OrderedDict[object, Fitted] = OrderedDict()
         self._origins: dict[object, _Origin] = {}
         self._noise: dict[object, FloatArray] = {}
+        self._free_loops: dict[Start, Nuisances] = {}
         # About the level that they have in common: an encoder's zero is no part of the physics.
         self.level = float(np.median(self.observed))
         self.loop_sign = 1.0
         """Of the loop's offset: -1 where the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """What is known of the first effects of each hypothesis beforehand."""
-        self.nuisance: FloatArray = np.empty((len(self.index), 0))
-        """Columns that every fit may use and that mean nothing, shape (m, k)."""
 
     @property
     def motion(self) -> Motion:
@@ -214,18 +217,21 @@ class Estimator:
         """Columns in units of the noise."""
         return np.asarray(columns * self.weight[:, np.newaxis])
 
-    def free_loop(self, start: Start) -> FloatArray:
+    def free_loop(self, start: Start) -> Nuisances:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
         memory.
         """
-        angle = self.data.full.motion.motor_deg
-        return np.stack([self.at_points(stop(angle, each, start)) for each in STOPS_DEG], axis=1)
+        if start not in self._free_loops:
+            angle = self.data.full.motion.motor_deg
+            stops = {f"stop of {each:g} deg": self.at_points(stop(angle, each, start)) for each in STOPS_DEG}
+            self._free_loops[start] = unknown(np.stack([*stops.values()], axis=1), [*stops])
+        return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
         """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says."""
         counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
         key = (
-            hypothesis, moves, effort, self.nuisance.shape[1],
+            hypothesis, moves, effort,
             self.load_angles if counted else 0, self.loop_sign, tuple(each.fixed for each in self.calibrated),
         )  # fmt: skip
         if key in self._fits:
@@ -299,7 +305,7 @@ class Estimator:
             self.observed - self.level,
             lambda effect: self.columns(effect, start),
             White(self.weight),
-            self.nuisances(),
+            self._nuisances(hypothesis),
             origin.prior,
             self._sign,
             moves,
@@ -316,13 +322,11 @@ class Estimator:
             self.weight,
         )
 
-    def nuisances(self) -> Nuisances:
-        """A zero for each absolute zero, and what else every fit may use."""
-        names = [f"zero{i}" for i in range(self.data.zeros)]
-        names += [f"nuisance{i}" for i in range(self.nuisance.shape[1])]
-        zeros = self.zero[:, np.newaxis] == np.arange(self.data.zeros)
-        columns = side_by_side([zeros, self.nuisance], len(zeros))
-        return Nuisances(columns, tuple(names), np.zeros(len(names)))
+    def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
+        """A zero for each absolute zero, and what the hypothesis has in addition."""
+        columns = self.zero[:, np.newaxis] == np.arange(self.data.zeros)
+        zeros = unknown(columns, [f"zero {each}" for each in range(self.data.zeros)])
+        return zeros if hypothesis.nuisances is None else zeros.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:
         """The sign that an effect's coefficients have; 0 where they may have either."""

@@ -9,8 +9,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray, IntArray
+from hdbridge.effects import BoolArray, Effect, FloatArray
 from hdbridge.effects.described import Moves
+from hdbridge.estimation.linear import side_by_side
 
 LOCAL = frozenset({Moves.ANYWHERE})
 """Shapes that a local step improves from anywhere."""
@@ -75,12 +76,12 @@ class Nuisances:
     prior: FloatArray
     """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
 
-    def and_waves(self, columns: FloatArray, names: Sequence[str]) -> Nuisances:
-        """With further columns of which nothing is known."""
+    def and_also(self, other: Nuisances) -> Nuisances:
+        """With further columns."""
         return Nuisances(
-            np.concatenate([self.columns, columns], axis=1),
-            (*self.names, *names),
-            np.concatenate([self.prior, np.zeros(columns.shape[1])]),
+            side_by_side([self.columns, other.columns], len(self.columns)),
+            (*self.names, *other.names),
+            np.concatenate([self.prior, other.prior]),
         )
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
@@ -89,9 +90,10 @@ class Nuisances:
         names = tuple(each for each in self.names if not left_out(each))
         return Nuisances(self.columns[:, keep], names, self.prior[keep])
 
-    def rows(self, index: IntArray) -> Nuisances:
-        """For some of the blocks."""
-        return Nuisances(self.columns[index], self.names, self.prior)
+
+def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
+    """Columns of which nothing is known."""
+    return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), np.zeros(len(names)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,7 @@ from hdbridge.estimation.nuisances import (
 from hdbridge.estimation.samples import Samples, gather
 from hdbridge.estimation.segment import Segment
 from hdbridge.estimation.separable import Solution
+from hdbridge.estimation.terms import unknown
 from hdbridge.identify.conclude import conclude
 from hdbridge.identify.covariance import covariance, of_effect
 from hdbridge.identify.figures import outlying
@@ -133,7 +134,7 @@ def _search(state: State, warnings: list[str]) -> State:
     """Shapes from a grid, the elastic state at the start where it is not known, and a first noise model."""
     waves = [f"{each} {part}" for each in state.candidates for part in ("cosine", "sine")]
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
-    columns = simple.in_addition().and_waves(state.waves, waves)
+    columns = simple.in_addition().and_also(unknown(state.waves, waves))
 
     def found(
         starts: list[Start], effects: tuple[Effect, ...]

@@ -15,7 +15,7 @@ from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import tangent
-from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting
+from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting, unknown
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, select
 from hdbridge.identify.result import Outliers
@@ -69,7 +69,7 @@ class State(NamedTuple):
             for number, part in enumerate(("cosine", "sine"))
         ]
         picked = self.waves[:, [at for _, at in others]]
-        return self.in_addition().and_waves(picked, [name for name, _ in others])
+        return self.in_addition().and_also(unknown(picked, [name for name, _ in others]))
 
     def model(self) -> tuple[Effect, ...]:
         """The chosen motor orders as the ripple, and the other effects."""

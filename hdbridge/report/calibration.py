@@ -11,7 +11,6 @@ import numpy as np
 
 from hdbridge import __version__
 from hdbridge.calibration import Calibration
-from hdbridge.calibration.result import unit_of
 from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
 from hdbridge.model.difference import diff
@@ -32,7 +31,7 @@ from hdbridge.report.page import (
 from hdbridge.report.validation import stepping_sections
 from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, figure, sentence, with_interval
-from hdbridge.units import DEG_PER_TURN
+from hdbridge.units import DEG_PER_TURN, unit_of, without_unit
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
@@ -287,7 +286,8 @@ def _parameters(result: Calibration) -> Iterator[Block]:
             row += with_interval(each.value, each.half_width)
         else:
             row += [f"({figure(each.value)})", "not known"]
-        row.append(unit_of(each.parameter))
+        unit = unit_of(each.parameter)
+        row.append("" if unit == "1" else unit)
         if before:
             was = before.get((each.effect, each.parameter))
             row += ["new", ""] if was is None else [figure(was), _change(each.value - was, each.parameter)]
@@ -307,9 +307,7 @@ def _parameters(result: Calibration) -> Iterator[Block]:
 
 def _parameter_words(effect: str, parameter: str) -> str:
     """``orders[2].amplitude_arcsec`` of synchronous: "synchronous, order 2: amplitude"."""
-    unit = unit_of(parameter)
-    words = parameter.removesuffix(f"_{unit}") if unit else parameter
-    words = re.sub(r"^orders\[(\d+)\]\.", r"order \1: ", words).replace("_", " ")
+    words = re.sub(r"^orders\[(\d+)\]\.", r"order \1: ", without_unit(parameter)).replace("_", " ")
     return f"{effect.replace('_', ' ')}, {words}" if ": " in words else f"{effect.replace('_', ' ')}: {words}"
 
 

@@ -17,6 +17,7 @@ from hdbridge.report.residuals import beside_charts, partial_residual_chart, res
 from hdbridge.report.validation import stepping_sections
 from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, sentence, with_interval
+from hdbridge.units import without_unit
 
 SURE: Final = 0.9
 LIKELY: Final = 0.6
@@ -204,7 +205,7 @@ def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
 def _parameters(finding: Finding) -> Table:
     rows: list[list[str | float]] = []
     for name, each in finding.parameters.items():
-        words = name.removesuffix(f"_{_suffix(each.unit)}").replace("_", " ")
+        words = without_unit(name).replace("_", " ")
         unit = "" if each.unit == "1" else each.unit
         if each.high > each.low:
             value, half = with_interval(each.value, 0.5 * (each.high - each.low))
@@ -336,10 +337,6 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
     if len(words) < 2 or any("," in each for each in words):
         return "; ".join(words)
     return f"{', '.join(words[:-1])} {last} {words[-1]}"
-
-
-def _suffix(unit: str) -> str:
-    return unit.replace("%", "percent").replace("/", "_per_").replace(" ", "_").replace("^", "").lower()
 
 
 def _two(value: float) -> str:
