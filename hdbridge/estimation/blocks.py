@@ -85,11 +85,12 @@ class Blocks:
         total = np.add.reduceat(picked * self.weight[spread], self.first, axis=0)
         return np.asarray(total / np.maximum(self.count, 1e-300)[spread])
 
-    def picked(self, index: IntArray) -> Blocks:
+    def picked(self, index: IntArray | BoolArray) -> Blocks:
         """Some of the blocks, each stood for by its middle sample."""
         own = {"index", "first", "weight"}
         kept = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name not in own}
-        return Blocks(self.middle[index], np.arange(len(index)), np.ones(len(index)), **kept)
+        middle = self.middle[index]
+        return Blocks(middle, np.arange(len(middle)), np.ones(len(middle)), **kept)
 
 
 def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:

@@ -15,6 +15,7 @@ import numpy as np
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
+from hdbridge.estimation.holdout import Linearised
 from hdbridge.estimation.linear import seen_directions, side_by_side
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import Observed
@@ -86,6 +87,11 @@ class Fitted:
     def tangent(self) -> FloatArray:
         """Weighted derivatives, shape (m, p)."""
         return self._solution.jacobian * self._weight[:, np.newaxis]
+
+    @property
+    def linearised(self) -> Linearised:
+        """Columns and residual in units of the noise."""
+        return Linearised(self.tangent, self.residual, self._solution.known)
 
     @property
     def information(self) -> FloatArray:

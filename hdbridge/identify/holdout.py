@@ -11,14 +11,13 @@ from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.holdout import Linearised, steps_without
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.samples import KINDS
 from hdbridge.estimation.segment import Kind
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.stretches import about_zeros, sums
-from hdbridge.estimation.terms import Effort
+from hdbridge.estimation.stretches import about_zeros, counted, sums
 from hdbridge.identify.result import HeldOut
 from hdbridge.identify.state import State
 from hdbridge.units import DEG_PER_TURN
@@ -26,8 +25,6 @@ from hdbridge.units import DEG_PER_TURN
 FOLDS = 4
 STRETCHES = 40
 """Of time, of which a fold takes every fourth."""
-BRIEF = Effort(steps=5)
-"""From the whole record's minimum it is not far to that of most of it."""
 RECORDINGS = "recordings"
 CELL_DEG = 30.0
 SAME_WAY = 0.8
@@ -43,33 +40,30 @@ def held_out(
     samples vary inside their blocks, which no model of this kind changes.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
-    active_arcsec = design.told(active.effects if active else ())
     fold, over = folds(blocks)
     # Turns and rounding are noise of the fit, not something that a model could be given.
-    columns = state.columns().without(is_rounding)
-    shift = columns.columns
+    written = {place for place, each in enumerate(solution.effects) if not each.violations()}
+    kept = [at for at, each in enumerate(solution.columns) if not is_rounding(each.name)]
+    shift = [at for at in kept if solution.columns[at].effect < 0]
+    kept = shift + [at for at in kept if solution.columns[at].effect in written]
+    rest_arcsec = blocks.error_arcsec - solution.jacobian[:, shift] @ solution.nuisances[shift]
     added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
-    used = np.zeros(len(blocks), dtype=bool)
-    for number in np.unique(fold).tolist():
-        out = fold == number
-        precision = Precision(state.noise, blocks, out)
-        if np.count_nonzero(~out) < 2 * solution.jacobian.shape[1]:
-            continue
-        fit = state.under(precision, columns, exact=False).fit(solution.effects, BRIEF)
-        # The active model has no nuisances of its own: it is given those that suit it best.
-        before, weighted = blocks.error_arcsec - active_arcsec, precision.apply(shift)
-        rest = solve_symmetric(shift.T @ weighted, weighted.T @ before)
-        either = (before - shift @ rest, fit.residual)
-        # As far as a model can hold them.
-        valid = [each for each in fit.effects if not each.violations()]
-        told = (active_arcsec, design.told(valid, exact=False))
-        # About the zeros that the rest of the data have; about its own where a zero is in this fold alone.
-        lost = ~np.isin(blocks.zero, blocks.zero[~out])
-        for row in (0, 1):
-            added[row, out] = about_zeros(either[row], blocks.zero, blocks.count * lost)[out]
-            left = measured_arcsec - told[row]
+    # The active model has no nuisances of its own: it is given those that suit it best.
+    own = active.effects if active else ()
+    new = [solution.effects[place] for place in sorted(written)]
+    for row, (effects, of) in enumerate(((own, shift), (new, kept))):
+        told, columns = design.told(effects), solution.jacobian[:, of]
+        fit = Linearised(columns, rest_arcsec - told, solution.known[of])
+        steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
+        for number, step in enumerate(steps):
+            out = fold == number
+            # About the zeros that the rest of the data have; about its own where one is in this fold alone.
+            lost = ~np.isin(blocks.zero, blocks.zero[~out])
+            left = fit.residual - columns @ step
+            added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
+            left = measured_arcsec - told - columns[:, len(shift) :] @ step[len(shift) :]
             alone[row, out] = about_zeros(left, blocks.zero, blocks.count * (lost | ~out))[out]
-        used |= out
+    used = len(fold) - np.bincount(fold)[fold] >= 2 * len(solution.columns)
     weight = blocks.count * used
     if not np.sum(weight):
         return HeldOut(
@@ -107,7 +101,7 @@ def folds(blocks: Blocks) -> tuple[IntArray, str]:
         return (blocks.chain % FOLDS, RECORDINGS) if _alike(blocks) else (by_time, "stretches of time")
     local = np.isin(blocks.kind, [KINDS.index(each) for each in (Kind.SINE, Kind.REVERSAL)])
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
-    return np.where(local, by_time, by_turn), words
+    return counted(np.where(local, by_time, by_turn)), words
 
 
 def _alike(blocks: Blocks) -> bool:
