@@ -22,7 +22,9 @@ from hdbridge.axis import AxisConfig
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.driving import driving_angle
+from hdbridge.observations.kinematics import CHATTER_COUNTS
+from hdbridge.observations.reading import reading_of
+from hdbridge.observations.reversals import steadied
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
@@ -198,7 +200,8 @@ def _laws(folder: Path) -> None:
     """Both laws fitted to the sine, and what they say of the earthquake; widths in mm."""
     _, angle, force = _damper(folder, "sine")
     _, other, measured = _damper(folder, "earthquake")
-    angle, other = (driving_angle(each, None, commanded=False) for each in (angle, other))
+    bands = (CHATTER_COUNTS * reading_of(each).unaided_deg for each in (angle, other))
+    angle, other = (steadied(each, each, band) for each, band in zip((angle, other), bands, strict=True))
     print(f"damper: {np.std(force):.0f} N rms in the sine, {np.std(measured):.0f} N in the earthquake")
     for law in (Hysteresis, HysteresisMemory):
         best = None

@@ -21,9 +21,9 @@ from hdbridge.effects import BoolArray, FloatArray, IntArray, Motion
 from hdbridge.errors import InputError
 from hdbridge.estimation.white_noise import noise_arcsec
 from hdbridge.observations.cuts import observed
-from hdbridge.observations.driving import reversals
-from hdbridge.observations.kinematics import kinematics
-from hdbridge.observations.reading import Reading, quantum_deg, reading_of
+from hdbridge.observations.kinematics import kinematics, reading_of_all, settling
+from hdbridge.observations.reading import quantum_deg
+from hdbridge.observations.reversals import reversals
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
@@ -35,9 +35,8 @@ AVERAGED_POINTS = 50_000
 SHORT = 0.77
 """Share of the mean length of a run that every other one has: the rest have 1.6 times as much."""
 LEAST_SAMPLES = 60
-SPEED_WINDOW_S = 0.03
-SETTLE_S = 0.15
-"""After a fast move the load is left this much time to come to rest."""
+LEAST_SETTLED = 0.2
+"""Of a record with less of it that is not in a fast move, all is used."""
 FAST_KINDS = frozenset({"move", "precondition", "step"})
 """Legs whose motion serves only to get somewhere: the load's own dynamics are not what is asked about."""
 
@@ -136,13 +135,12 @@ def gather(
         part.check_ratio(ratio)
     steps = np.diff(time)
     period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
-    window = max(1, round(SPEED_WINDOW_S / period)) | 1
     rows_of = [slice(first, last) for first, last in pairwise([*record.starts, len(time)])]
-    reading = _reading(position, rows_of)
+    reading = reading_of_all(position, rows_of)
     if target is not None and np.ptp(target) <= 0.0 and np.ptp(position) > 4.0 * reading.count_deg:
         target = None  # a command that never moves while the motor does is no command
     pieces = [
-        kinematics(position[rows], None if target is None else target[rows], time[rows], window, reading)
+        kinematics(position[rows], None if target is None else target[rows], time[rows], reading)
         for rows in rows_of
     ]
     driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
@@ -177,7 +175,9 @@ def gather(
     sigma = noise_arcsec(error - known, still, *counts, target is not None, record.starts)
     zero = part_of if independent_zeros else np.zeros_like(part_of)
     fast_kind = np.isin(kind, [i for i, each in enumerate(names) if each in FAST_KINDS])
-    usable = _usable(still, fast_kind, round(SETTLE_S / period))
+    usable = ~settling(fast_kind & ~still, time)
+    if np.mean(usable) < LEAST_SETTLED:
+        usable[:] = True
     full = Series(motion, error, sigma, usable, zero, leg, kind)
     runs = _runs(len(time), record.starts)
     return Observed(
@@ -198,13 +198,6 @@ def gather(
     )
 
 
-def _usable(still: BoolArray, fast_kind: BoolArray, reach: int) -> BoolArray:
-    """False in legs that only get somewhere, while they move and for so many samples after."""
-    fast = fast_kind & ~still
-    recent = np.convolve(fast, np.ones(reach + 1))[: len(fast)] > 0.5
-    return ~recent if np.mean(~recent) >= 0.2 else np.ones_like(still)
-
-
 def _kinds(
     time: FloatArray, speed: FloatArray, part: IntArray, legs: Sequence[Segment]
 ) -> tuple[IntArray, IntArray, tuple[str, ...]]:
@@ -223,12 +216,6 @@ def _kinds(
     border = float(np.median(moving)) if len(moving) else 1.0
     kind = np.where(magnitude == 0.0, 0, np.where(magnitude <= border, 1, 2)).astype(np.intp)
     return kind, part + 1, ("standing", "slow", "fast")
-
-
-def _reading(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
-    """How finely the motor's angle was read: one encoder for all parts, so the one that saw it best tells."""
-    largest = max(parts, key=lambda rows: rows.stop - rows.start)
-    return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
 
 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:

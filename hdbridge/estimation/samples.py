@@ -14,19 +14,14 @@ from hdbridge.effects.path import branches
 from hdbridge.errors import InputError
 from hdbridge.estimation.segment import MINIMUM_SAMPLES, Kind, Segment
 from hdbridge.observations.cuts import jumps
-from hdbridge.observations.driving import driving_angle
-from hdbridge.observations.reading import quantum_deg
+from hdbridge.observations.kinematics import SETTLE_S, kinematics, reading_of_all, settling
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 
 KINDS = tuple(Kind)
-SPEED_WINDOW_S = 0.02
-"""The speed of a sample is taken over this much time on either side."""
-SETTLE_S = 0.1
-"""After a fast move the load is left this much time to come to rest, and after a turn, where the hysteresis
-rises too steeply for a load on a spring to follow."""
 SETTLE_SHARE = 0.2
-"""But no more than this share of the travel to the next turn."""
+"""After a turn, where the hysteresis rises too steeply for a load on a spring to follow, no more than this
+share of the travel to the next one is left out."""
 STANDING_DEG_S = 1e-3
 """Load speed below which an axis stands."""
 GENTLE_DEG_S2 = 40.0
@@ -142,7 +137,6 @@ def gather(
         Chain(slice(edges[first], edges[last]), known)
         for (first, last), known in zip(spans, starts, strict=True)
     ]
-    driving = np.concatenate([_driving(segments[first:last]) for first, last in spans])
     time = np.concatenate([each.time_s for each in segments])
     measured = np.concatenate([_measured(each) for each in segments])
     load = np.concatenate([each.load_deg for each in segments])
@@ -150,7 +144,14 @@ def gather(
         np.repeat(each, np.diff(edges))
         for each in ([KINDS.index(each.kind) for each in segments], [names[number] for number in numbers])
     )
-    speed = np.concatenate([_rate(time[each.rows], driving[each.rows]) for each in chains])
+    reading = reading_of_all(measured, [each.rows for each in chains])
+    pieces = []
+    for (first, last), chain in zip(spans, chains, strict=True):
+        own, rows = segments[first:last], chain.rows
+        commanded = all(each.commanded for each in own)
+        command = np.concatenate([each.motor_deg for each in own]) if commanded else None
+        pieces.append(kinematics(measured[rows], command, time[rows], reading))
+    driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
     turned = np.concatenate([_has_turned(time[each.rows], driving[each.rows]) for each in chains])
     if not ratio > 0:
         raise InputError(f"{segments[0].name}: the ratio is {ratio:g}; expected more than 0")
@@ -166,11 +167,11 @@ def gather(
         load_deg=load,
         error_arcsec=error * ARCSEC_PER_DEG,
         speed_deg_s=speed,
-        usable=_usable(time, speed / ratio, kind, slow_deg_s) & ~turned,
+        usable=_usable(time, speed / ratio, acceleration / ratio, kind, slow_deg_s) & ~turned,
         kind=kind,
         zero=zero,
         zeros=len(names),
-        count_deg=max(quantum_deg(_measured(each)) for each in segments),
+        count_deg=reading.count_deg,
         chains=tuple(chains),
         travel_deg=max(float(np.ptp(each)) for each in np.split(measured, [edges[index] for index in cuts])),
     )
@@ -187,27 +188,13 @@ def _measured(segment: Segment) -> FloatArray:
     return segment.motor_deg if segment.position_deg is None else segment.position_deg
 
 
-def _driving(segments: Sequence[Segment]) -> FloatArray:
-    """The driving angle of a chain."""
-    seen = [each.position_deg for each in segments if each.position_deg is not None]
-    return driving_angle(
-        np.concatenate([each.motor_deg for each in segments]),
-        np.concatenate(seen) if len(seen) == len(segments) else None,
-        all(each.commanded for each in segments),
-    )
-
-
-def _rate(time: FloatArray, angle: FloatArray) -> FloatArray:
-    """Rate of change over a short window about each sample, per second."""
-    if len(time) < 2:
-        return np.zeros(len(time))
-    later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW_S, "right"), len(time) - 1)
-    earlier = np.maximum(np.searchsorted(time, time - SPEED_WINDOW_S, "left") - 1, 0)
-    span = time[later] - time[earlier]
-    return np.divide(angle[later] - angle[earlier], span, out=np.zeros(len(time)), where=span > 0)
-
-
-def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s: float | None) -> BoolArray:
+def _usable(
+    time: FloatArray,
+    load_speed: FloatArray,
+    load_acceleration: FloatArray,
+    kind: IntArray,
+    slow_deg_s: float | None,
+) -> BoolArray:
     """Samples at rest and in slow motions, not within `SETTLE_S` after fast ones.
 
     A motion counts as a whole, from rest or turn to the next: the start of a fast move is no slow motion. Of
@@ -219,14 +206,13 @@ def _usable(time: FloatArray, load_speed: FloatArray, kind: IntArray, slow_deg_s
         slow_deg_s = 1.2 * float(np.quantile(own, 0.995)) if len(own) else np.inf
     under_way = moving > STANDING_DEG_S
     fast = under_way & np.isin(kind, [KINDS.index(each) for each in ON_THE_WAY])
-    fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(_rate(time, load_speed)) > GENTLE_DEG_S2)
+    fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(load_acceleration) > GENTLE_DEG_S2)
     # Motions that follow one another without a rest are distinguished by their kind and direction.
     changes = [np.diff(each) != 0 for each in (under_way, kind, np.sign(load_speed))]
     first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
     fastest = np.repeat(np.maximum.reduceat(moving, first), np.diff(np.append(first, len(time))))
     fast |= under_way & (fastest > slow_deg_s)
-    last_fast = np.maximum.accumulate(np.where(fast, time, -np.inf))
-    return np.asarray(~fast & ~((time - last_fast < SETTLE_S) & (time >= last_fast)))
+    return ~settling(fast, time)
 
 
 def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:

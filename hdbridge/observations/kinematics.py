@@ -1,32 +1,56 @@
 """The angle that drives the effects, its speed and its acceleration, of one record.
 
-The command's angle where the record has one, plus what the motor encoder shows against it: as a smooth line
-in speed and acceleration, and as it was read where that differs by more than its counts. Neither encoder
-counts nor a following error are findings.
+A hysteresis law with an infinite slope at each reversal turns one count of chatter into several arcseconds,
+so it must not see the encoder as it is. It sees the command's angle where the record has one, plus what the
+motor encoder shows against it: as a smooth line in speed and acceleration, and as it was read where that
+differs by more than its counts. Neither encoder counts nor a following error are findings.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from hdbridge.effects import FloatArray
-from hdbridge.observations.driving import steadied
-from hdbridge.observations.reading import Reading, third_deviation
+from hdbridge.observations.reading import Reading, quantum_deg, reading_of, third_deviation
+from hdbridge.observations.reversals import steadied
 
 BoolArray = NDArray[np.bool_]
 
-CHATTER_COUNTS = 1.6
-"""Turns of the driving angle smaller than this are no turns: a servo that settles, not a move."""
+CHATTER_COUNTS = 2.6
+"""A measured angle counts as reversed when it has come back by more than this many counts: noise of a third
+of one flickers over two."""
+WINDOW_S = 0.03
+"""Speed and acceleration are means over so long."""
+SETTLE_S = 0.1
+"""After a fast move the load is left this much time to come to rest: two periods of a load that swings at
+20 Hz."""
+
+
+def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
+    """How finely the motor's angle was read: one encoder for all parts, so the one that saw it best tells."""
+    largest = max(parts, key=lambda rows: rows.stop - rows.start)
+    return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
+
+
+def settling(fast: BoolArray, time_s: FloatArray) -> BoolArray:
+    """The samples of fast moves, and those within `SETTLE_S` after."""
+    last = np.maximum.accumulate(np.where(fast, time_s, -np.inf))
+    return np.asarray(fast | ((time_s - last < SETTLE_S) & (time_s >= last)))
 
 
 def kinematics(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
+    position: FloatArray, target: FloatArray | None, time: FloatArray, reading: Reading
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Driving angle, speed and acceleration of one record."""
+    steps = np.diff(time)
+    period_s = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
+    window = max(1, round(WINDOW_S / period_s)) | 1
     if len(time) < 4 * window:
         window = 1
     count = reading.resolution_deg if target is not None else reading.unaided_deg

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.observations.driving import driving_angle
-from hdbridge.observations.reading import quantum_deg
+from hdbridge.observations.kinematics import kinematics
+from hdbridge.observations.reading import quantum_deg, reading_of
 
 
 def turns(path):
@@ -30,9 +30,9 @@ def test_what_has_no_counts_has_none():
     assert quantum_deg(np.zeros(100)) == 0.0
 
 
-def test_a_command_is_taken_as_it_is():
-    path = np.array([0.0, 1.0, 0.999, 2.0])
-    assert driving_angle(path, None, True) is path
+def driving_angle(command, measured):
+    time = np.arange(len(measured)) / 250.0
+    return kinematics(measured, command, time, reading_of(measured))[0]
 
 
 def test_chatter_of_a_count_makes_no_turns():
@@ -41,7 +41,7 @@ def test_chatter_of_a_count_makes_no_turns():
     true = np.concatenate([np.linspace(0.0, 20.0, 2000), np.full(500, 20.0), np.linspace(20.0, 5.0, 2000)])
     measured = np.round((true + rng.normal(size=len(true)) * 0.3 * count) / count) * count
     assert turns(measured) > 100
-    path = driving_angle(measured, None, False)
+    path = driving_angle(None, measured)
     assert turns(path) == 1
     assert np.max(np.abs(path - true)) < 2.5 * count
 
@@ -51,6 +51,6 @@ def test_a_lagging_motor_turns_where_it_turned_and_not_where_it_was_told_to():
     command = 30.0 * np.cos(2 * np.pi * time / 4.0)
     motor = 29.0 * np.cos(2 * np.pi * time / 4.0 - 0.05)
     count = 0.045
-    path = driving_angle(command, np.round(motor / count) * count, True)
+    path = driving_angle(command, np.round(motor / count) * count)
     assert turns(path) == turns(motor)
     assert np.max(np.abs(path - motor)) < 1.5 * count

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.observations.driving import reversals
 from hdbridge.observations.kinematics import kinematics
 from hdbridge.observations.reading import reading_of
+from hdbridge.observations.reversals import reversals
 
 COUNTS = [8000, 2**14, 2**17, 2**20]
 
@@ -32,7 +32,7 @@ def kept(angle: np.ndarray, digits: int) -> np.ndarray:
 def turns(measured: np.ndarray, target: np.ndarray | None) -> int:
     reading = reading_of(measured)
     time_s = np.arange(len(measured)) / 50.0
-    return reversals(kinematics(measured, target, time_s, 1, reading)[0], reading.jitter_deg)
+    return reversals(kinematics(measured, target, time_s, reading)[0], reading.jitter_deg)
 
 
 @settings(deadline=None, max_examples=25)

@@ -1,48 +1,18 @@
-"""The angle that drives the gear's elastic state: smooth, and free of chatter.
-
-A hysteresis law with an infinite slope at each reversal turns one count of chatter into several arcseconds,
-so it must not see the encoder as it is. It sees the command, and where the motor was measured too, the
-command plus the lag behind it; either way a turn counts only when the motor comes back by more than chatter.
-"""
+"""Where a motor reverses: a turn counts only when it comes back by more than chatter."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from hdbridge.effects import FloatArray
-from hdbridge.observations.reading import reading_of
 
-LAG_SAMPLES = 5
-"""Samples over which the lag of the motor behind its command is averaged."""
-CHATTER_COUNTS = 2.6
-"""A measured angle counts as reversed when it has come back by more than this many counts."""
 REVERSAL_DEG = 0.3
 """Travel that a reversal has on either side of it, motor degrees: less than the narrowest loop that is looked
 for (0.5, `effects.elastic_loop`), and several times what a motor settles by (0.07 in measured records)."""
 JITTER_SIGMAS = 8.0
 """... and at least so many standard deviations of the reading's own error."""
-
-
-def driving_angle(motor_deg: FloatArray, position_deg: FloatArray | None, commanded: bool) -> FloatArray:
-    """Motor angle for the regressors, degrees, shape (n,).
-
-    Where the motor was measured in addition to its command: the command plus the averaged lag, but never
-    outside the cell that the encoder was read in, so that a fast move's lag does not smear over a turn.
-    """
-    if len(motor_deg) < 2 or (position_deg is None and commanded):
-        return motor_deg
-    if position_deg is None:
-        return steadied(motor_deg, motor_deg, CHATTER_COUNTS * reading_of(motor_deg).unaided_deg)
-    reading = reading_of(position_deg)
-    cell = reading.count_deg
-    path = position_deg
-    if cell:
-        lag = uniform_filter1d(position_deg - motor_deg, min(LAG_SAMPLES, len(motor_deg)), mode="nearest")
-        path = np.clip(motor_deg + lag, position_deg - 0.5 * cell, position_deg + 0.5 * cell)
-    return steadied(path, position_deg, CHATTER_COUNTS * reading.resolution_deg)
 
 
 def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) -> FloatArray:
