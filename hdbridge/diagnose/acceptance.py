@@ -14,8 +14,8 @@ import numpy as np
 
 from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linear import orthonormal
-from hdbridge.estimation.stretches import of_length, sums
+from hdbridge.estimation.linear import orthonormal, seen_directions, solve_symmetric
+from hdbridge.estimation.stretches import of_length, sandwich
 
 BLOCKS_S = (1.0, 5.0)
 """Noise that wanders is correlated over less than one or the other."""
@@ -23,8 +23,6 @@ LEAST_BLOCKS = 30
 """A short record is cut into so many, whatever their length: fewer tell no variance."""
 LEAST_POINTS = 20
 """Fewer tell nothing."""
-SHARE_LEFT = 1e-5
-"""Share of a column's squares below which what the others leave of it is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,55 +41,34 @@ def robust_chi_square(
     fitted: Fitted,
     place: int,
     nuisances: FloatArray | None = None,
-    rows: BoolArray | None = None,
+    rows: BoolArray | slice = slice(None),
     only: int | None = None,
 ) -> float:
-    """Of one effect of a hypothesis: its coefficients against zero, by the sums of their scores over
-    blocks of time.
+    """Of one effect of a hypothesis: its coefficients against zero, by their sandwich over blocks of time.
 
-    Everything else is projected out, and the columns ``nuisances`` (weighted) too; only ``rows`` count, where
-    given, and of the coefficients the one with the number ``only``.
+    Everything else is refitted, and the columns ``nuisances`` (weighted) are in addition to it; only ``rows``
+    count, where given, and of the coefficients the one with the number ``only``.
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     coefficients = fitted.hypothesis.effects[place].coefficients()
     if only is not None:
         own, coefficients = [own[only]], coefficients[[only]]
-    others = np.setdiff1d(np.arange(fitted.count()), own)
-    tangent, residual, time = fitted.tangent, fitted.residual, estimator.time_s
-    target = residual + tangent[:, own] @ coefficients
-    rest = tangent[:, others] if nuisances is None else np.hstack([tangent[:, others], nuisances])
-    columns = tangent[:, own]
-    if rows is not None:
-        rest, columns, target, time = rest[rows], columns[rows], target[rows], time[rows]
-        if np.count_nonzero(rows) < LEAST_POINTS:
-            return 0.0
-    held, asked = fitted.prior_rows()
-    held = held[:, others]
-    rest = np.vstack([rest, np.hstack([held, np.zeros((len(held), rest.shape[1] - held.shape[1]))])])
-    columns = np.vstack([columns, np.zeros((len(held), columns.shape[1]))])
-    target = np.concatenate([target, asked])
-    basis = orthonormal(rest)
-    left = columns - basis @ (basis.T @ columns)
-    share = np.sum(left**2, axis=0) / np.maximum(np.sum(columns**2, axis=0), 1e-300)
-    left = left[:, share > SHARE_LEFT]
-    if not left.shape[1]:
+    columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
+    columns, residual, time_s = columns[rows], fitted.residual[rows], estimator.time_s[rows]
+    if len(time_s) < LEAST_POINTS:
         return 0.0
-    gram = left.T @ left
-    target = target - basis @ (basis.T @ target)
-    moment = left.T @ target
-    residual = target - left @ np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
-    result = np.inf
-    scores = left * residual[:, np.newaxis]
-    for longest in BLOCKS_S:
-        number = of_length(
-            time, min(longest, estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS)
-        )
-        number = np.concatenate([number, number[-1] + 1 + np.arange(len(held))])
-        summed = sums(scores, number)
-        # The noise itself is a floor: a residual may be quieter than it by luck.
-        variance = summed.T @ summed + 0.25 * gram
-        result = min(result, float(moment @ np.linalg.lstsq(variance, moment, rcond=1e-10)[0]))
-    return result
+    known = np.zeros((columns.shape[1], 2))
+    known[: fitted.count()] = fitted.linearised.known
+    directions = seen_directions(columns.T @ columns + np.diag(known[:, 0]))
+    step = directions @ (directions.T @ (columns.T @ residual + known[:, 1]))
+    inverse = directions @ directions[own].T
+    coefficients = coefficients + step[own]
+    influence = (columns @ inverse) * (residual - columns @ step)[:, np.newaxis]
+    # The noise itself is a floor: a residual may be quieter than it by luck.
+    least = 0.25 * inverse[own] + inverse.T @ (np.maximum(known[:, :1], 0.0) * inverse)
+    longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
+    spreads = [sandwich(influence, of_length(time_s, min(each, longest_s))) + least for each in BLOCKS_S]
+    return min(float(coefficients @ solve_symmetric(each, coefficients)) for each in spreads)
 
 
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:

@@ -17,7 +17,7 @@ from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
-from hdbridge.estimation.stretches import of_length, sums
+from hdbridge.estimation.stretches import of_length, sandwich, sums
 from hdbridge.units import unit_of
 
 PARTS: Final = (6, 12)
@@ -41,15 +41,14 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     directions = seen_directions(gram)
     inverse = directions @ directions.T
     best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
-    scores = tangent * residual[:, np.newaxis] + fitted.pull / len(residual)  # about their mean
-
+    influence = tangent @ inverse
+    moved = influence * residual[:, np.newaxis] + inverse @ fitted.pull / len(residual)  # about their mean
     of_prior = inverse @ np.diag(np.maximum(fitted.information, 0.0)) @ inverse
 
     def at_least(number: IntArray, normal: bool) -> FloatArray:
-        summed, count = sums(scores, number), int(number[-1]) + 1
-        spread = inverse @ (summed.T @ summed) @ inverse * (count / (count - 1)) + of_prior
+        spread = sandwich(moved, number) + of_prior
         if not normal:
-            share = sums((tangent @ inverse) ** 2, number)
+            share = sums(influence**2, number)
             carried = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
             wider = stdtrit(np.maximum(carried - 1.0, 1.0), 0.975) / NORMAL_95
             spread = spread * np.outer(wider, wider)

@@ -117,12 +117,6 @@ class Fitted:
         """s, shape (r,): of a column's moment c'r the fit leaves c'r - (B'c)'s; none at its minimum."""
         return np.asarray(self._directions.T @ (self.tangent.T @ self.residual + self.pull))
 
-    def prior_rows(self) -> tuple[FloatArray, FloatArray]:
-        """What was known beforehand as observations: rows (k, p) of the tangent, (k,) of the residual."""
-        held = np.flatnonzero(self.information > 0.0)
-        root = np.sqrt(self.information[held])
-        return np.eye(self.count())[held] * root[:, np.newaxis], self.pull[held] / root
-
     def count(self) -> int:
         """Columns of the tangent matrix."""
         return len(self.parameters)

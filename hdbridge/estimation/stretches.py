@@ -28,6 +28,14 @@ def sums(rows: FloatArray, number: IntArray) -> FloatArray:
     return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
 
 
+def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
+    """Covariance (p, p) of what is the sum of the influences of all points, (n, p), where those of one number
+    may hang together (Liang and Zeger 1986).
+    """
+    summed, count = sums(influence, number), int(number[-1]) + 1
+    return np.asarray(summed.T @ summed * (count / max(count - 1, 1)))
+
+
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
     """What is left (n,) about the weighted mean of each absolute zero; as it is where that weighs nothing."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)

@@ -21,7 +21,7 @@ from hdbridge.estimation.linear import inverse_symmetric
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_turn
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.stretches import sums
+from hdbridge.estimation.stretches import sandwich, sums
 
 STRETCHES = 100
 """The record is cut into about so many stretches for the sandwich."""
@@ -31,17 +31,15 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
     """Covariance of the solution's columns, shape (p, p)."""
     model = inverse_symmetric(solution.information)
     number = clusters(blocks, STRETCHES)
-    count = int(number[-1]) + 1
     # Turns are noise (each has one stretch to itself), not parameters: they have no scores of their own.
     main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]
-    if count < 2 * len(main):
+    if int(number[-1]) + 1 < 2 * len(main):
         return model
-    scores = solution.jacobian[:, main] * precision.apply(solution.residual)[:, np.newaxis]
-    summed = sums(scores, number)
     inner = model[np.ix_(main, main)]
-    sandwich = inner @ (summed.T @ summed) @ inner * count / (count - 1.0)
+    weighted = precision.apply(solution.residual)
+    spread = sandwich(solution.jacobian[:, main] @ inner * weighted[:, np.newaxis], number)
     widen = np.ones(len(model))
-    widen[main] = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inner), 1e-300), 1.0))
+    widen[main] = np.sqrt(np.maximum(np.diag(spread) / np.maximum(np.diag(inner), 1e-300), 1.0))
     orders = {at for at, each in enumerate(solution.effects) if each.part is Part.ORDERS}
     waves = [at for at, each in enumerate(solution.columns) if each.effect in orders]
     if waves:
