@@ -37,11 +37,6 @@ class Observations(Protocol):
         ...
 
     @property
-    def travel_deg(self) -> float:
-        """The largest span of the motor's angle over which a phase is carried."""
-        ...
-
-    @property
     def motor_count_arcsec(self) -> float:
         """One count of the motor encoder, at the load."""
         ...

@@ -54,8 +54,6 @@ class Series:
     """False in fast moves between the legs of a bench plan, and just after them."""
     zero: IntArray
     """Number of the absolute zero of each point."""
-    leg: IntArray
-    """Number of the leg; a new one wherever the kind of motion changes."""
     kind: IntArray
     """Index into `Observed.kinds`."""
 
@@ -87,14 +85,11 @@ class Observed:
     """Whether the record has the command."""
     motor_count_arcsec: float
     """One count of the motor encoder at the load; where none is seen, the one that would jitter as much."""
-    load_count_arcsec: float
     period_s: float
     """Median time between samples."""
     standstill: bool
     reversals: int
     """Turns of the driving angle with travel on both sides, each within one record."""
-    travel_deg: float
-    """The largest span of the motor's angle over which a phase is carried: no further than to a cut."""
     remarks: tuple[str, ...]
     """What the record lacks, in words."""
 
@@ -154,7 +149,7 @@ def gather(
         load_deg=driving / ratio,
     )
     part_of = np.repeat(np.arange(len(rows_of)), [rows.stop - rows.start for rows in rows_of])
-    kind, leg, names = _kinds(time, speed, part_of, legs)
+    kind, names = _kinds(time, speed, legs)
     # Without a command the error is that of the counts as they are; only what drives the loop is steadied.
     error = (record.load_position_deg - (position if target is None else driving) / ratio) * ARCSEC_PER_DEG
     still = speed == 0.0
@@ -178,7 +173,7 @@ def gather(
     usable = ~settling(fast_kind & ~still, time)
     if np.mean(usable) < LEAST_SETTLED:
         usable[:] = True
-    full = Series(motion, error, sigma, usable, zero, leg, kind)
+    full = Series(motion, error, sigma, usable, zero, kind)
     runs = _runs(len(time), record.starts)
     return Observed(
         ratio=ratio,
@@ -189,33 +184,27 @@ def gather(
         zeros=int(zero[-1]) + 1,
         commanded=target is not None,
         motor_count_arcsec=counts[0],
-        load_count_arcsec=counts[1],
         period_s=period,
         standstill=standstill,
         reversals=turns,
-        travel_deg=prepared.travel_deg(independent_zeros),
         remarks=tuple(remarks),
     )
 
 
-def _kinds(
-    time: FloatArray, speed: FloatArray, part: IntArray, legs: Sequence[Segment]
-) -> tuple[IntArray, IntArray, tuple[str, ...]]:
-    """Kind and number of the leg of each sample; without legs by whether it stands, is slow or fast."""
+def _kinds(time: FloatArray, speed: FloatArray, legs: Sequence[Segment]) -> tuple[IntArray, tuple[str, ...]]:
+    """Kind of the leg of each sample; without legs by whether it stands, is slow or fast."""
     if legs:
         names = tuple(dict.fromkeys(["other", *(each.kind for each in legs)]))
         kind = np.zeros(len(time), dtype=np.intp)
-        leg = np.zeros(len(time), dtype=np.intp)
-        for number, each in enumerate(legs, 1):
+        for each in legs:
             rows = slice(np.searchsorted(time, each.start_s), np.searchsorted(time, each.end_s, "right"))
             kind[rows] = names.index(each.kind)
-            leg[rows] = number
-        return kind, leg, names
+        return kind, names
     magnitude = np.abs(speed)
     moving = magnitude[magnitude > 0.0]
     border = float(np.median(moving)) if len(moving) else 1.0
     kind = np.where(magnitude == 0.0, 0, np.where(magnitude <= border, 1, 2)).astype(np.intp)
-    return kind, part + 1, ("standing", "slow", "fast")
+    return kind, ("standing", "slow", "fast")
 
 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:
@@ -268,6 +257,5 @@ def _averaged(full: Series, runs: IntArray) -> Series:
         np.sqrt(mean(full.sigma_arcsec**2) / size),
         mean(full.usable.astype(np.float64)) > 0.999,
         full.zero[middle],
-        full.leg[middle],
         full.kind[middle],
     )

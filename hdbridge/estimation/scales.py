@@ -11,8 +11,6 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-BLIND = "blind suites of simulated axes"
-"""Chosen so that wrong names became rare there without a right one being lost."""
 FITTED = "tools/fit_probabilities.py"
 
 
@@ -46,7 +44,7 @@ class Scales:
         0.8,
         "share of a large rest that one more than few may leave",
         math.inf,
-        BLIND,
+        "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
     )
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
@@ -78,7 +76,12 @@ class Scales:
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
-    foot_lines: float = _scale(50.0, "lines of the record's resolution", 0.0, BLIND)
+    foot_lines: float = _scale(
+        50.0,
+        "lines of the record's resolution",
+        0.0,
+        "k lines off, a wave switched on has 1 / (pi k) of its amplitude: of 78 arcsec the floor",
+    )
 
     # What is left.
     plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
@@ -87,8 +90,18 @@ class Scales:
         0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
     )
     acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
-    near: float = _scale(0.4, "share of the largest piece", math.inf, BLIND)
-    leads: float = _scale(3.5, "peak over rms of what is left", 0.0, BLIND)
+    near: float = _scale(
+        0.4,
+        "share of the largest piece",
+        math.inf,
+        "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
+    )
+    leads: float = _scale(
+        3.5,
+        "peak over rms of what is left",
+        0.0,
+        "what is there in a twelfth of a record has a peak of 3.5 times its rms",
+    )
     foretold: float = _scale(
         0.3,
         "share of the square of what is left",

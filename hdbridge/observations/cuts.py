@@ -45,15 +45,6 @@ class Observed:
     cuts: tuple[int, ...] = ()
     """The rows before which nothing is known of the axis; some of ``record.starts``."""
 
-    def travel_deg(self, independent: bool = False) -> float:
-        """The largest span of the motor's angle without a cut; where the zeros of its records are independent
-        of each other, within one of them. No phase is carried further.
-        """
-        edges = [0, *(self.record.starts[1:] if independent else self.cuts), len(self.record)]
-        motor = self.record.motor_position_deg
-        spans = [motor[first:end] for first, end in pairwise(edges)]
-        return max((float(np.ptp(each)) for each in spans if len(each)), default=0.0)
-
 
 def observed(record: Record, ratio: float) -> Observed:
     """What a record says was observed; the same record where nothing is wrong with it."""

@@ -90,7 +90,6 @@ def test_a_jump_that_no_motor_makes_is_a_cut_and_no_reversal() -> None:
     assert seen.record.starts == (0, 500)
     assert seen.cuts == (500,)
     assert "nothing is known of the axis between" in seen.remarks[0]
-    assert seen.travel_deg() == pytest.approx(998.0)
     found = diagnose(one_file, TransmissionModel(RATIO, ()))
     assert any("hardly a reversal" in each for each in found.remarks)
     assert all(each.probability <= 0.6 for each in found.findings if each.cause != "unexplained")
