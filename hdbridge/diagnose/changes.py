@@ -15,12 +15,13 @@ import numpy as np
 from hdbridge.diagnose.experiment import next_experiment
 from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.lookalikes import together
-from hdbridge.diagnose.parameters import parameters_of, polar
+from hdbridge.diagnose.parameters import named_parameters, parameters_of
 from hdbridge.diagnose.result import UNWEIGHED, Finding, Parameter
 from hdbridge.diagnose.search import Search, Trail
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Part, Start
 from hdbridge.estimation.calibration import CalibratedPart, calibrated, variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.terms import Column
 from hdbridge.model import TransmissionModel
 
 
@@ -137,12 +138,9 @@ def _orders(
     causes = causes_of(was, is_now)
     if not causes or difference.largest_piece_arcsec() > scales.extrapolated * seen:
         return None  # on an arc of their turn orders take any size
-    parameters: dict[str, Parameter] = {}
-    for i, named in enumerate(difference.named_coefficients()):
-        pair = own[2 * i : 2 * i + 2]
-        # What it has changed from was itself known to its calibration only.
-        apart = spread[np.ix_(pair, pair)] + np.diag(known[i])
-        parameters |= polar(named.name, difference.coefficients()[list(named.columns)], apart)
+    # What it has changed from was itself known to its calibration only.
+    apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
+    parameters = named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart)
     return _finding(
         estimator, fitted, np.array(own),
         estimator.columns(difference, fitted.hypothesis.start) @ difference.coefficients(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -14,12 +14,14 @@ from hdbridge.diagnose.result import Parameter
 from hdbridge.diagnose.systematic import systematic
 from hdbridge.effects import Effect, FloatArray, IntArray, Moves
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.intervals import NORMAL_95
+from hdbridge.estimation.intervals import NORMAL_95, intervals_of, joined, labelled
 from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.stretches import of_length, sandwich, sums
+from hdbridge.estimation.terms import Column
 from hdbridge.units import unit_of
 
+WAVE: Final = ("amplitude_arcsec", "phase_deg")
 PARTS: Final = (6, 12)
 """Numbers of equal parts of a record that count as one observation each."""
 STEP_95: Final = 11.03
@@ -69,21 +71,8 @@ def parameters_of(
     estimator: Estimator, fitted: Fitted, place: int, spread: FloatArray
 ) -> dict[str, Parameter]:
     """Those of one effect, by the names of the model file where it has them."""
-    effect = fitted.hypothesis.effects[place]
-    own = fitted.places(place)
-    linear = [i for i in own if not fitted.parameters[i].shape]
-    result = _linear(effect, spread[np.ix_(linear, linear)])
-    for i in own:
-        parameter = fitted.parameters[i]
-        if not parameter.shape or spread[i, i] <= 0.0:
-            continue  # nothing in the record depends on it
-        value = shape_value(effect, parameter.name)
-        half = NORMAL_95 * math.sqrt(max(float(spread[i, i]), 0.0))
-        if parameter.logarithmic:
-            low, high = value * math.exp(-min(half, 20.0)), value * math.exp(min(half, 20.0))
-        else:
-            low, high = value - half, value + half
-        result[parameter.name] = Parameter(value, unit_of(parameter.name), low, high)
+    effect, own = fitted.hypothesis.effects[place], fitted.places(place)
+    result = named_parameters(effect, [fitted.parameters[i] for i in own], spread[np.ix_(own, own)])
     for shape in effect.shape:
         if shape.is_frequency and shape.name not in result:
             value = shape_value(effect, shape.name)
@@ -97,22 +86,26 @@ def parameters_of(
     return result
 
 
-def _linear(effect: Effect, spread: FloatArray) -> dict[str, Parameter]:
-    values = effect.coefficients()
-    deviation = np.sqrt(np.maximum(np.diag(spread), 0.0))
-
-    def plain(name: str, i: int) -> Parameter:
-        half = NORMAL_95 * float(deviation[i])
-        value = float(values[i])
-        return Parameter(value, unit_of(name), value - half, value + half, is_size=True)
-
-    result: dict[str, Parameter] = {}
+def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArray) -> dict[str, Parameter]:
+    """An effect's parameters by the covariance (c, c) of its ``columns``; without what nothing in the record
+    depends on.
+    """
+    names: dict[str, str] = {}
     for each in effect.named_coefficients():
-        own = list(each.columns)
-        if len(own) > 1:
-            result |= polar(each.name, values[own], spread[np.ix_(own, own)])
-        elif deviation[own[0]] > 0.0:
-            result[each.name] = plain(each.name, own[0])
+        path = labelled(effect.parameters(), each.path)
+        wave = len(each.columns) > 1
+        names |= {joined(path, leaf): each.name + leaf for leaf in (WAVE if wave else ("",))}
+    logarithmic = {each.name for each in effect.shape if each.logarithmic}
+    result: dict[str, Parameter] = {}
+    for found in intervals_of(effect, columns, spread):
+        name = names.get(found.parameter, found.parameter.rpartition(".")[2])
+        value, low, high = found.value, found.low, found.high
+        is_size = found.parameter in names and not name.endswith("phase_deg")
+        if name in logarithmic:
+            share = min(found.half_width / value, 20.0)
+            low, high = value * math.exp(-share), value * math.exp(share)
+        if found.half_width > 0.0:
+            result[name] = Parameter(value, unit_of(name), low, high, is_size)
     return result
 
 
@@ -142,23 +135,3 @@ def _stepwise(
         name = f"{named.name.removesuffix('size_arcsec')}{piece.shape[0].name}"
         result[name] = Parameter(begin_s, "s", min(low, begin_s), max(high, begin_s))
     return result
-
-
-def polar(prefix: str, pair: FloatArray, spread: FloatArray) -> dict[str, Parameter]:
-    """Amplitude and phase of a cosine and a sine, from their covariance."""
-    cosine, sine = map(float, pair)
-    amplitude = math.hypot(cosine, sine)
-    phase = math.degrees(math.atan2(-sine, cosine))
-    along = np.array([cosine, sine]) / max(amplitude, 1e-12)
-    across = np.array([-along[1], along[0]])
-    half = NORMAL_95 * math.sqrt(max(float(along @ spread @ along), 0.0))
-    sideways = NORMAL_95 * math.sqrt(max(float(across @ spread @ across), 0.0))
-    # The tangents from zero to the ellipse; any phase where zero is in it.
-    nearest = math.sqrt(max(amplitude**2 - half**2, 0.0))
-    turn = math.degrees(math.atan(sideways / nearest)) if nearest else 180.0
-    return {
-        f"{prefix}amplitude_arcsec": Parameter(
-            amplitude, "arcsec", max(amplitude - half, 0.0), amplitude + half, is_size=True
-        ),
-        f"{prefix}phase_deg": Parameter(phase, "deg", phase - turn, phase + turn),
-    }

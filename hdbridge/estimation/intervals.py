@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,7 +90,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
     def nest(value: Any, path: str) -> Any:
         if isinstance(value, dict):
-            nested = {key: nest(part, _joined(path, key)) for key, part in value.items()}
+            nested = {key: nest(part, joined(path, key)) for key, part in value.items()}
             return {key: part for key, part in nested.items() if part is not None}
         if isinstance(value, list):
             return [nest(part, f"{path}[{_label(part, number)}]") for number, part in enumerate(value)]
@@ -104,7 +104,7 @@ def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
     """Every floating-point parameter with its path; list items are labelled by their ``order`` if any."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
-            yield from leaves(part, _joined(path, key))
+            yield from leaves(part, joined(path, key))
     elif isinstance(parameters, list | tuple):
         for number, part in enumerate(parameters):
             yield from leaves(part, f"{path}[{_label(part, number)}]")
@@ -116,8 +116,18 @@ def _label(part: Any, number: int) -> int:
     return int(part["order"]) if isinstance(part, dict) and "order" in part else number
 
 
-def _joined(path: str, key: str) -> str:
-    return f"{path}.{key}" if path else key
+def joined(path: str, key: str) -> str:
+    """A path (`leaves`) with one step more."""
+    return f"{path}.{key}" if path and key else path or key
+
+
+def labelled(parameters: Any, path: Iterable[str | int]) -> str:
+    """The path (`leaves`) of where keys and numbers lead."""
+    said = ""
+    for key in path:
+        parameters = parameters[key]
+        said = joined(said, key) if isinstance(key, str) else f"{said}[{_label(parameters, key)}]"
+    return said
 
 
 def difference(name: str, low: float, high: float) -> float:
