@@ -104,7 +104,10 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
         if name in logarithmic:
             share = min(found.half_width / value, 20.0)
             low, high = value * math.exp(-share), value * math.exp(share)
-        if found.half_width > 0.0:
+        amplitude = result.get(name.replace("phase_deg", "amplitude_arcsec"))
+        if amplitude is not None and amplitude.low <= 0.0:  # what may be nothing has any phase
+            low, high = value - 180.0, value + 180.0
+        if found.half_width > 0.0 and name not in result:  # a shape that several parts share is told once
             result[name] = Parameter(value, unit_of(name), low, high, is_size)
     return result
 
