@@ -208,6 +208,7 @@ def _check(
             "twin": str(files.twin),
             "sentence": found.sentence,
             "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
+            "unseen": list(found.unseen),
         },
     )
     console.print(found.sentence, markup=False, soft_wrap=True)

@@ -62,13 +62,17 @@ class Check:
     """By channel, rms of what the twin leaves, over the scale that it was made with."""
     misfit_after: Mapping[str, float]
     """The same with the changes."""
+    unseen: tuple[str, ...] = ()
+    """Causes of which even a large change would not have shown, in this motion or against this twin."""
 
     @property
     def sentence(self) -> str:
-        """One sentence for somebody at the bench."""
-        if not self.changes:
-            return "Nothing has changed since the twin was made."
-        return f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}."
+        """One sentence for somebody at the bench; a second one of what would not have shown."""
+        found = "Nothing has changed since the twin was made"
+        if self.changes:
+            found = f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"
+        rest = f" A change of {', '.join(self.unseen)} would not have shown." if self.unseen else ""
+        return f"{found}.{rest}"
 
 
 def check(
@@ -101,7 +105,7 @@ def check(
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
-    return Check(changes, _in_scales(before, scale), _in_scales(after, scale))
+    return Check(changes, _in_scales(before, scale), _in_scales(after, scale), search.unseen(best))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +212,16 @@ class _Search:
         }
         after = at_coordinates(best.truth, parameters, now.tolist())
         return finding(parameters, self._twin, after, intervals, moved.distance, gain)
+
+    def unseen(self, best: _Place) -> tuple[str, ...]:
+        """The causes of which no parameter's change is known to better than what was possible before."""
+        found = []
+        for cause in (each for each in self._causes if each not in best.causes):
+            moved = self._moved(cause, best, cause)
+            spread = np.array([self._every[place].spread for place in moved.places])
+            if np.all(NORMAL_95 * np.sqrt(np.diag(moved.covariance)) > spread):
+                found.append(cause)
+        return tuple(found)
 
     def _contenders(self, best: _Place, suspects: Sequence[str]) -> list[tuple[str, Truth]]:
         """The suspects of which a parameter, moved alone, explains more than it costs, and where it does."""

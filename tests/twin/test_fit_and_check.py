@@ -112,7 +112,21 @@ def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> N
 def test_a_check_is_silent_where_nothing_has_changed() -> None:
     told = check(recorded(seed=1), AXIS, twin(), workers=1)
     assert told.changes == ()
-    assert told.sentence == "Nothing has changed since the twin was made."
+    # No step comes near the limit, and the demo's friction does not depend on its temperature.
+    assert told.unseen == ("current limit", "warmth")
+    assert told.sentence == (
+        "Nothing has changed since the twin was made. A change of current limit, warmth would not have shown."
+    )
+
+
+def test_a_check_says_what_a_twin_that_knows_little_would_not_have_shown() -> None:
+    known = twin()
+    about = known.provenance["fit"]
+    vague = [[1e9 * value for value in row] for row in about["covariance"]]
+    unsure = known.model_copy(update={"provenance": {"fit": about | {"covariance": vague}}})
+    told = check(recorded(seed=1), AXIS, unsure, workers=1)
+    assert told.changes == ()
+    assert {"friction", "load inertia"} & set(told.unseen)
 
 
 def test_a_check_names_what_has_changed() -> None:
