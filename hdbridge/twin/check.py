@@ -39,6 +39,8 @@ SIZES = (1.0, 2.5, 6.0)
 goes out of step at a small share of a larger change already, and slopes say nothing of it."""
 CONTENDERS = 3
 """So many causes are fitted; the others are behind with one parameter alone already."""
+EXCHANGED = 2
+"""Once so many causes are found, the first one is looked for again."""
 STEPS = 6
 DRAWS = 8
 """Rounded and noisy replays about a place, within what the twin leaves open. A recording is held against
@@ -99,7 +101,7 @@ def check(
             step = search.next_after(best)
             if step is None:
                 break
-            best = step
+            best = search.exchanged(step) if len(step.causes) == EXCHANGED else step
         best = search.without_idle(best)
         (after,) = replays([best.truth])
     progress(1.0)
@@ -190,6 +192,15 @@ class _Search:
             if self._significant(causes[-1], found) and self._matters(best, found):
                 return found
         return None
+
+    def exchanged(self, best: _Place) -> _Place:
+        """The place with another cause for the first one, where that explains more.
+
+        The first had to explain all that has changed, and may have stood in for two.
+        """
+        others = best.causes[1:]
+        instead = self.next_after(self.at(others, self._fit(others, self._twin, best)[1].truth))
+        return instead if instead is not None and self._explains_more(instead, best) else best
 
     def without_idle(self, best: _Place) -> _Place:
         """Only the causes that are still significant next to the others."""
@@ -286,8 +297,19 @@ class _Search:
 
     def _matters(self, best: _Place, found: _Place) -> bool:
         """Whether one cause more explains more than a twin may leave."""
-        alike = [each.left * each.apart / np.maximum(best.apart, found.apart) for each in (best, found)]
-        return bool(np.any(self._squares(alike[0]) - self._squares(alike[1]) > TOLERATED))
+        before, after = self._alike(best, found)
+        return bool(np.any(self._squares(before) - self._squares(after) > TOLERATED))
+
+    def _explains_more(self, one: _Place, other: _Place) -> bool:
+        """Whether as many causes leave less, by what each costs."""
+        left, right = (0.5 * float(each @ each) for each in self._alike(one, other))
+        prices = [0.5 * sum(map(self._price, each.causes)) for each in (one, other)]
+        return left + prices[0] < right + prices[1]
+
+    def _alike(self, one: _Place, other: _Place) -> tuple[FloatArray, FloatArray]:
+        """What two places leave, on one scale."""
+        apart = np.maximum(one.apart, other.apart)
+        return one.left * one.apart / apart, other.left * other.apart / apart
 
     def _squares(self, left: FloatArray) -> FloatArray:
         """Mean square by channel."""
