@@ -19,6 +19,8 @@ import pytest
 from support.hidden import CAUSES
 from support.hidden_bench import (
     ACCELERATION_DEG_S2,
+    CYCLE_MS,
+    FAST_MS,
     REACH_DEG,
     SPEED_DEG_S,
     STEPPING,
@@ -115,13 +117,14 @@ class Bench:
     highest_deg_s2: float = ACCELERATION_DEG_S2
     truth: Truth | None = None
     stepping: Stepping = STEPPING
+    cycle_ms: float = CYCLE_MS
 
     @contextmanager
     def run(self, folder: Path, seed: int) -> Iterator[Cell]:
         """The axis with it, measured."""
         sizes = [(each, 2.0 if each == "subdivisional_error" else 5.0) for each in self.causes]
         parts = (*LOOP, *self.parts)
-        with hidden_bench(folder, sizes, seed, parts, self.highest_deg_s2, self.truth) as cell:
+        with hidden_bench(folder, sizes, seed, parts, self.highest_deg_s2, self.truth, self.cycle_ms) as cell:
             cell.stepping = self.stepping
             yield cell
 
@@ -131,7 +134,7 @@ def single(cause: str, parts: Parts, **more: Any) -> tuple[str, Bench]:
 
 
 def pair(first: str, second: str, parts: Parts) -> tuple[str, Bench]:
-    return f"{first} and {second}", Bench(parts, (first, second))
+    return f"{first} and {second}", Bench(parts, (first, second), cycle_ms=FAST_MS)
 
 
 SINGLE = dict(
@@ -143,10 +146,10 @@ SINGLE = dict(
         single("direction_phase", FAST),
         single("torque_modulation", TORQUES),
         single("compliance", TURN),
-        single("inertial_windup", SWINGS, highest_deg_s2=39.0, stepping=AT_REST),
-        single("velocity_windup", SPEEDS, truth=greased()),
+        single("inertial_windup", SWINGS, highest_deg_s2=39.0, stepping=AT_REST, cycle_ms=FAST_MS),
+        single("velocity_windup", SPEEDS, truth=greased(), cycle_ms=FAST_MS),
         single("channel_skew", SPEEDS),
-        single("backlash", FAST),
+        single("backlash", FAST, cycle_ms=FAST_MS),
         single("hysteresis_memory", FAST),
         single("hysteresis_parameters", FAST),
         single("rate_dependence", SLOW, stepping=AT_REST),

@@ -33,7 +33,10 @@ from hdbridge.sim.truth import Truth
 from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-CYCLE_MS = 10
+CYCLE_MS = 20
+"""Half as many samples as at `FAST_MS` show the same of most causes."""
+FAST_MS = 10
+"""For what depends on speed or acceleration, and for play, which the axis crosses within some samples."""
 MOTOR_COUNTS = 32_768
 """A command in whole counts is followed at a fixed fraction of a count: half a count is a bias of a sweep."""
 SPEED_DEG_S = 6.1
@@ -82,10 +85,10 @@ STEPPING = Stepping(count=20, step_deg=403.56)
 """At every phase of the motor, over most of a load turn."""
 
 
-def axis_config(folder: Path) -> AxisConfig:
+def axis_config(folder: Path, cycle_ms: float) -> AxisConfig:
     """The axis file, written into a folder."""
     text = (DEMO / "axis.yaml").read_text() + SENSORS
-    for old, new in (("cycle_ms: 4", f"cycle_ms: {CYCLE_MS}"), ("turn: 8000", f"turn: {MOTOR_COUNTS}")):
+    for old, new in (("cycle_ms: 4", f"cycle_ms: {cycle_ms}"), ("turn: 8000", f"turn: {MOTOR_COUNTS}")):
         assert old in text
         text = text.replace(old, new)
     path = folder / "axis.yaml"
@@ -198,11 +201,12 @@ def hidden_bench(
     parts: Sequence[Procedure[Any]],
     highest_deg_s2: float = ACCELERATION_DEG_S2,
     truth: Truth | None = None,
+    cycle_ms: float = CYCLE_MS,
 ) -> Iterator[Cell]:
     """An axis with causes of given sizes in it, measured."""
     rng = random.Random(f"hidden {seed} {causes}")
     folder.mkdir(parents=True, exist_ok=True)
-    axis = axis_config(folder)
+    axis = axis_config(folder, cycle_ms)
     bare = truth or bare_truth()
     (folder / "model.yaml").write_text(model_text(bare_truth(), rng))
     known, hidden = hide_all(bare, causes, rng, run_of(parts, axis, highest_deg_s2))
