@@ -87,7 +87,7 @@ def test_an_elastic_state_that_is_not_told_is_found(bench):
     plan = [
         ("reversal", bench.ramp(0.0, 6.0, 3.0)),
         ("standstill", np.full(200, 6.0)),
-        *bench.plan(turns=8.0),
+        *bench.plan(turns=3.0),
     ]
     segments = axis.record(plan)
     shift = 2.0 * axis.offset / 3600.0  # the first segment as if it had begun saturated backwards

@@ -200,7 +200,7 @@ def led(machine: Machine, seed: int, cycles: int = 150) -> list[tuple[Any, ...]]
     return rows
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(truths(), st.integers(0, 1000))
 def test_compiled_and_python_agree_bit_for_bit(known: Truth, seed: int) -> None:
     ours, theirs = Machine(known, seed), Machine(known, seed, may_compile=True)
