@@ -33,16 +33,11 @@ def searched(fit: Separable, effects: _Effects) -> tuple[float, _Effects]:
 def _minima(fit: Separable, index: int, effects: _Effects) -> list[_Effects]:
     """With one effect at its local minima over a grid of its shapes, best first; others as they are."""
     effect = effects[index]
-    axes = [
-        np.geomspace(each.lower, each.upper, GRID_LOGARITHMIC)
-        if each.logarithmic
-        else np.linspace(each.lower, each.upper, GRID_LINEAR)
-        for each in effect.shape
-    ]
+    axes = [each.grid(GRID_LOGARITHMIC if each.logarithmic else GRID_LINEAR) for each in effect.shape]
     costs = np.full(tuple(len(each) for each in axes), np.inf)
     tried: dict[tuple[int, ...], Effect] = {}
     for place in product(*(range(size) for size in costs.shape)):
-        shape = {each.name: float(axis[at]) for each, axis, at in zip(effect.shape, axes, place, strict=True)}
+        shape = {each.name: axis[at] for each, axis, at in zip(effect.shape, axes, place, strict=True)}
         candidate = effect.fitted(effect.coefficients(), shape)
         found = fit.fit((*effects[:index], candidate, *effects[index + 1 :]), LINEAR_ONLY)
         tried[place] = found.effects[index]
