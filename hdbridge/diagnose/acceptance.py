@@ -14,7 +14,8 @@ import numpy as np
 
 from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linear import orthonormal, seen_directions, solve_symmetric
+from hdbridge.estimation.linear import orthonormal, solve_symmetric
+from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.stretches import of_length, sandwich
 
 BLOCKS_S = (1.0, 5.0)
@@ -54,16 +55,14 @@ def robust_chi_square(
     if only is not None:
         own, coefficients = [own[only]], coefficients[[only]]
     columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
-    columns, residual, time_s = columns[rows], fitted.residual[rows], estimator.time_s[rows]
-    if len(time_s) < LEAST_POINTS:
-        return 0.0
     known = np.zeros((columns.shape[1], 2))
     known[: fitted.count()] = fitted.linearised.known
-    directions = seen_directions(columns.T @ columns + np.diag(known[:, 0]))
-    step = directions @ (directions.T @ (columns.T @ residual + known[:, 1]))
-    inverse = directions @ directions[own].T
-    coefficients = coefficients + step[own]
-    influence = (columns @ inverse) * (residual - columns @ step)[:, np.newaxis]
+    fit, time_s = Linearised(columns[rows], fitted.residual[rows], known), estimator.time_s[rows]
+    if len(time_s) < LEAST_POINTS:
+        return 0.0
+    inverse = fit.directions @ fit.directions[own].T
+    coefficients = coefficients + fit.directions[own] @ fit.slack
+    influence = (fit.columns @ inverse) * (fit.residual - fit.basis @ fit.slack)[:, np.newaxis]
     # The noise itself is a floor: a residual may be quieter than it by luck.
     least = 0.25 * inverse[own] + inverse.T @ (np.maximum(known[:, :1], 0.0) * inverse)
     longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS

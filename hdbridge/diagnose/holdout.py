@@ -11,8 +11,8 @@ import numpy as np
 
 from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.holdout import Linearised, steps_without
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.linearised import Linearised, steps_without
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.stretches import counted, of_number
 

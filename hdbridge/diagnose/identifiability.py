@@ -36,7 +36,7 @@ def identifiability(
     best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
     stride = -(-len(estimator.index) // ENOUGH)
     # Leaving points out changes what a basis spans over them: made orthonormal anew.
-    basis = orthonormal(fitted.basis[::stride])
+    basis = orthonormal(fitted.linearised.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
         columns = estimator.columns(candidate.effect, fitted.hypothesis.start)[::stride]

@@ -68,7 +68,7 @@ def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
 
 def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
     """The time (s) of the best single step, at any sample; exact, with the hypothesis projected out."""
-    weight, basis = estimator.weight, fitted.basis
+    weight, basis = estimator.weight, fitted.linearised.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
     left = square.copy()
@@ -98,7 +98,7 @@ def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
 
     moments = binned(weight * fitted.residual)
     squares = binned(weight**2)
-    shadows = np.stack([binned(weight * each) for each in fitted.basis.T])
+    shadows = np.stack([binned(weight * each) for each in fitted.linearised.basis.T])
     best: tuple[float, float, float] | None = None
     for half in HALF_WIDTHS_DEG:
         kernel = np.fft.rfft(_bump(half))

@@ -15,7 +15,6 @@ from hdbridge.diagnose.systematic import systematic
 from hdbridge.effects import Effect, FloatArray, IntArray, Moves
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.intervals import NORMAL_95, intervals_of, joined, labelled
-from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.stretches import of_length, sandwich, sums
 from hdbridge.estimation.terms import Column
@@ -39,13 +38,12 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
     (`systematic`).
     """
     tangent, residual = fitted.tangent, fitted.residual
-    gram = tangent.T @ tangent + np.diag(fitted.information)
-    directions = seen_directions(gram)
+    directions, known = fitted.linearised.directions, fitted.linearised.known
     inverse = directions @ directions.T
     best = inverse * max(float(residual @ residual) / max(len(residual) - fitted.count(), 1), 0.25)
     influence = tangent @ inverse
-    moved = influence * residual[:, np.newaxis] + inverse @ fitted.pull / len(residual)  # about their mean
-    of_prior = inverse @ np.diag(np.maximum(fitted.information, 0.0)) @ inverse
+    moved = influence * residual[:, np.newaxis] + inverse @ known[:, 1] / len(residual)  # about their mean
+    of_prior = inverse @ np.diag(np.maximum(known[:, 0], 0.0)) @ inverse
 
     def at_least(number: IntArray, normal: bool) -> FloatArray:
         spread = sandwich(moved, number) + of_prior

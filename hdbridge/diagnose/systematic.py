@@ -16,7 +16,7 @@ import numpy as np
 from hdbridge.diagnose.lookalikes import lookalikes
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, aliases_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linear import seen_directions
+from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.screening import proposed
 
 
@@ -40,10 +40,9 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
         if known & set(theirs):
             continue  # its calibration distinguishes the two
         own = [i for i, each in enumerate(fitted.parameters) if each.effect not in theirs]
-        tangent = fitted.tangent[:, own]
-        directions = seen_directions(tangent.T @ tangent + np.diag(fitted.information[own]))
-        shift = directions @ (directions.T @ (tangent.T @ columns))
-        left = columns - tangent @ shift
+        fit = Linearised(fitted.tangent[:, own], fitted.residual, fitted.linearised.known[own])
+        shift = fit.taken_over(columns)
+        left = columns - fit.columns @ shift
         claimed = noise * np.sum(columns**2, axis=0)
         seen, axes = np.linalg.eigh(left.T @ left - np.diag(claimed))
         if seen[0] < scales.enter + scales.penalty:
@@ -56,10 +55,9 @@ def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """What systematic errors add to the covariance of all parameters, shape (p, p)."""
     start, motion = fitted.hypothesis.start, estimator.data.full.motion
     added = np.zeros((fitted.count(), fitted.count()))
-    directions = seen_directions(fitted.tangent.T @ fitted.tangent + np.diag(fitted.information))
     for place, effect in enumerate(fitted.hypothesis.effects):
         form = estimator.weighted(estimator.at_points(effect.law_discrepancy(motion, start)))
-        shift = directions @ (directions.T @ (fitted.tangent.T @ form))
+        shift = fitted.linearised.taken_over(form)
         added += shift @ shift.T
         own = fitted.places(place)
         for each in confounded(estimator, fitted, place):

@@ -15,8 +15,8 @@ import numpy as np
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
-from hdbridge.estimation.holdout import Linearised
-from hdbridge.estimation.linear import seen_directions, side_by_side
+from hdbridge.estimation.linear import side_by_side
+from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.observed import Observed
 from hdbridge.estimation.scales import Scales
@@ -84,38 +84,20 @@ class Fitted:
         return self._solution.origin
 
     @cached_property
-    def tangent(self) -> FloatArray:
-        """Weighted derivatives, shape (m, p)."""
-        return self._solution.jacobian * self._weight[:, np.newaxis]
+    def linearised(self) -> Linearised:
+        """In units of the noise."""
+        weighted = self._solution.jacobian * self._weight[:, np.newaxis]
+        return Linearised(weighted, self.residual, self._solution.known)
 
     @property
-    def linearised(self) -> Linearised:
-        """Columns and residual in units of the noise."""
-        return Linearised(self.tangent, self.residual, self._solution.known)
+    def tangent(self) -> FloatArray:
+        """Weighted derivatives, shape (m, p)."""
+        return self.linearised.columns
 
     @property
     def information(self) -> FloatArray:
         """What was known of each column beforehand: one over its variance, shape (p,)."""
-        return self._solution.known[:, 0]
-
-    @property
-    def pull(self) -> FloatArray:
-        """That times how far its mean is from where the column stands, shape (p,)."""
-        return self._solution.known[:, 1]
-
-    @cached_property
-    def _directions(self) -> FloatArray:
-        return seen_directions(self.tangent.T @ self.tangent + np.diag(self.information))
-
-    @cached_property
-    def basis(self) -> FloatArray:
-        """B, shape (m, r): of a column c the fit leaves c'c - (B'c)'(B'c); orthonormal without a prior."""
-        return np.asarray(self.tangent @ self._directions)
-
-    @cached_property
-    def slack(self) -> FloatArray:
-        """s, shape (r,): of a column's moment c'r the fit leaves c'r - (B'c)'s; none at its minimum."""
-        return np.asarray(self._directions.T @ (self.tangent.T @ self.residual + self.pull))
+        return self.linearised.known[:, 0]
 
     def count(self) -> int:
         """Columns of the tangent matrix."""

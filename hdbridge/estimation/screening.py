@@ -74,9 +74,9 @@ class Screen:
 
     def scores(self, fitted: Fitted) -> list[Score]:
         """Each candidate's, in their order."""
-        basis, matrix = fitted.basis, self._matrix
-        shadow = basis.T @ matrix
-        moment = matrix.T @ fitted.residual - shadow.T @ fitted.slack
+        fit, matrix = fitted.linearised, self._matrix
+        shadow = fit.basis.T @ matrix
+        moment = matrix.T @ fit.residual - shadow.T @ fit.slack
         return [
             _score(candidate, gram, shadow[:, part], moment[part])
             for candidate, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
@@ -85,8 +85,9 @@ class Screen:
 
 def score_of(candidate: Candidate, columns: FloatArray, fitted: Fitted) -> Score:
     """The score of one candidate from its weighted columns."""
-    shadow = fitted.basis.T @ columns
-    moment = columns.T @ fitted.residual - shadow.T @ fitted.slack
+    fit = fitted.linearised
+    shadow = fit.basis.T @ columns
+    moment = columns.T @ fit.residual - shadow.T @ fit.slack
     return _score(candidate, columns.T @ columns, shadow, moment)
 
 

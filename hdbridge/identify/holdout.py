@@ -11,7 +11,7 @@ from hdbridge.effects import FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.design import clusters
 from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.holdout import Linearised, steps_without
+from hdbridge.estimation.linearised import Linearised, steps_without
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.samples import KINDS
