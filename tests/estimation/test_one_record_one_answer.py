@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import plant
 
-from hdbridge.effects import Effect, FloatArray, Hysteresis, Start, Synchronous
+from hdbridge.effects import Channel, Effect, FloatArray, Hysteresis, Start, Synchronous
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.estimation import observed, samples
 from hdbridge.estimation.blocks import Blocks, make_blocks
@@ -57,8 +57,14 @@ def seen(request: pytest.FixtureRequest) -> Seen:
     return Seen(samples.gather([segment], RATIO, slow_deg_s=1e9), observed.gather(record, RATIO))
 
 
+def test_both_are_driven_by_the_same_angle_at_the_same_speed(seen: Seen) -> None:
+    motion = seen.diagnosis.full.motion
+    assert np.array_equal(motion.motor_deg, seen.calibration.motor_deg)
+    assert np.array_equal(motion.channel(Channel.SPEED, "both"), seen.calibration.speed_deg_s)
+
+
 def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
-    """The same white noise, motion and blocks handed in: orders, loop and standard errors to 1e-6."""
+    """The same white noise and blocks handed in: orders, loop and standard errors to 1e-6."""
     table = seen.calibration
     design = Design.of(table, make_blocks(table), [Start.VIRGIN])
     blocks = design.blocks
@@ -69,7 +75,6 @@ def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
 
     full = replace(
         seen.diagnosis.full,
-        motion=table.motion,
         error_arcsec=table.error_arcsec,
         usable=table.usable,
         sigma_arcsec=np.full(len(table), NOISE_ARCSEC),
