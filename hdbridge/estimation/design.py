@@ -68,13 +68,14 @@ class Design:
         parts = (self.columns(each, exact) @ each.coefficients() for each in effects)
         return np.asarray(sum(parts, start=np.zeros(len(self.blocks))))
 
-    def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, IntArray]:
-        """What a reach further at the turn before would change, arcsec (b,), and which turn that is.
+    def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
+        """What a reach further at the turn before would change, arcsec (b,), what share of that reach may lie
+        between two samples (b,), and which turn it is (b,).
 
         The reach is within what a turn is known: the count, and twice what may lie between two samples.
         Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
         """
-        change = np.zeros(len(self.blocks))
+        change, missed = np.zeros((2, len(self.blocks)))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
         last = 0
         for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
@@ -82,19 +83,23 @@ class Design:
             motion = motion_at(self.samples.along(chain), picked)
             turning, signs = branches(motion.motor_deg, Start.VIRGIN)
             inside = self.blocks.chain == number
-            turn[inside] = last + np.searchsorted(turning, middles, "left")
+            branch = np.searchsorted(turning, middles, "left")
+            turn[inside] = last + branch
             last += len(turning) + 1
             at = picked[turning[1:-1]]
-            reach = self.samples.count_deg + 2.0 * missed_deg(self.samples.motor_deg[chain.rows], at)
+            between = missed_deg(self.samples.motor_deg[chain.rows], at)
+            reach = self.samples.count_deg + 2.0 * between
             if not np.any(reach):
                 continue
+            share = np.concatenate([[0.0], between / np.maximum(reach, 1e-12), [0.0]])
+            missed[inside] = share[branch - 1]
             moved_motor = motion.motor_deg.copy()
             moved_motor[turning[1:-1]] += 0.5 * reach * np.array(signs[:-1])
             other = replace(motion, motor_deg=moved_motor)
             for effect in effects:
                 if not isinstance(effect.tracker(), Memoryless):
                     change[inside] += (effect.predict(other, start) - effect.predict(motion, start))[middles]
-        return 2.0 * change, turn
+        return 2.0 * change, missed, turn
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
         """The same, each block's variance raised by what rounding of the driving angle does to the effects.
@@ -102,7 +107,7 @@ class Design:
         Just after a turn a hysteresis may rise without bound: what is measured there says little, and should
         not say much.
         """
-        change, _ = self.turn_effects(effects)
+        change, _, _ = self.turn_effects(effects)
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:

@@ -114,8 +114,8 @@ class Solution:
         """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
         prior = self._fit.terms.prior
         result = np.zeros((len(self.columns), 2))
-        result[: len(self.nuisances), 0] = self._fit.terms.nuisances.prior
-        result[: len(self.nuisances), 1] = -self._fit.terms.nuisances.prior * self.nuisances
+        mean, information = np.array(self._fit.terms.nuisances.prior).reshape(-1, 2).T
+        result[: len(mean)] = np.stack([information, information * (mean - self.nuisances)], axis=1)
         for at, each in enumerate(self.columns):
             known = prior.get((each.effect, each.name)) if each.effect >= 0 else None
             if known is not None:
@@ -280,7 +280,7 @@ class Separable:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and mean beforehand, and the sign, of each linear column."""
         terms = self.terms
-        rows = [(each, 0.0, 0.0) for each in terms.nuisances.prior.tolist()]
+        rows = [(each.information, each.mean, 0.0) for each in terms.nuisances.prior]
         for place in (each for group in places for each in group):
             sign = terms.sign(effects[place])
             for number in range(len(effects[place].coefficients())):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -35,6 +36,10 @@ class Prior(NamedTuple):
     mean: float
     information: float
     """One over the variance; less than nothing takes back what columns that are noisy themselves claim."""
+
+
+FREE = Prior(0.0, 0.0)
+"""Nothing is known."""
 
 
 class Column(NamedTuple):
@@ -73,27 +78,28 @@ class Nuisances:
     columns: FloatArray
     """Shape (b, q)."""
     names: tuple[str, ...]
-    prior: FloatArray
-    """One over the variance about zero that each coefficient has beforehand; 0 where nothing is known."""
+    prior: tuple[Prior, ...]
+    """What is known of each coefficient beforehand."""
 
     def and_also(self, other: Nuisances) -> Nuisances:
         """With further columns."""
         return Nuisances(
             side_by_side([self.columns, other.columns], len(self.columns)),
             (*self.names, *other.names),
-            np.concatenate([self.prior, other.prior]),
+            self.prior + other.prior,
         )
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
         """Without the columns whose names answer."""
         keep = np.array([not left_out(each) for each in self.names])
-        names = tuple(each for each in self.names if not left_out(each))
-        return Nuisances(self.columns[:, keep], names, self.prior[keep])
+        return Nuisances(
+            self.columns[:, keep], tuple(compress(self.names, keep)), tuple(compress(self.prior, keep))
+        )
 
 
 def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
     """Columns of which nothing is known."""
-    return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), np.zeros(len(names)))
+    return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), (FREE,) * len(names))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -99,8 +99,11 @@ class State(NamedTuple):
         weighted = self.precision().apply(columns)
         gram = columns.T @ weighted
         inside = np.arange(len(extra.prior)) + self.waves.shape[1]
-        gram[inside, inside] += extra.prior
-        return gram, weighted.T @ self.design.blocks.error_arcsec
+        right = weighted.T @ self.design.blocks.error_arcsec
+        mean, known = np.array(extra.prior).T
+        gram[inside, inside] += known
+        right[inside] += known * mean
+        return gram, right
 
     def selected(self, system: System | None = None) -> State:
         """With the orders that this noise lets one see; ``system`` is `information`, where it is at hand."""

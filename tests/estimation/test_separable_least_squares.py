@@ -22,7 +22,7 @@ from hdbridge.effects.creep import Relaxation
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.separable import Separable
-from hdbridge.estimation.terms import Nuisances, Prior, Terms
+from hdbridge.estimation.terms import FREE, Nuisances, Prior, Terms
 
 TIME_S = np.arange(0.0, 120.0, 0.05)
 MOTION = Motion(400.0 * np.sin(0.11 * TIME_S) + 60.0 * np.sin(0.9 * TIME_S), TIME_S)
@@ -44,7 +44,7 @@ def terms(truth: tuple[Effect, ...], seed: int = 3) -> Terms:
         observed,
         lambda effect: effect.columns(MOTION, Start.FORWARD),
         White(np.full(len(TIME_S), 1.0 / SIGMA_ARCSEC)),
-        Nuisances(np.ones((len(TIME_S), 1)), ("zero",), np.zeros(1)),
+        Nuisances(np.ones((len(TIME_S), 1)), ("zero",), (FREE,)),
     )
 
 

@@ -272,3 +272,19 @@ def test_turns_between_two_samples_bend_no_parameter_of_the_loop(bench):
     assert off(result, "hysteresis", "width_deg", axis.width) < 2.0
     assert off(result, "hysteresis", "exponent", axis.exponent) < 2.0
     assert result.interval("hysteresis", "width_deg").half_width < 0.3
+
+
+def test_counts_that_a_motor_lags_by_at_each_speed_bend_no_parameter_of_the_loop(bench):
+    """The motor is behind its reading by up to a quarter of a count: once round with every 200 counts/s."""
+    axis, count = bench.axis(motor_counts=8000.0), 360.0 / 8000.0
+    plan = [*bench.plan(turns=8.0), *bench.plan(turns=8.0, speed=61.7)[1:3]]
+    speed = np.gradient(np.concatenate([each for _, each in plan])) * bench.rate_hz
+    behind = 0.25 * count * np.sin(2 * np.pi * np.abs(speed) / count / 200.0) * np.sign(speed)
+    segments, at = [], 0
+    for each in axis.record(plan):
+        lag, at = behind[at : at + len(each)], at + len(each)
+        segments.append(replace(each, load_deg=each.load_deg - lag / axis.ratio))
+    result = fit(segments, axis.ratio, bench.options)
+    assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 1.2
+    assert off(result, "hysteresis", "width_deg", axis.width) < 1.2
+    assert off(result, "hysteresis", "exponent", axis.exponent) < 1.2
