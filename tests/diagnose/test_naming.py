@@ -227,3 +227,16 @@ def test_a_load_that_lags_is_a_loop_of_the_other_sign(
     loop = next(each for each in found.model.effects if each.name == "hysteresis")
     assert loop.parameters()["offset_arcsec"] == pytest.approx(-30.0, abs=0.5)
     assert found.extended.rms_arcsec < 1.5 * found.noise_floor_arcsec
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"motor_order": {"orders": [(each, 2.0, 37.0 * each) for each in (5, 7, 9, 10, 11, 12)]}},
+        {"unknown": {"kind": "bursts", "size": 5.0}, "load_order": {"orders": [(2, 4.0, 30.0)]}},
+    ],
+    ids=["more equal orders than one cause has", "bursts beside an order of the load"],
+)
+def test_what_no_cause_describes_leads(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
+    """Without `Scales.near` the orders are one cause, without `Scales.leads` the load's order comes first."""
+    assert names(diagnosed(effects))[0] == "unexplained"
