@@ -167,7 +167,7 @@ def traces_of(data: Data, truth: Truth, seed: int | None = None) -> list[dict[st
         commands = piece.commands
         draw = 0 if seed is None else len(data.pieces) * seed + number
         traces = run(commands, data.axis, simulated, draw, smooth=seed is None)
-        wanted = _demand_deg(commands, data.axis)
+        wanted = demand_deg(commands, data.axis)
         shown.append(
             {
                 FOLLOWING: wanted - traces.motor_deg,
@@ -368,7 +368,7 @@ def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[Float
     return np.maximum(places, 0).astype(np.float64), tuple(kind for _, kind in starts)
 
 
-def _demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
+def demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
     """The commanded motor angle at each row."""
     counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
     encoder = axis.motor_encoder

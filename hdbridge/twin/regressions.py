@@ -1,8 +1,11 @@
 """Where a fit starts: what can be read off the recordings without any replay, by linear regressions.
 
-While the motor follows its command, torque is inertia times acceleration, Coulomb friction by the sign of
-the speed and viscous friction by the speed; and the following error at a constant speed is that speed times
-the age of the demand.
+The motor's torque is its own inertia times its acceleration, the load's by the ratio, Coulomb friction by the
+sign of the speed and viscous friction by the speed, whatever the spring and the loops are. The load's part is
+taken from its own encoder: near its resonance it does not do what the command says. The motor's part is
+needed, but not used: a drive takes in a new demand in each cycle, so the motor accelerates in the first
+milliseconds of a cycle, and its torque is told at the end. The following error at a constant speed is
+that speed times the age of the demand.
 """
 
 from __future__ import annotations
@@ -14,13 +17,15 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import Data, Piece
-from hdbridge.twin.parameters import FOLLOWING, TORQUE, with_values
+from hdbridge.twin.misfit import Data, Piece, demand_deg
+from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_values
+from hdbridge.units import ARCSEC_PER_DEG
 
-SMOOTHED_S = 0.06
-"""All that is compared is averaged over so long: a command in whole counts has no acceleration of its own."""
+SMOOTHED_S = 0.03
+"""All that is compared is averaged over so long: an angle in whole counts has no acceleration of its own."""
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is beyond doubt."""
+LEAST_ROWS = 50
 LEAST_SHARE = 0.03
 """A coefficient that is known no better than this, relatively, is not used."""
 
@@ -31,46 +36,30 @@ class Readings:
 
     lag_s: float | None
     """Age of the demand: following error by speed."""
-    inertia_kg_m2: float | None
-    """Of motor and load, at the motor."""
+    load_inertia_kg_m2: float | None
     coulomb_nm: float | None
     viscous_nm_s_per_rad: float | None
 
 
 def read_off(data: Data) -> Readings:
     """The regressions over all pieces."""
-    speed, acceleration, following, torque = _columns(data)
-    moving = np.abs(speed) > MOVING_DEG_S
-    lag = _slope(following[moving], [speed[moving]])
-    lag_s = lag[0] if lag else None
-    inertia = coulomb = viscous = None
-    rad = math.pi / 180.0
-    if moving.sum() > 50:
-        ones = [np.sign(speed[moving]), np.ones(int(moving.sum()))]
-        found = _slope(
-            torque[moving], [rad * acceleration[moving], ones[0], rad * speed[moving], ones[1]], LEAST_SHARE
-        )
-        if found:
-            inertia, coulomb, viscous, _ = found
-    return Readings(lag_s, inertia, coulomb, viscous)
+    return Readings(_lag_s(data), *_mechanics(data))
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
     """The truth with what the regressions give in place of what it had."""
     found = read_off(data)
     values: dict[str, float] = {}
-    ratio = truth.gear.ratio
-    motor, load, servo = truth.motor, truth.load_, truth.servo
-    inertia = motor.inertia_kg_m2
-    if found.inertia_kg_m2 is not None and found.inertia_kg_m2 > 0.0:
-        scale = found.inertia_kg_m2 / (inertia + load.whole_inertia_kg_m2 / ratio**2)
-        values |= {"motor inertia": inertia * scale, "load inertia": load.inertia_kg_m2 * scale}
+    load, servo = truth.load_, truth.servo
+    if found.load_inertia_kg_m2 is not None:
+        scale = found.load_inertia_kg_m2 / load.whole_inertia_kg_m2
+        values["load inertia"] = load.inertia_kg_m2 * scale
         # The spring with its damping keeps the frequency that the start had.
         values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
         values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
-    if found.coulomb_nm is not None and found.coulomb_nm > 0.0:
+    if found.coulomb_nm is not None:
         values["Coulomb friction"] = found.coulomb_nm
-    if found.viscous_nm_s_per_rad is not None and found.viscous_nm_s_per_rad > 0.0:
+    if found.viscous_nm_s_per_rad is not None:
         values["viscous friction"] = found.viscous_nm_s_per_rad
     if found.lag_s is not None:
         filtered_ms = 2.0 * servo.command_filter_ms
@@ -82,39 +71,81 @@ def start_of(truth: Truth, data: Data) -> Truth:
     return with_values(truth, values)
 
 
-def _columns(data: Data) -> tuple[FloatArray, ...]:
-    """Speed and acceleration of the command at the motor; following error and torque as measured."""
-    rows: list[list[FloatArray]] = [[] for _ in range(4)]
-    lag_s = 0.0
-    for again in range(2):  # the second time the command is taken as late as the drive takes it
-        rows = [[] for _ in range(4)]
-        for piece in data.pieces:
-            for column, values in zip(rows, _of_piece(piece, data, lag_s), strict=True):
-                column.append(values)
-        if not again:
-            speed, following = np.concatenate(rows[0]), np.concatenate(rows[2])
-            moving = np.abs(speed) > MOVING_DEG_S
-            lag = _slope(following[moving], [speed[moving]])
-            lag_s = min(max(lag[0] or 0.0, 0.0), 0.1) if lag else 0.0
-    return tuple(np.concatenate(each) for each in rows)
+def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
+    """Load inertia, Coulomb and viscous friction."""
+    tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
+    table, torque = np.concatenate(tables), np.concatenate(torques)
+    if len(torque) <= LEAST_ROWS:
+        return None, None, None
+    columns = list(table.T)
+    found = _slope(torque, columns, LEAST_SHARE)
+    if found and (found[0] is None or found[0] <= 0.0):
+        # No motor inertia to be seen: the load's goes without it.
+        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or [None] * 4)]
+    load, coulomb, viscous = found[1:4] if found else (None, None, None)
+    return _positive(load), _positive(coulomb), _positive(viscous)
 
 
-def _of_piece(piece: Piece, data: Data, lag_s: float) -> list[FloatArray]:
-    commands, axis = piece.commands, data.axis
-    cycle_s = commands.cycle_s
-    counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
-    encoder = axis.motor_encoder
-    demand = encoder.direction * counts * 360.0 / encoder.counts_per_turn
-    place = np.clip(commands.row_cycles - lag_s / cycle_s, 0.0, len(demand) - 1.0)
-    late = np.interp(place, np.arange(len(demand)), demand)
+def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
+    """What the motor's torque is made of, shape (n, 5), and the torque, where it counts.
+
+    Accelerations of motor and load, the latter as the motor feels it, direction and speed, and one.
+    """
+    commands, truth = piece.commands, data.base
+    cycle_s, ratio = commands.cycle_s, truth.gear.ratio
+    width = _width(cycle_s)
+    motor = np.radians(demand_deg(commands, data.axis) - piece.measured[FOLLOWING])
+    load = np.radians(piece.measured[LOAD] / ARCSEC_PER_DEG)
+    torque = piece.measured[TORQUE]
+    if commands.told_nm is not None:
+        cycles = np.arange(len(commands.told_nm) - commands.lead)
+        told = np.interp(commands.row_cycles, cycles, commands.told_nm[commands.lead :])
+        torque = torque + truth.load_.torque_sense * told / ratio
+    speed = _smoothed(np.gradient(motor, cycle_s), 3)
+    direction = np.sign(speed) * (np.abs(speed) > math.radians(MOVING_DEG_S))
     # A linear law holds between signals that went through the same filter.
-    width = max(3, round(SMOOTHED_S / cycle_s))
-    late, following, torque = (
-        _smoothed(each, width) for each in (late, piece.measured[FOLLOWING], piece.measured[TORQUE])
-    )
-    speed = np.gradient(late, cycle_s)
-    acceleration = np.gradient(speed, cycle_s)
-    return [speed, acceleration, following, torque]
+    accelerations = [
+        np.gradient(np.gradient(_smoothed(each, width), cycle_s), cycle_s) for each in (motor, load)
+    ]
+    columns = [
+        accelerations[0], accelerations[1] / ratio, _smoothed(direction, width), _smoothed(speed, width),
+        np.ones(len(motor)),
+    ]  # fmt: skip
+    counts = (piece.counts[TORQUE] > 0.0).astype(np.float64)
+    counts[:width] = counts[-width:] = 0.0
+    whole = _smoothed(counts, width + 2) > 1.0 - 1e-9
+    return np.stack(columns, axis=1)[whole], _smoothed(torque, width)[whole]
+
+
+def _lag_s(data: Data) -> float | None:
+    """Following error by speed."""
+    lag_s: float | None = None
+    for _ in range(2):  # the second time the command is taken as late as the drive takes it
+        late_s = min(max(lag_s or 0.0, 0.0), 0.1)
+        rows = [_following(piece, data, late_s) for piece in data.pieces]
+        speed, following = (np.concatenate(each) for each in zip(*rows, strict=True))
+        moving = np.abs(speed) > MOVING_DEG_S
+        lag = _slope(following[moving], [speed[moving]])
+        lag_s = lag[0] if lag else None
+    return lag_s
+
+
+def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, FloatArray]:
+    """Speed of the command, so late, and following error."""
+    commands = piece.commands
+    demand = demand_deg(commands, data.axis)
+    late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
+    width = _width(commands.cycle_s)
+    return np.gradient(_smoothed(late, width), commands.cycle_s), _smoothed(piece.measured[FOLLOWING], width)
+
+
+def _width(cycle_s: float) -> int:
+    """Rows that are averaged."""
+    return max(3, round(SMOOTHED_S / cycle_s))
+
+
+def _positive(value: float | None) -> float | None:
+    return value if value is not None and value > 0.0 else None
 
 
 def _smoothed(column: FloatArray, width: int) -> FloatArray:

@@ -82,9 +82,8 @@ def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
 
 def test_regressions_read_inertia_friction_and_lag_off_the_recording() -> None:
     found = read_off(prepare(recorded(), AXIS, TRUTH))
-    whole = TRUTH.motor.inertia_kg_m2 + TRUTH.load_.inertia_kg_m2 / TRUTH.gear.ratio**2
-    assert found.inertia_kg_m2 == pytest.approx(whole, rel=0.2)
-    assert found.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.2)
+    assert found.load_inertia_kg_m2 == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
+    assert found.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.02)
     assert found.lag_s == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
 
 
