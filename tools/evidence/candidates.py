@@ -12,8 +12,8 @@ from evidence.theory import Theory
 
 from hdbridge.diagnose import matched_filters
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part, Sought, causes, unmet
+from hdbridge.estimation import linearised
 from hdbridge.estimation.hypothesis import Hypothesis
-from hdbridge.estimation.linear import seen_directions
 from hdbridge.estimation.shapes import free_shapes
 from hdbridge.estimation.terms import FOUND
 
@@ -34,7 +34,7 @@ class _Residual:
     hypothesis: Hypothesis
     zeros: FloatArray
     residual: FloatArray
-    basis: FloatArray
+    linearised: linearised.Linearised
 
 
 class Screen:
@@ -111,12 +111,12 @@ class Screen:
         scale = here.deviation * np.array([1.0, *fitted.slack])[here.group]
         tangent = here.columns() * weight[:, np.newaxis]
         known = np.divide(1.0, scale**2, out=np.full(len(scale), 1e12), where=scale > 0.0)
-        directions = seen_directions(tangent.T @ tangent + np.diag(known))
+        residual = weight * here.left(mean)
         left = _Residual(
             Hypothesis(theory.effects, theory.start),
             mean[: evidence.data.zeros],
-            weight * here.left(mean),
-            tangent @ directions,
+            residual,
+            linearised.Linearised(tangent, residual, np.stack([known, np.zeros(len(known))], axis=1)),
         )
         for each in matched_filters.found(evidence.estimator, left):  # type: ignore[arg-type]
             places = 1.0
