@@ -19,8 +19,8 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import (
     Fitted,
     fitted_rows,
-    information_of,
     legs_of_rows,
+    principal,
     sandwich,
     scaled,
     softened,
@@ -31,8 +31,9 @@ from hdbridge.twin.replays import Replays
 
 DRAWS = (12, 12, 24)
 """Simulated recordings of each round. The first round's are about the fit, the others about where the round
-before has led. None is further away than by the wide covariance that the fit has before: a linear step from
-there errs by itself, and rounds that are wider and wider would say nothing."""
+before has led, if that is no further from the measured recording. None is further away than by the wide
+covariance that the fit has before: a linear step from there errs by itself, and rounds that are further and
+further, wider and wider, would say nothing."""
 JUDGES = 4
 """Simulated recordings by which the fit with and without its bias are held against the measured one."""
 
@@ -49,12 +50,15 @@ def unbiased(replays: Replays, fitted: Fitted) -> Fitted:
     rows = fitted_rows(replays.data)
     spread = np.array([each.spread for each in parameters])
     slopes = fitted.jacobian
-    inverse = np.asarray(np.linalg.inv(information_of(slopes, spread)), dtype=np.float64)
+    along = principal(slopes, spread)
+    back, inverse = np.asarray(np.linalg.inv(along), dtype=np.float64), along @ along.T
+    widest = _deviations(fitted.covariance, back)
     noisy = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     place, covariance = fitted.place, fitted.covariance
+    nearest = _off(replays, fitted, noisy, place)
     for count in DRAWS:
         root = np.linalg.cholesky(covariance)
-        places = [np.clip(place + root @ rng.standard_normal(len(place)), *low_high) for _ in range(count)]
+        places = [within(place, root @ rng.standard_normal(len(place)), *low_high) for _ in range(count)]
         drawn = replays.drawn([at_coordinates(noisy, parameters, each.tolist()) for each in places])
         missed, left = [], []
         for each, shown in zip(places, drawn, strict=True):
@@ -64,39 +68,53 @@ def unbiased(replays: Replays, fitted: Fitted) -> Fitted:
             left.append(off - slopes @ (each - fitted.place))
         bias = np.mean(missed, axis=0)
         place = np.clip(fitted.place - bias, *low_high)
+        astray = _off(replays, fitted, noisy, place) > nearest
+        if astray:
+            place = fitted.place
         few = float(stdtrit(count - 1, 0.975)) / NORMAL_95 * np.sqrt(1.0 + 1.0 / count)
-        deviation = few * np.std(missed, axis=0, ddof=1)
-        covariance = _scaled_to(inverse, np.minimum(deviation, np.sqrt(np.diag(fitted.covariance))))
+        deviation = few * np.std(missed @ back.T, axis=0, ddof=1)
+        near = np.minimum(deviation, widest)
+        covariance = (along * near**2) @ along.T
     own = fitted.vector - np.mean(left, axis=0)
     apart = sandwich(slopes, own, legs_of_rows(replays.data, rows), spread)
-    truths = [at_coordinates(noisy, parameters, each.tolist()) for each in (fitted.place, place)]
-    if _off(replays, fitted, truths[1]) > _off(replays, fitted, truths[0]):
-        deviation = np.hypot(deviation, bias)
-        place = fitted.place
+    if astray:
+        deviation = np.hypot(deviation, back @ bias)
     truth = at_coordinates(fitted.truth, parameters, place.tolist())
     (residuals,) = replays([truth])
-    deviation = np.maximum(deviation, np.sqrt(np.diag(apart)))
+    deviation = np.maximum(deviation, _deviations(apart, back))
     vector = softened(scaled(residuals, fitted.scales)[rows])
     return replace(
         fitted,
         truth=truth,
         place=place,
-        covariance=_scaled_to(apart, deviation),
+        covariance=(along * deviation**2) @ along.T,
         residuals=residuals,
         vector=vector,
         cost=0.5 * float(vector @ vector),
     )
 
 
-def _scaled_to(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
-    """The covariance with other standard deviations."""
-    times = deviation / np.sqrt(np.diag(covariance))
-    given: FloatArray = covariance * np.outer(times, times)
-    return given
+def within(place: FloatArray, step: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Where a step leads, or its opposite, as far as the bounds leave room for all of it.
+
+    Of a step along a valley some coordinates alone would lead far off it.
+    """
+    best = place
+    for each in (step, -step):
+        room = np.where(each > 0.0, high - place, place - low)
+        share = np.divide(room, np.abs(each), out=np.ones_like(room), where=np.abs(each) > room)
+        ahead = place + float(np.min(share, initial=1.0)) * each
+        best = max(best, ahead, key=lambda one: float(np.linalg.norm(one - place)))
+    return np.clip(best, low, high)
 
 
-def _off(replays: Replays, fitted: Fitted, truth: Truth) -> float:
+def _deviations(covariance: FloatArray, back: FloatArray) -> FloatArray:
+    """Standard deviations along the principal directions, to which ``back`` leads from the coordinates."""
+    return np.asarray(np.sqrt(np.diag(back @ covariance @ back.T)), dtype=np.float64)
+
+
+def _off(replays: Replays, fitted: Fitted, noisy: Truth, place: FloatArray) -> float:
     """Mean squares of what replays that are as rounded and noisy leave of the measured recording."""
-    rows = fitted_rows(replays.data)
+    rows, truth = fitted_rows(replays.data), at_coordinates(noisy, fitted.parameters, place.tolist())
     every = [softened(scaled(each, fitted.scales)[rows]) for each in replays.drawn([truth] * JUDGES)]
     return float(np.mean(np.square(every)))

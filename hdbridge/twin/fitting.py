@@ -36,7 +36,8 @@ LAST = ("velocity feed-forward",)
 """Fitted last, if that earns it: most drives feed the whole speed forward, and otherwise it looks like a dead
 time until all else is right."""
 EARNED = 8.0
-"""Half the drop of the scaled squares that such a parameter has to bring: exp(8) to one."""
+"""Half the drop of the scaled squares that such a parameter has to bring, and a place that is not the start's
+to be gone on from: exp(8) to one."""
 SURE = 4.0
 """... and its distance from where it was, in standard deviations."""
 FILTER_SHARES = (0.25, 0.6, 0.9)
@@ -47,7 +48,7 @@ FIRST_STEPS = 6
 """From each of these starts a fit goes so many steps: with three that of a drawn axis came to 2.4 times the
 least misfit in `NEAR_STEPS`, with six to 1.1 times."""
 HEATS = ((3, 4), (1, 8))
-"""From so many of those that came out best it goes so many more."""
+"""From the start, and so many of the others that came out best, it goes so many more."""
 NEAR_STEPS = 12
 """Steps at most over all of the recording, by the noise that is expected;"""
 STEPS = 30
@@ -147,13 +148,20 @@ def _starts(truth: Truth) -> list[Truth]:
 def _best_of(
     replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
 ) -> Fitted:
-    """The best of the fits from several places; those that fall behind are given up."""
+    """The fit from the first place, unless that from another one is better beyond doubt.
+
+    The first is where the simulation stands: what motion does not show keeps its value. Of the others those
+    that fall behind are given up.
+    """
     noise = expected(replays.data)
-    fits = [solve(replays, each, parameters, prior, FIRST_STEPS, known=noise) for each in starts]
+    own, *others = (solve(replays, each, parameters, prior, FIRST_STEPS, known=noise) for each in starts)
     for places, steps in HEATS:
-        fits = sorted(fits, key=lambda each: each.cost)[:places]
-        fits = [solve(replays, each.truth, parameters, prior, steps, known=noise, near=each) for each in fits]
-    return fits[0]
+        others = sorted(others, key=lambda each: each.cost)[:places]
+        own, *others = (
+            solve(replays, each.truth, parameters, prior, steps, known=noise, near=each)
+            for each in (own, *others)
+        )
+    return others[0] if own.cost - others[0].cost > EARNED else own
 
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:

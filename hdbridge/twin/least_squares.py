@@ -266,15 +266,28 @@ def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
     return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
 
 
+def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Directions of the coordinates, one a column, shape (p, p), in each of which the information is one.
+
+    A long valley is one of them. Each may be known worse by a factor of its own; were each *coordinate*, what
+    two of them have in common, which is known best of all, would be lost.
+    """
+    scaled = slopes * spread
+    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
+
+
 def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
-    """Covariance of the coordinates where residuals of one leg go together and legs are independent."""
-    information = information_of(slopes, spread)
-    inverse = np.linalg.inv(information)
-    by_leg = over_legs(slopes * left[:, None], legs)
-    meat = by_leg.T @ by_leg + np.diag(spread**-2.0)
-    covariance = inverse @ meat @ inverse
-    # Never better than what independent residuals of the present size would give.
-    white = inverse * max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
-    larger = np.maximum(np.sqrt(np.diag(white) / np.diag(covariance)), 1.0)
-    given: FloatArray = covariance * np.outer(larger, larger)
-    return given
+    """Covariance of the coordinates where residuals of one leg go together and legs are independent.
+
+    By principal directions: of a few legs no more can be said. None is better known than independent
+    residuals of the present size would have it, nor worse than before the fit. What the slopes would still
+    take of the residuals is no scatter of the legs.
+    """
+    along = principal(slopes, spread)
+    noise = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    by_leg = over_legs((slopes @ along) * noise[:, None], legs)
+    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
+    white = max(1.0, float(noise @ noise) / max(len(left) - len(spread), 1))
+    times = np.minimum(np.maximum(np.sum(np.square(by_leg), axis=0), white), before)
+    return np.asarray(along * times @ along.T, dtype=np.float64)

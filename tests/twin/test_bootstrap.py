@@ -11,8 +11,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.bootstrap import unbiased
-from hdbridge.twin.least_squares import solve
+from hdbridge.twin.bootstrap import unbiased, within
+from hdbridge.twin.least_squares import sandwich, solve
 from hdbridge.twin.misfit import prepare
 from hdbridge.twin.parameters import BY_NAME, coordinates, with_values
 from hdbridge.twin.replays import Replays
@@ -42,3 +42,31 @@ def test_a_bias_by_rounding_is_taken_off_and_the_truth_is_within_the_intervals()
     assert before < -0.02, "as a share: what the encoder says looks like a shorter lag"
     assert abs(after) < 0.7 * abs(before)
     assert abs(after) < 1.96 * float(np.sqrt(told.covariance[0, 0]))
+
+
+def test_a_step_along_a_valley_stays_on_its_line_at_a_bound() -> None:
+    rng = np.random.default_rng(2)
+    low, high = np.array([0.0, -np.inf, -1.0]), np.array([20.0, np.inf, 1.0])
+    for _ in range(200):
+        place = np.array([rng.choice([0.0, 0.1]), rng.normal(), rng.uniform(-1.0, 1.0)])
+        step = rng.standard_normal(3)
+        reached = within(place, step, low, high)
+        share = (reached - place) / step
+        assert np.ptp(share) < 1e-9
+        assert np.all((low <= reached) & (reached <= high))
+        room = np.concatenate([(high - place) / np.abs(step), (place - low) / np.abs(step)])
+        assert abs(share[0]) >= min(1.0, float(np.min(room))) - 1e-9, "as far as one of the two ways allows"
+
+
+def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:
+    rng = np.random.default_rng(1)
+    slopes = rng.standard_normal((600, 1)) + 0.01 * rng.standard_normal((600, 3))  # a valley
+    spread, legs = np.full(3, 0.7), np.repeat([0.0, 1.0], 300)
+    white = rng.standard_normal(600)
+    for left in (white, white + 5.0 * slopes[:, 0]):
+        covariance = sandwich(slopes, left, legs, spread)
+        least = np.linalg.inv(slopes.T @ slopes + np.diag(spread**-2.0))
+        times = np.linalg.eigvals(covariance @ np.linalg.inv(least)).real
+        assert np.all(times > 0.9), "never better than by independent residuals"
+        assert np.all(times < 8.0), "nor much worse where they are"
+        assert np.all(np.linalg.eigvalsh(covariance / 0.49) < 1.0 + 1e-9), "nor than before the fit"
