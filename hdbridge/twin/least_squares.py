@@ -235,11 +235,17 @@ def _ends(place: FloatArray, moves: FloatArray, low: FloatArray, high: FloatArra
 
 def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     """Along the principal directions of the information, each as far as residuals change by `RESPONSE`."""
-    scaled = slopes * spread
-    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    worth, directions = _eigen(slopes, spread)
     far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
+
+
+def _eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information and principal directions of the coordinates in units of their spreads."""
+    scaled = slopes * spread
+    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    return worth, directions
 
 
 def softened(values: FloatArray) -> FloatArray:
@@ -272,8 +278,7 @@ def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     A long valley is one of them. Each may be known worse by a factor of its own; were each *coordinate*, what
     two of them have in common, which is known best of all, would be lost.
     """
-    scaled = slopes * spread
-    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
+    worth, directions = _eigen(slopes, spread)
     return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
 
 

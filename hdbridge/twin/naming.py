@@ -17,7 +17,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import Fitted
 from hdbridge.twin.misfit import CHANNELS, Data, counted
-from hdbridge.twin.parameters import Parameter, coordinates, value_in
+from hdbridge.twin.parameters import Parameter, coordinates, free_value
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import held_out, put_back, told_apart, without
 
@@ -171,7 +171,7 @@ def finding(
     ``instead`` are those that may have changed in their place.
     """
     moved = tuple(
-        Moved(each.name, each.unit, _value(before, each), _value(after, each), *intervals[each.name])
+        Moved(each.name, each.unit, free_value(before, each), free_value(after, each), *intervals[each.name])
         for each in parameters
     )
     return Finding(
@@ -243,12 +243,6 @@ def _further(one: Truth, other: Truth, parameters: Sequence[Parameter]) -> list[
     """Those that differ by more than anybody would care about."""
     apart = np.subtract(coordinates(one, parameters), coordinates(other, parameters))
     return [each for each, off in zip(parameters, apart, strict=True) if abs(off) > each.least_change]
-
-
-def _value(truth: Truth, parameter: Parameter) -> float:
-    value = value_in(truth, parameter)
-    assert value is not None  # it was free
-    return value
 
 
 def _rms(values: FloatArray) -> float:

@@ -168,6 +168,13 @@ def value_in(truth: Truth, parameter: Parameter) -> float | None:
     return float(place)
 
 
+def free_value(truth: Truth, parameter: Parameter) -> float:
+    """The same of a parameter that a fit changes, which is there."""
+    value = value_in(truth, parameter)
+    assert value is not None, parameter.name
+    return value
+
+
 def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
     """The truth with other values, by the parameters' names; what cannot be is refused as in a file."""
     return Truth.model_validate(_with(truth, values))
@@ -189,8 +196,7 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
     """Where a truth lies; a value beyond a bound counts as the bound."""
     found = []
     for each in parameters:
-        value = value_in(truth, each)
-        assert value is not None, each.name
+        value = free_value(truth, each)
         found.append(each.coordinate(min(max(value, each.least), each.most)))
     return found
 

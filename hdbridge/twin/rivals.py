@@ -27,7 +27,7 @@ from hdbridge.twin.least_squares import (
     solve,
 )
 from hdbridge.twin.misfit import counted
-from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, value_in, with_values
+from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value, with_values
 from hdbridge.twin.replays import Replays
 
 FALSE_ALARM = 0.02
@@ -51,7 +51,7 @@ def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
 
 def put_back(start: Truth, truth: Truth, own: Sequence[Parameter]) -> Truth:
     """A truth with these parameters where they were."""
-    return with_values(truth, {each.name: _value(start, each) for each in own})
+    return with_values(truth, {each.name: free_value(start, each) for each in own})
 
 
 def without(
@@ -73,7 +73,7 @@ def without(
     along = np.linalg.solve(information_of(slopes, spread), slopes.T @ (fitted.jacobian[:, back] @ off))
     low, high = np.array([each.bounds for each in others]).T
     led = at_coordinates(before, others, np.clip(fitted.place[free] - along, low, high).tolist())
-    kept = {each.name: _value(fitted.truth if each in moved else start, each) for each in others}
+    kept = {each.name: free_value(fitted.truth if each in moved else start, each) for each in others}
     begun = [led, with_values(before, kept)]
     rows = fitted_rows(replays.data)
     costs = [float(np.sum(np.square(softened(scaled(each, fitted.scales)[rows])))) for each in replays(begun)]
@@ -91,9 +91,3 @@ def held_out(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> 
     out = data.out if data.out.any() else np.ones(len(data.out))
     rows = np.concatenate([each * out > 0.0 for each in counted(data).values()])
     return softened(scaled(found, fitted.scales)[rows]), legs_of_rows(data, rows)
-
-
-def _value(truth: Truth, parameter: Parameter) -> float:
-    value = value_in(truth, parameter)
-    assert value is not None  # it was free
-    return value
