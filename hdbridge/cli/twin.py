@@ -305,8 +305,8 @@ def print_report(report: TwinReport) -> None:
             notes.print(f"{effect.effect} is not simulated: {effect.note}", markup=False, soft_wrap=True)
     console.print(escape(verdict(report)), soft_wrap=True)
     table = Table("")
-    columns = ["measured", "simulated", *(["before"] if report.after else []), "difference", "of the noise"]
-    for name in columns:
+    differences = ["difference before", "difference"] if report.after else ["difference"]
+    for name in ("measured", "simulated", *differences, "of the noise"):
         table.add_column(name, justify="right")
     table.add_column("unit")
     for row in report.now.rows:
