@@ -17,11 +17,12 @@ from scipy.optimize import minimize
 
 from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.estimation.blocks import Blocks
-from hdbridge.observations.reading import median_deviation
 
 PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC = 1e-3
+DIFFERENCE = 1e-4
+"""Step of the likelihood's slopes, in logarithms: the rounding of a smaller one stops the fit on its way."""
 COLUMNS_AT_ONCE = 8
 SAME_LEG = 1e-8
 """A block's step along a wander that stays the same over a leg: as good as none."""
@@ -47,6 +48,10 @@ class NoiseModel:
         sample = np.where(blocks.moving, self.moving_arcsec, self.standing_arcsec) ** 2
         mean = np.divide(sample, blocks.count, out=np.full(len(blocks), np.inf), where=blocks.count > 0)
         return np.asarray(mean + blocks.blur)
+
+
+BEGIN = NoiseModel(1.0, 1.0, 1.0, 10.0, 1.0, 0.3)
+"""Where a fit of it begins; it ends where it would from any other."""
 
 
 class White:
@@ -153,9 +158,7 @@ def _averaged(extent: FloatArray) -> FloatArray:
     return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
 
 
-def fit_noise(
-    residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel | None = None
-) -> NoiseModel:
+def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel = BEGIN) -> NoiseModel:
     """The noise model that makes a residual (b,) most likely.
 
     Pieces of the record, spread over all of it, are enough: a likelihood of ten thousand blocks. The
@@ -164,7 +167,6 @@ def fit_noise(
     pieces = _pieces(blocks)
     part = blocks.picked(pieces)
     left = residual[pieces]
-    begin = begin or first_guess(residual, blocks)
     still = not np.any(part.moving)
     always = np.all(part.moving)
 
@@ -184,30 +186,12 @@ def fit_noise(
         np.clip(x, lower, upper),
         method="L-BFGS-B",
         bounds=list(zip(lower, upper, strict=True)),
-        options={"maxiter": 40, "ftol": 1e-7},
+        options={"eps": DIFFERENCE, "ftol": 1e-8},
     )
     best = model(found.x)
     share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
     white = {name: share * getattr(best, name) for name in ("standing_arcsec", "moving_arcsec")}
     return replace(best, **white)
-
-
-def first_guess(residual: FloatArray, blocks: Blocks) -> NoiseModel:
-    """White noise from differences of neighbouring blocks; half of the rest to each wander."""
-    neighbours = (np.diff(blocks.chain) == 0) & (np.diff(blocks.time_s) < 1.0)
-    scaled = np.diff(residual) / np.sqrt(
-        1.0 / np.maximum(blocks.count[1:], 1) + 1.0 / np.maximum(blocks.count[:-1], 1)
-    )
-
-    def white(which: BoolArray) -> float:
-        picked = scaled[neighbours & which[1:] & which[:-1]]
-        if len(picked) < 10:
-            picked = scaled[neighbours]
-        return median_deviation(picked) if len(picked) else 1.0
-
-    rest = max(median_deviation(residual), SMALLEST_ARCSEC) * np.sqrt(0.5)
-    at_rest, in_motion = (max(white(each), SMALLEST_ARCSEC) for each in (~blocks.moving, blocks.moving))
-    return NoiseModel(at_rest, in_motion, rest, 5.0, rest, 0.2)
 
 
 def _pieces(blocks: Blocks) -> IntArray:

@@ -100,8 +100,8 @@ def test_the_residual_is_what_the_written_model_leaves(tmp_path: Path) -> None:
 
 
 def test_a_model_that_is_worse_on_what_was_left_out_is_not_written(tmp_path: Path) -> None:
-    """Ripple that has another phase in each recording: any two foretell nothing of the third."""
-    paths = moves(tmp_path, 2.0, (0.0, 90.0, 180.0))
+    """Ripple that has another phase in each recording: any two foretell the third badly."""
+    paths = moves(tmp_path, 2.0, (0.0, 60.0, 120.0))
     out = tmp_path / "model.yaml"
     result, data, _ = fitted(tmp_path, paths, "--out", str(out))
     assert data["held_out"]["after_arcsec"] > data["held_out"]["before_arcsec"]
