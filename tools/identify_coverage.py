@@ -21,25 +21,13 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from identify_records import draw, plan, record
+from identify_records import draw, plan, record, recording
 
+from hdbridge.calibration import measured_of
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, Kind, Segment, fit
+from hdbridge.identify import FitOptions, fit
 
 TOLERANCE = {"offset_arcsec": 0.01, "width_deg": 0.04}
-
-
-def segments(rows: list[dict[str, object]]) -> list[Segment]:
-    return [
-        Segment(
-            row["time_s"],
-            row["target_deg"],
-            row["load_deg"],
-            Kind.named(row["kind"]),
-            position_deg=row["position_deg"],
-        )
-        for row in rows
-    ]
 
 
 def one(job: tuple[int, int, float]) -> dict[str, object]:
@@ -48,7 +36,7 @@ def one(job: tuple[int, int, float]) -> dict[str, object]:
     truth = draw(rng)
     rows = record(truth, rng, plan(truth.ratio, speed=speed), every)
     begun = time.perf_counter()
-    result = fit(segments(rows), truth.ratio, FitOptions(start=Start.FORWARD))
+    result = fit(measured_of([recording(rows)]), truth.ratio, FitOptions(start=Start.FORWARD))
     taken = time.perf_counter() - begun
     found = []
     wanted = {"offset_arcsec": truth.offset, "width_deg": truth.width, "exponent": truth.exponent}

@@ -1,4 +1,4 @@
-"""Records of made-up axes for measuring the identification: from the formulas, sharing no code with hdbridge.
+"""Records of made-up axes for measuring the identification: from the formulas, not from hdbridge's models.
 
 An axis is drawn at random (`draw`), moved through a bench plan and read through quantised encoders
 (`record`). It has what the identification does not model as such: a motor that lags behind its command
@@ -10,6 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment
 
 RATE_HZ = 250.0
 ARCSEC = 3600.0
@@ -189,6 +192,20 @@ def record(
         )
         at += len(leg)
     return result
+
+
+def recording(rows: list[dict[str, np.ndarray | str]]) -> Recording:
+    """The legs of `record` as the bench would have recorded them."""
+    names = {
+        "time_s": "time_s",
+        "motor_target_deg": "target_deg",
+        "motor_position_deg": "position_deg",
+        "load_position_deg": "load_deg",
+    }
+    columns = {column: np.concatenate([row[name] for row in rows]) for column, name in names.items()}
+    times = [(row["kind"], *row["time_s"][[0, -1]].tolist()) for row in rows]
+    legs = (Segment(kind=kind, start_s=first, end_s=last) for kind, first, last in times)
+    return Recording(Record(columns), tuple(legs))
 
 
 def _stopping_short(

@@ -9,7 +9,7 @@
 """
 
 from hdbridge.calibration.fit import fit
-from hdbridge.calibration.identification import identify, segments_of
+from hdbridge.calibration.identification import identify, measured_of
 from hdbridge.calibration.journal import Journal
 from hdbridge.calibration.measure import measure, start_journal
 from hdbridge.calibration.pipeline import calibrate, conclude, concluded
@@ -28,7 +28,7 @@ __all__ = [
     "fit",
     "identify",
     "measure",
-    "segments_of",
+    "measured_of",
     "start_journal",
     "validate",
 ]

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hdbridge.calibration.journal import tasks_of
-from hdbridge.effects import FloatArray, Start
-from hdbridge.identify import FitOptions, FitResult, Kind, Segment, fit
+from hdbridge.effects import FloatArray, IntArray, Start
+from hdbridge.errors import InputError
+from hdbridge.estimation.samples import Measured
+from hdbridge.estimation.stretches import counted
+from hdbridge.identify import FitOptions, FitResult, fit
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.cuts import observed
-from hdbridge.records.record import Record, time_shifts_s
+from hdbridge.observations.cuts import jumps, observed
+from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, versions_here
 
 STANDING = ("reference", "standstill")
@@ -30,28 +33,42 @@ def identify(
     """Fit a model. InputError where the recordings cannot be used; what they cannot say: ``warnings``."""
     prepared = [observed(each.record, ratio) for each in recordings]
     whole = [replace(each, record=seen.record) for each, seen in zip(recordings, prepared, strict=True)]
-    segments = segments_of(whole, independent_zeros=independent_zeros)
-    found = fit(segments, ratio, FitOptions(active=active))
+    measured = measured_of(whole, independent_zeros=independent_zeros)
+    found = fit(measured, ratio, FitOptions(active=active))
     remarks = tuple(remark for seen in prepared for remark in seen.remarks)
     return replace(found, warnings=(*remarks, *found.warnings))
 
 
-def segments_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> list[Segment]:
-    """Several recordings, one after the other, as segments.
+def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> Measured:
+    """Several recordings, one after the other: their legs, or the whole of what has none.
 
-    A recording with legs gives a segment for each; a bare CSV file is one segment of which nothing is known.
     ``independent_zeros`` says that the encoders' zeros were lost between the recordings.
     """
-    shifts = time_shifts_s([each.record for each in recordings])
-    segments: list[Segment] = []
-    for recording, shift_s in zip(recordings, shifts, strict=True):
-        zero = (
-            max((each.zero for each in segments), default=-1) + 1
-            if independent_zeros or _sessions(recording)
-            else 0
-        )
-        segments += _of_one(recording, shift_s, zero, independent_zeros)
-    return segments
+    pieces: list[_Piece] = []
+    for recording in recordings:
+        zeros = int(pieces[-1].zero[-1]) + 1 if pieces else 0
+        apart = independent_zeros or _sessions(recording)
+        pieces += _pieces(recording, zeros if apart else 0, independent_zeros)
+    if not pieces:
+        raise InputError("the recordings hold no leg to be used; expected samples: record more")
+    whole = concatenate([each.record for each in pieces])
+    kinds = tuple(dict.fromkeys(each.kind for each in pieces))
+    zero = np.concatenate([each.zero for each in pieces])
+    edges = np.cumsum([0, *(len(each.record) for each in pieces)]).tolist()
+    # From one leg the axis moved straight to the next, but for jumps and where the zeros were lost.
+    begins = {0, *(np.flatnonzero(np.diff(zero)) + 1).tolist()}
+    begins |= {row + 1 for row in jumps(whole.motor_position_deg, whole.time_s).tolist() if row + 1 in edges}
+    begins |= {
+        first + row for first, each in zip(edges, pieces, strict=False) for row in each.record.starts[1:]
+    }
+    states = {first: each.start for first, each in zip(edges, pieces, strict=False) if each.start is not None}
+    return Measured(
+        Record(whole.columns, whole.source, tuple(sorted(begins | states.keys()))),
+        kinds,
+        np.repeat([kinds.index(each.kind) for each in pieces], np.diff(edges)),
+        counted(zero),
+        states,
+    )
 
 
 def standings(recording: Recording, ratio: float) -> list[tuple[float, float]]:
@@ -111,43 +128,29 @@ def _sessions(recording: Recording) -> bool:
     return len({each.session for each in tasks_of(recording)}) > 1
 
 
-def _of_one(recording: Recording, shift_s: float, zero: int, independent: bool) -> Iterator[Segment]:
+class _Piece(NamedTuple):
+    record: Record
+    kind: str
+    zero: IntArray
+    start: Start | None
+
+
+def _pieces(recording: Recording, zero: int, independent: bool) -> Iterator[_Piece]:
+    record = recording.record
     if not recording.segments:
-        for number, part in enumerate(recording.record.parts()):
-            name = part.source or f"part {number + 1}"
-            segment = _segment(part, Kind.UNKNOWN, shift_s, zero + number * independent, None, name)
-            yield replace(segment, follows=number == 0)
+        part = np.zeros(len(record), dtype=np.intp)
+        part[list(record.starts[1:])] = 1
+        yield _Piece(record, "unknown", zero + independent * np.cumsum(part), None)
         return
     tasks = list(tasks_of(recording))
     session, known = 1, not tasks
-    pieces = list(recording.pieces())
-    for number, (leg, piece) in enumerate(pieces):
+    for leg, piece in recording.pieces():
         if tasks and leg.start_s >= tasks[0].start_s:
             session, known = tasks.pop(0).session, False
         if not known and leg.kind == "precondition":
             continue  # the state before it is not known, after it it is
-        if not len(piece):
-            continue
-        kind = Kind.STANDSTILL if leg.kind in STANDING else Kind.named(leg.kind)
-        start = None if known else Start.FORWARD
-        known = True
-        name = f"leg {number + 1} of {len(pieces)} ({leg.kind})"
-        yield _segment(piece, kind, shift_s, zero + session - 1, start, name)
-
-
-def _segment(
-    record: Record, kind: Kind, shift_s: float, zero: int, start: Start | None, name: str
-) -> Segment:
-    target = record.motor_target_deg
-    return Segment(
-        time_s=record.time_s + shift_s,
-        motor_deg=record.motor_position_deg if target is None else target,
-        load_deg=record.load_position_deg,
-        kind=kind,
-        position_deg=None if target is None else record.motor_position_deg,
-        commanded=target is not None,
-        measured=record.measured,
-        start=start,
-        zero=zero,
-        name=name,
-    )
+        if len(piece):
+            yield _Piece(
+                piece, leg.kind, np.full(len(piece), zero + session - 1), None if known else Start.FORWARD
+            )
+            known = True

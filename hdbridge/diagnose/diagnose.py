@@ -338,9 +338,13 @@ class _Judge:
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator
-        kinds = estimator.data.points.kind[estimator.index]
-        direction = direction_of(estimator.motion)[estimator.index]
-        masks = {name: kinds == i for i, name in enumerate(estimator.data.kinds)}
+        points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
+        masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
+        if len(masks) == 1:  # without legs by whether it stands, is slow or fast
+            speed = np.abs(points.speed_deg_s)
+            slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
+            either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}
+            masks = {name: each[estimator.index] for name, each in either.items()}
         masks |= {"forward": direction > 0, "backward": direction < 0}
         return {
             name: (_figures(given[rows], about_zero=True), _figures(after[rows], about_zero=True))

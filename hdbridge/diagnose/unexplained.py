@@ -78,11 +78,11 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
     # that.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    limit = float(np.hypot(scales.floor_arcsec, 0.0 if data.commanded else counts))
+    limit = float(np.hypot(scales.floor_arcsec, 0.0 if data.full.commanded else counts))
     if left.arcsec > limit and left.foretold(scales):
         return True
     # Where command and standstill distinguish noise and following error from the gear, fast things count.
-    if data.commanded and data.standstill:
+    if data.full.commanded and data.standstill:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
         if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, floor), left.standing_arcsec):
             return True

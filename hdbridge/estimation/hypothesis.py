@@ -296,7 +296,7 @@ class Estimator:
         found = Separable(terms).fit(hypothesis.effects, effort)
         return Fitted(
             replace(hypothesis, effects=found.effects),
-            found.nuisances[: self.data.zeros],
+            found.nuisances[: self.data.full.zeros],
             found.residual * self.weight,
             found.columns,
             found.chi_square + origin.costs,
@@ -306,8 +306,8 @@ class Estimator:
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
         """A zero for each absolute zero, and what the hypothesis has in addition."""
-        columns = self.zero[:, np.newaxis] == np.arange(self.data.zeros)
-        zeros = unknown(columns, [f"zero {each}" for each in range(self.data.zeros)])
+        columns = self.zero[:, np.newaxis] == np.arange(self.data.full.zeros)
+        zeros = unknown(columns, [f"zero {each}" for each in range(self.data.full.zeros)])
         return zeros if hypothesis.nuisances is None else zeros.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:

@@ -1,39 +1,49 @@
-"""All segments laid end to end: what was observed, what drove it, and which samples can be used."""
+"""What was observed, sample by sample, and what drove it: one table, for calibration and diagnosis alike.
+
+The angle that drives the effects is the command's where the record has one, plus what the motor encoder shows
+against it (`hdbridge.observations.kinematics`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from hdbridge.effects import BoolArray, FloatArray, IntArray, Motion, Start
-from hdbridge.effects.base import measured_by_all
-from hdbridge.effects.path import branches
 from hdbridge.errors import InputError
-from hdbridge.estimation.segment import MINIMUM_SAMPLES, Kind, Segment
-from hdbridge.observations.cuts import jumps
-from hdbridge.observations.kinematics import SETTLE_S, kinematics, reading_of_all, settling
-from hdbridge.records.record import Record
+from hdbridge.estimation.white_noise import noise_arcsec
+from hdbridge.observations.kinematics import kinematics, reading_of_all
+from hdbridge.observations.reading import Reading, quantum_deg
+from hdbridge.records.record import OPTIONAL, REQUIRED, Record
 from hdbridge.units import ARCSEC_PER_DEG
 
-KINDS = tuple(Kind)
-SETTLE_SHARE = 0.2
-"""After a turn, where the hysteresis rises too steeply for a load on a spring to follow, no more than this
-share of the travel to the next one is left out."""
-STANDING_DEG_S = 1e-3
-"""Load speed below which an axis stands."""
-GENTLE_DEG_S2 = 40.0
-"""Load acceleration that a motion of which nothing is known may have."""
-ON_THE_WAY = (Kind.MOVE, Kind.STEP)
-SLOW = (Kind.SWEEP, Kind.SINE, Kind.REVERSAL)
-"""Kinds whose own speed is what is meant by slow."""
+ON_THE_WAY = ("move", "precondition", "step", "settle")
+"""Legs whose motion serves only to get somewhere: it carries the elastic state, and only rests are used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A record, and what is known of its samples; arrays of shape (n,)."""
+
+    record: Record
+    """Nothing is known of the axis between what lies before one of its ``starts`` and what begins there."""
+    kinds: tuple[str, ...]
+    """What the axis may have been doing, by the names of a recording's legs."""
+    kind: IntArray
+    """Index into ``kinds``."""
+    zero: IntArray
+    """Number of the absolute zero, 0 .. zeros - 1."""
+    states: Mapping[int, Start] = field(default_factory=dict)
+    """The elastic state at a start where it is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Consecutive segments through which the elastic state is carried."""
+    """Consecutive samples through which the elastic state is carried."""
 
     rows: slice
     start: Start | None
@@ -42,33 +52,43 @@ class Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Segments laid end to end; arrays of shape (n,)."""
+    """Samples, or means over runs of them; arrays of shape (n,)."""
 
     ratio: float
     motion: Motion
-    """What drove the axis: the driving angle, time, and the channels that all segments have."""
+    """Driving angle, time, speed, acceleration and the channels that were recorded."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
-    """Observed transmission error, load - motor / N, about an arbitrary zero."""
-    speed_deg_s: FloatArray
-    """Speed of the motor, signed."""
+    """Observed transmission error, about an arbitrary zero."""
+    sigma_arcsec: FloatArray
+    """White noise of each."""
     usable: BoolArray
-    """False for fast moves and the settling after them."""
+    kinds: tuple[str, ...]
     kind: IntArray
-    """Index into `KINDS`."""
+    """Index into ``kinds``."""
     zero: IntArray
-    """Index of the absolute zero, 0 .. zeros - 1."""
-    zeros: int
-    count_deg: float
-    """Motor angle of one count of the encoder or the command, 0 where none is seen."""
+    """Number of the absolute zero, 0 .. zeros - 1."""
     chains: tuple[Chain, ...]
-    travel_deg: float
-    """The largest span of the motor's angle over which a phase is carried."""
+    """Of single samples."""
+    reading: Reading
+    """How finely the motor's angle was read."""
+    commanded: bool
+    """Whether the record has the command."""
 
     def __len__(self) -> int:
         """Number of samples."""
-        return len(self.motion)
+        return len(self.error_arcsec)
+
+    @property
+    def zeros(self) -> int:
+        """Number of absolute zeros."""
+        return int(self.zero[-1]) + 1
+
+    @property
+    def count_deg(self) -> float:
+        """Motor angle of one count of the encoder, 0 where none is seen."""
+        return self.reading.count_deg
 
     @property
     def motor_deg(self) -> FloatArray:
@@ -80,6 +100,20 @@ class Samples:
         """The record's clock."""
         assert self.motion.time_s is not None
         return self.motion.time_s
+
+    @property
+    def speed_deg_s(self) -> FloatArray:
+        """Speed of the motor, signed."""
+        assert self.motion.motor_speed_deg_s is not None
+        return self.motion.motor_speed_deg_s
+
+    def of_kind(self, *names: str) -> BoolArray:
+        """The samples of legs of some names."""
+        return self.among(self.kind, names)
+
+    def among(self, kind: IntArray, names: Collection[str]) -> BoolArray:
+        """Which indices into ``kinds`` are those of some names."""
+        return np.isin(kind, [at for at, each in enumerate(self.kinds) if each in names])
 
     def along(self, chain: Chain) -> Motion:
         """What drove one of the chains."""
@@ -97,129 +131,79 @@ class Samples:
 
 def motion_at(motion: Motion, rows: slice | IntArray) -> Motion:
     """A motion at some of its samples."""
-    return Motion(
-        motion.motor_deg[rows],
-        None if motion.time_s is None else motion.time_s[rows],
-        {channel: values[rows] for channel, values in motion.measured.items()},
-    )
+    return of_each(motion, lambda values: values[rows])
 
 
-def gather(
-    segments: Sequence[Segment],
+def of_each(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:
+    """A motion with each of its arrays changed."""
+    given: dict[str, Any] = {each.name: getattr(motion, each.name) for each in fields(motion)}
+    changed = {name: change(each) for name, each in given.items() if isinstance(each, np.ndarray)}
+    measured = {channel: change(values) for channel, values in motion.measured.items()}
+    return replace(motion, **changed, measured=measured)
+
+
+def observe(
+    measured: Measured,
     ratio: float,
-    start: Start | None = None,
-    slow_deg_s: float | None = None,
+    *,
+    against_command: bool,
+    expected: Callable[[Motion], FloatArray] | None = None,
 ) -> Samples:
-    """Lay segments end to end. InputError where there is too little, or the ratio is not this gear's.
+    """Drive, error and noise of all samples, all of them usable.
 
-    ``slow_deg_s`` is the load speed up to which samples are used; by default the one of the slow kinds.
-    ``start`` is the elastic state at the very first sample; None leaves it to the fit.
+    ``against_command`` says that the error is that against the driving angle where there is a command, else
+    against the encoder's counts; ``expected`` is what a model predicts, taken off before the noise is looked
+    at. InputError where the record holds what cannot be computed with, or the ratio is not this gear's.
     """
-    segments = [each for each in segments if len(each)]
-    total = sum(len(each) for each in segments)
-    if total < MINIMUM_SAMPLES:
+    record = measured.record
+    name = f"{record.source}: " if record.source else ""
+    time, position, target = record.time_s, record.motor_position_deg, record.motor_target_deg
+    for column in sorted(record.columns.keys() & {*REQUIRED, *OPTIONAL}):
+        bad = np.flatnonzero(~np.isfinite(record.columns[column]))
+        if len(bad):
+            raise InputError(
+                f"{name}{column} of sample {bad[0]} is {record.columns[column][bad[0]]}; expected a finite "
+                "number: remove the sample or repair the file"
+            )
+    for row in np.setdiff1d(np.flatnonzero(np.diff(time) < 0.0) + 1, record.starts)[:1].tolist():
         raise InputError(
-            f"{total} samples in {len(segments)} segments; expected at least {MINIMUM_SAMPLES}: record more"
+            f"{name}time_s of sample {row} lies before that of sample {row - 1}; expected time to run "
+            "forwards: sort the samples, or make two records of them"
         )
-    numbers = [each.zero for each in segments]
-    names = {number: index for index, number in enumerate(dict.fromkeys(numbers))}
-    cuts = [
-        index
-        for index in range(1, len(segments))
-        if numbers[index] != numbers[index - 1] or not follows(segments[index - 1], segments[index])
-    ]
-    begins = sorted({0, *cuts, *(index for index, each in enumerate(segments) if each.start is not None)})
-    edges = np.cumsum([0, *map(len, segments)]).tolist()
-    spans = [*pairwise([*begins, len(segments)])]
-    starts = [segments[first].start for first in begins]
-    starts[0] = start if starts[0] is None else starts[0]
-    chains = [
-        Chain(slice(edges[first], edges[last]), known)
-        for (first, last), known in zip(spans, starts, strict=True)
-    ]
-    time = np.concatenate([each.time_s for each in segments])
-    measured = np.concatenate([_measured(each) for each in segments])
-    load = np.concatenate([each.load_deg for each in segments])
-    kind, zero = (
-        np.repeat(each, np.diff(edges))
-        for each in ([KINDS.index(each.kind) for each in segments], [names[number] for number in numbers])
-    )
-    reading = reading_of_all(measured, [each.rows for each in chains])
-    pieces = []
-    for (first, last), chain in zip(spans, chains, strict=True):
-        own, rows = segments[first:last], chain.rows
-        commanded = all(each.commanded for each in own)
-        command = np.concatenate([each.motor_deg for each in own]) if commanded else None
-        pieces.append(kinematics(measured[rows], command, time[rows], reading))
-    driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
-    turned = np.concatenate([_has_turned(time[each.rows], driving[each.rows]) for each in chains])
     if not ratio > 0:
-        raise InputError(f"{segments[0].name}: the ratio is {ratio:g}; expected more than 0")
-    first = zero == zero[0]
-    columns = {"time_s": time, "motor_position_deg": measured, "load_position_deg": load}
-    Record({name: each[first] for name, each in columns.items()}, segments[0].name).check_ratio(ratio)
-    error = load - measured / ratio
-    for index in range(len(names)):
-        error[zero == index] -= np.median(error[zero == index])
+        raise InputError(f"{name}the ratio is {ratio:g}; expected more than 0")
+    rows_of = [slice(first, last) for first, last in pairwise([*record.starts, len(time)])]
+    for part in record.parts():
+        part.check_ratio(ratio)
+    reading = reading_of_all(position, rows_of)
+    if target is not None and np.ptp(target) <= 0.0 and np.ptp(position) > 4.0 * reading.count_deg:
+        target = None  # a command that never moves while the motor does is no command
+    pieces = [
+        kinematics(position[rows], None if target is None else target[rows], time[rows], reading)
+        for rows in rows_of
+    ]
+    driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    driving.setflags(write=False)  # so that where it reverses is worked out once
+    motion = Motion(driving, time, record.measured, speed, acceleration, load_deg=driving / ratio)
+    against = driving if against_command and target is not None else position
+    error = (record.load_position_deg - against / ratio) * ARCSEC_PER_DEG
+    count_arcsec = reading.resolution_deg / ratio * ARCSEC_PER_DEG
+    load_count_arcsec = quantum_deg(record.load_position_deg) * ARCSEC_PER_DEG
+    known = expected(motion) if expected is not None else 0.0
+    sigma = noise_arcsec(
+        error - known, speed == 0.0, count_arcsec, load_count_arcsec, target is not None, record.starts
+    )
     return Samples(
         ratio=ratio,
-        motion=Motion(driving, time, measured_by_all([each.measured for each in segments])),
-        load_deg=load,
-        error_arcsec=error * ARCSEC_PER_DEG,
-        speed_deg_s=speed,
-        usable=_usable(time, speed / ratio, acceleration / ratio, kind, slow_deg_s) & ~turned,
-        kind=kind,
-        zero=zero,
-        zeros=len(names),
-        count_deg=reading.count_deg,
-        chains=tuple(chains),
-        travel_deg=max(float(np.ptp(each)) for each in np.split(measured, [edges[index] for index in cuts])),
+        motion=motion,
+        load_deg=record.load_position_deg,
+        error_arcsec=error,
+        sigma_arcsec=sigma,
+        usable=np.ones(len(time), dtype=np.bool_),
+        kinds=measured.kinds,
+        kind=measured.kind,
+        zero=measured.zero,
+        chains=tuple(Chain(rows, measured.states.get(rows.start)) for rows in rows_of),
+        reading=reading,
+        commanded=target is not None,
     )
-
-
-def follows(before: Segment, segment: Segment) -> bool:
-    """Whether the axis can have moved straight from one segment to the next."""
-    time_s = np.concatenate([before.time_s[-2:], segment.time_s[:2]])
-    motor_deg = np.concatenate([_measured(before)[-2:], _measured(segment)[:2]])
-    return segment.follows and not len(jumps(motor_deg, time_s))
-
-
-def _measured(segment: Segment) -> FloatArray:
-    return segment.motor_deg if segment.position_deg is None else segment.position_deg
-
-
-def _usable(
-    time: FloatArray,
-    load_speed: FloatArray,
-    load_acceleration: FloatArray,
-    kind: IntArray,
-    slow_deg_s: float | None,
-) -> BoolArray:
-    """Samples at rest and in slow motions, not within `SETTLE_S` after fast ones.
-
-    A motion counts as a whole, from rest or turn to the next: the start of a fast move is no slow motion. Of
-    moves and steps only the rests are used. Where nothing is known of a record, what accelerates is left out.
-    """
-    moving = np.abs(load_speed)
-    own = moving[np.isin(kind, [KINDS.index(each) for each in SLOW]) & (moving > 0)]
-    if slow_deg_s is None:
-        slow_deg_s = 1.2 * float(np.quantile(own, 0.995)) if len(own) else np.inf
-    under_way = moving > STANDING_DEG_S
-    fast = under_way & np.isin(kind, [KINDS.index(each) for each in ON_THE_WAY])
-    fast |= (kind == KINDS.index(Kind.UNKNOWN)) & (np.abs(load_acceleration) > GENTLE_DEG_S2)
-    # Motions that follow one another without a rest are distinguished by their kind and direction.
-    changes = [np.diff(each) != 0 for each in (under_way, kind, np.sign(load_speed))]
-    first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
-    fastest = np.repeat(np.maximum.reduceat(moving, first), np.diff(np.append(first, len(time))))
-    fast |= under_way & (fastest > slow_deg_s)
-    return ~settling(fast, time)
-
-
-def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
-    """Samples within `SETTLE_S` after a turn."""
-    turned = np.zeros(len(time), dtype=bool)
-    turning, _ = branches(motor_deg)
-    for first, last in pairwise(turning[1:]):
-        settled = time[first] + min(SETTLE_S, SETTLE_SHARE * float(time[last] - time[first]))
-        turned[first + 1 : int(np.searchsorted(time, settled, "right"))] = True
-    return turned

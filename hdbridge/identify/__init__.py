@@ -1,11 +1,11 @@
 """From records to parameters with uncertainties.
 
-`fit` takes stretches of a measurement (`Segment`) and returns a `FitResult`: the model, 95 % intervals that
-allow for noise that is not white, held-out figures, residual tests, and in words what the data cannot say.
+`fit` takes a measurement (`hdbridge.estimation.samples.Measured`) and returns a `FitResult`: the model, 95 %
+intervals that allow for noise that is not white, held-out figures, residual tests, and in words what the data
+cannot say.
 """
 
 from hdbridge.estimation.intervals import Interval
-from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.identify.fit import fit
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Line, Order
@@ -16,9 +16,7 @@ __all__ = [
     "FitOptions",
     "FitResult",
     "Interval",
-    "Kind",
     "Line",
     "Order",
-    "Segment",
     "fit",
 ]

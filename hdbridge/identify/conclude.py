@@ -12,7 +12,6 @@ from hdbridge.effects import FloatArray, Part
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.intervals import NORMAL_95, nested_half_widths
 from hdbridge.estimation.nuisances import DELAY, TEXTS, UNITS, delay_column
-from hdbridge.estimation.samples import KINDS
 from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.stretches import about_zeros
 from hdbridge.identify.covariance import of_effect
@@ -89,7 +88,7 @@ def conclude(
             motor_deg=blocks.motor_deg[used],
             load_deg=(blocks.motor_deg / samples.ratio + blocks.error_arcsec / ARCSEC_PER_DEG)[used],
             direction=(blocks.heading * blocks.moving)[used],
-            kind=tuple(each.value for each in KINDS),
+            kind=samples.kinds,
             kind_index=blocks.kind[used],
             error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
             predicted_arcsec=design.told(solution.effects)[used],

@@ -10,9 +10,9 @@ from scipy.ndimage import median_filter
 from hdbridge.effects import FloatArray
 from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import REST_DEG_S
-from hdbridge.estimation.samples import KINDS, SLOW, Samples
-from hdbridge.estimation.segment import Kind
+from hdbridge.estimation.samples import Samples
 from hdbridge.identify.result import Outliers
+from hdbridge.identify.usable import SLOW
 from hdbridge.observations.reading import median_deviation
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -32,7 +32,7 @@ def standing_arcsec(samples: Samples) -> float | None:
     sweep that creeps within a count seems to rest, while the load goes on.
     """
     still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
-    still &= ~np.isin(samples.kind, [KINDS.index(each) for each in SLOW])
+    still &= ~samples.of_kind(*SLOW)
     # What was not recorded may have been a motion.
     pause = np.diff(samples.time_s, prepend=samples.time_s[0]) > LONGEST_GAP_S
     rest = np.where(still, np.cumsum(pause) + 1, 0)
@@ -53,7 +53,7 @@ def standing_arcsec(samples: Samples) -> float | None:
 def laps_arcsec(samples: Samples) -> float | None:
     """Rms by which passes in the same direction differ, over the root of two; means over `LAP_BIN_DEG`."""
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
-    sweep = samples.usable & (samples.kind == KINDS.index(Kind.SWEEP))
+    sweep = samples.usable & samples.of_kind("sweep")
     for chain in samples.chains:
         turning, signs = branches(samples.motor_deg[chain.rows])
         for (first, last), sign in zip(pairwise(turning), signs, strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,8 +23,7 @@ from hdbridge.estimation.nuisances import (
     speeds_differ,
     zeros,
 )
-from hdbridge.estimation.samples import Samples, gather
-from hdbridge.estimation.segment import Segment
+from hdbridge.estimation.samples import Measured, Samples
 from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.terms import unknown
 from hdbridge.identify.conclude import conclude
@@ -35,6 +34,7 @@ from hdbridge.identify.orders import System
 from hdbridge.identify.result import FitResult
 from hdbridge.identify.shapes import LINEAR_ONLY, searched
 from hdbridge.identify.state import State, candidate_orders, turns_covered
+from hdbridge.identify.usable import usable_samples
 from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50
@@ -47,18 +47,21 @@ EFFECT_SHARE = 1e-3
 ROUNDS = 3
 
 
-def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = None) -> FitResult:
-    """Identify an axis of gear ratio ``ratio`` from stretches of a measurement.
+def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> FitResult:
+    """Identify an axis of gear ratio ``ratio`` from a measurement.
 
     InputError where the record cannot be used at all; what it cannot say stands in the result's ``warnings``.
     """
     options = options or FitOptions()
     warnings: list[str] = []
-    samples = gather(segments, ratio, options.start)
+    if options.start is not None:
+        measured = replace(measured, states={0: options.start} | {**measured.states})
+    samples = usable_samples(measured, ratio)
+    name = f"{measured.record.source}: " if measured.record.source else ""
     usable = int(np.count_nonzero(samples.usable))
     if usable < MINIMUM_USABLE:
         raise InputError(
-            f"{segments[0].name}: only {usable} of {len(samples)} samples are slow enough to be used; "
+            f"{name}only {usable} of {len(samples)} samples are slow enough to be used; "
             f"expected at least {MINIMUM_USABLE}: record slow sweeps, sines and rests"
         )
     travel = max(
@@ -69,7 +72,7 @@ def fit(segments: Sequence[Segment], ratio: float, options: FitOptions | None = 
     )
     if travel < LEAST_TRAVEL_DEG:
         raise InputError(
-            f"{segments[0].name}: the motor moves by {travel:.2g} deg in the {usable} of {len(samples)} "
+            f"{name}the motor moves by {travel:.2g} deg in the {usable} of {len(samples)} "
             f"samples that are slow and steady enough to be used; expected at least "
             f"{LEAST_TRAVEL_DEG:g}: record slow sweeps at a steady speed, both ways ({NO_DEGREES})"
         )

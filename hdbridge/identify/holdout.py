@@ -8,18 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.effects import FloatArray, IntArray
-from hdbridge.estimation.blocks import Blocks
-from hdbridge.estimation.design import clusters
+from hdbridge.estimation.design import Design, clusters
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.linearised import Linearised, steps_without
 from hdbridge.estimation.noise import Precision
 from hdbridge.estimation.nuisances import is_rounding
-from hdbridge.estimation.samples import KINDS
-from hdbridge.estimation.segment import Kind
 from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.stretches import about_zeros, counted, sums
 from hdbridge.identify.result import HeldOut
 from hdbridge.identify.state import State
+from hdbridge.identify.usable import KNOWN
 from hdbridge.units import DEG_PER_TURN
 
 FOLDS = 4
@@ -40,7 +38,7 @@ def held_out(
     samples vary inside their blocks, which no model of this kind changes.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
-    fold, over = folds(blocks)
+    fold, over = folds(design)
     # Turns and rounding are noise of the fit, not something that a model could be given.
     written = {place for place, each in enumerate(solution.effects) if not each.violations()}
     kept = [at for at, each in enumerate(solution.columns) if not is_rounding(each.name)]
@@ -85,7 +83,7 @@ def held_out(
     return replace(result, text=f"{words} {against}: {figures} on {over} left out")
 
 
-def folds(blocks: Blocks) -> tuple[IntArray, str]:
+def folds(design: Design) -> tuple[IntArray, str]:
     """Which fold each block is in, and what is left out in words.
 
     Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
@@ -93,20 +91,22 @@ def folds(blocks: Blocks) -> tuple[IntArray, str]:
     short recordings of the same travel whole ones: what is left in one of them goes on from one
     stretch to the next, and would be foretold by its neighbours.
     """
+    blocks = design.blocks
     lowest = float(np.min(blocks.motor_deg))
     turns = float(np.ptp(blocks.motor_deg)) / DEG_PER_TURN
     by_turn = np.floor((blocks.motor_deg - lowest) / DEG_PER_TURN).astype(np.intp) % FOLDS
     by_time = clusters(blocks, STRETCHES) % FOLDS
     if turns < 2 * FOLDS:
-        return (blocks.chain % FOLDS, RECORDINGS) if _alike(blocks) else (by_time, "stretches of time")
-    local = np.isin(blocks.kind, [KINDS.index(each) for each in (Kind.SINE, Kind.REVERSAL)])
+        return (blocks.chain % FOLDS, RECORDINGS) if _alike(design) else (by_time, "stretches of time")
+    local = design.samples.among(blocks.kind, ("sine", "reversal"))
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
     return counted(np.where(local, by_time, by_turn)), words
 
 
-def _alike(blocks: Blocks) -> bool:
+def _alike(design: Design) -> bool:
     """Whether there are recordings of which nothing is known but that each went where others did."""
-    if not np.all(blocks.kind == KINDS.index(Kind.UNKNOWN)) or int(blocks.chain[-1]) == 0:
+    blocks = design.blocks
+    if np.any(design.samples.among(blocks.kind, KNOWN)) or int(blocks.chain[-1]) == 0:
         return False
     cell = np.floor(blocks.motor_deg / CELL_DEG).astype(np.intp)
     for chain in range(int(blocks.chain[-1]) + 1):

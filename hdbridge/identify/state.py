@@ -136,7 +136,9 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
     ratio = design.samples.ratio
     if turns_covered(design) < WHOLE_TURN:
         return ()
-    turns = design.samples.travel_deg / DEG_PER_TURN
+    samples = design.samples
+    travel_deg = max(float(np.ptp(samples.motor_deg[samples.zero == each])) for each in range(samples.zeros))
+    turns = travel_deg / DEG_PER_TURN
     motor = [Order.motor(number) for number in range(1, options.highest_order + 1)]
     if turns < WHOLE_TURN * ratio:
         return tuple(motor)

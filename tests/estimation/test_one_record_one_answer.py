@@ -17,9 +17,9 @@ from hdbridge.estimation.design import Design
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
-from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.estimation.separable import Separable
 from hdbridge.estimation.terms import Effort, Terms
+from hdbridge.identify.usable import usable_samples
 from hdbridge.records.record import Record
 
 RATIO = plant.RATIO
@@ -45,16 +45,9 @@ def seen(request: pytest.FixtureRequest) -> Seen:
     commanded = request.param == "with the command"
     columns = plant.record(plant.Truth(), plant.Plan(scale=0.4), 5, command=commanded)
     record = Record(columns)
-    target = record.motor_target_deg
-    segment = Segment(
-        record.time_s,
-        record.motor_position_deg if target is None else target,
-        record.load_position_deg,
-        Kind.SWEEP,
-        position_deg=None if target is None else record.motor_position_deg,
-        commanded=target is not None,
-    )
-    return Seen(samples.gather([segment], RATIO, slow_deg_s=1e9), observed.gather(record, RATIO))
+    none = np.zeros(len(record), dtype=np.intp)
+    calibration = usable_samples(samples.Measured(record, ("sweep",), none, none), RATIO, slow_deg_s=1e9)
+    return Seen(calibration, observed.gather(record, RATIO))
 
 
 def test_both_are_driven_by_the_same_angle_at_the_same_speed(seen: Seen) -> None:

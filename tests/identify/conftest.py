@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from support.legs import Leg, fit
 
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, FitResult, Kind, Segment, fit
+from hdbridge.identify import FitOptions, FitResult
 
 RATE_HZ = 50.0
 
@@ -49,7 +50,7 @@ class Axis:
             loop[index] = sign * min(sign * before + 2 * rise, 1.0)
         return total + self.offset * loop
 
-    def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0) -> list[Segment]:
+    def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0) -> list[Leg]:
         """Legs of motor angles, one after the other at `RATE_HZ`, as segments."""
         rng = np.random.default_rng(seed)
         motor = np.concatenate([each for _, each in legs])
@@ -61,7 +62,7 @@ class Axis:
         segments, at = [], 0
         for kind, leg in legs:
             part = slice(at, at + len(leg))
-            segments.append(Segment(time[part], motor[part], load[part], Kind.named(kind), name=kind))
+            segments.append(Leg(time[part], motor[part], load[part], kind))
             at += len(leg)
         return segments
 

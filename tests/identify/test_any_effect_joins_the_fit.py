@@ -6,10 +6,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 import pytest
+from support.legs import fit
 
 from hdbridge.effects import Cause, Channel, Effect, FloatArray, Moment, Motion, Shape, Start
 from hdbridge.effects.base import Memoryless
-from hdbridge.identify import fit
 
 
 class Settling(Effect):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.legs import Leg, fit
 
 from hdbridge.errors import InputError
-from hdbridge.identify import Segment, fit
 
 
 def sweep(begin, end, speed, acceleration, rate_hz):
@@ -29,7 +29,7 @@ def record(bench, speed, acceleration, turns, laps, measured):
     end = 360.0 * turns
     legs = [sweep(*ends, speed, acceleration, bench.rate_hz) for ends in [(0.0, end), (end, 0.0)] * laps]
     whole = axis.record([("unknown", np.concatenate([[0.0], *legs]))])[0]
-    return Segment(whole.time_s, whole.motor_deg, whole.load_deg, commanded=not measured, name="fast.csv")
+    return Leg(whole.time_s, whole.motor_deg, whole.load_deg, commanded=not measured)
 
 
 @settings(deadline=None, max_examples=5, derandomize=True)

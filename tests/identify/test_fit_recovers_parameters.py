@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.legs import Leg, fit
 
 from hdbridge.effects import Hysteresis, MotorOrder, Start, Synchronous
-from hdbridge.identify import FitOptions, Kind, Segment, fit
+from hdbridge.identify import FitOptions
 from hdbridge.model import TransmissionModel
 
 
@@ -130,9 +131,7 @@ def test_a_measured_motor_angle_that_chatters_does_as_well(bench):
     segments = []
     for each in axis.record(bench.plan(turns=8.0)):
         flutter = rng.choice([-1.0, 0.0, 1.0], len(each), p=[0.05, 0.9, 0.05]) * 360.0 / 8000.0
-        segments.append(
-            Segment(each.time_s, each.motor_deg + flutter, each.load_deg, each.kind, commanded=False)
-        )
+        segments.append(Leg(each.time_s, each.motor_deg + flutter, each.load_deg, each.kind, commanded=False))
     result = fit(segments, axis.ratio, bench.options)
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.03)
     assert result.interval("hysteresis", "width_deg").value == pytest.approx(18.0, rel=0.06)
@@ -182,9 +181,7 @@ def test_a_load_that_cannot_follow_a_turn_bends_no_loop(bench):
         motor = each.motor_deg
         first = np.argmax(motor != motor[0])
         behind = -2.0 * np.sign(motor[first] - motor[0]) * (np.arange(len(motor)) < 0.08 * bench.rate_hz)
-        segments.append(
-            replace(each, load_deg=each.load_deg + behind * (each.kind is Kind.REVERSAL) / 3600.0)
-        )
+        segments.append(replace(each, load_deg=each.load_deg + behind * (each.kind == "reversal") / 3600.0))
     result = fit(segments, axis.ratio, bench.options)
     assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 1.5
     assert off(result, "hysteresis", "width_deg", axis.width) < 1.5
@@ -202,7 +199,7 @@ def test_a_load_that_swings_raises_and_shifts_no_orders(bench):
             ("sweep", bench.ramp(1800.0, 0.0, 40.3)),
         ]
     ):
-        if each.kind not in {Kind.SWEEP, Kind.SINE}:
+        if each.kind not in {"sweep", "sine"}:
             segments.append(each)
             continue
         rate = np.gradient(np.deg2rad(each.motor_deg), each.time_s)
@@ -228,11 +225,10 @@ def test_a_load_that_swings_raises_and_shifts_no_orders(bench):
 def test_default_options_suit_a_bare_record(bench):
     axis = bench.axis()
     parts = axis.record(bench.plan(turns=8.0))
-    whole = Segment(
+    whole = Leg(
         np.concatenate([each.time_s for each in parts]),
         np.concatenate([each.motor_deg for each in parts]),
         np.concatenate([each.load_deg for each in parts]),
-        name="someone.csv",
     )
     result = fit([whole], axis.ratio, FitOptions())
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
@@ -265,7 +261,7 @@ def test_turns_between_two_samples_bend_no_parameter_of_the_loop(bench):
     for each in axis.record(legs):
         kept = slice(-at % every, None, every)
         time_s, motor_deg, load_deg = each.time_s[kept] / every, each.motor_deg[kept], each.load_deg[kept]
-        segments.append(Segment(time_s, motor_deg, load_deg, each.kind))
+        segments.append(Leg(time_s, motor_deg, load_deg, each.kind))
         at += len(each)
     result = fit(segments, axis.ratio, bench.options)
     assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0

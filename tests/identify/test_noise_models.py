@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.legs import Leg, measured
 
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
-from hdbridge.estimation.samples import gather
-from hdbridge.estimation.segment import Kind, Segment
 from hdbridge.identify.figures import outlying, standing_arcsec
+from hdbridge.identify.usable import usable_samples
 
 
-def blocks_of(count, rng, motor=None, error=None, kind=Kind.SWEEP):
+def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
     time = np.cumsum(rng.uniform(0.3, 1.0, count))  # longer than a block lasts: each sample is a block
     motor = np.cumsum(rng.uniform(5.0, 30.0, count)) if motor is None else motor
     error = np.zeros(count) if error is None else error
-    segment = Segment(time, motor, motor / 50.0 + error / 3600.0, kind)
-    samples = gather([segment], 50.0, slow_deg_s=1e9)
+    segment = Leg(time, motor, motor / 50.0 + error / 3600.0, kind)
+    samples = usable_samples(measured([segment]), 50.0, slow_deg_s=1e9)
     return make_blocks(samples), samples
 
 
@@ -84,7 +84,7 @@ def test_blocks_average_a_column_exactly():
     rng = np.random.default_rng(5)
     time = np.arange(4000) / 250.0
     motor = np.concatenate([np.linspace(0.0, 300.0, 2000), np.linspace(300.0, 0.0, 2000)])
-    samples = gather([Segment(time, motor, motor / 50.0, Kind.SWEEP)], 50.0)
+    samples = usable_samples(measured([Leg(time, motor, motor / 50.0, "sweep")]), 50.0)
     blocks = make_blocks(samples)
     values = rng.normal(size=4000)
     assert blocks.count @ blocks.mean(values) == pytest.approx(np.sum(values[samples.usable]))
@@ -97,7 +97,7 @@ def test_a_load_is_left_time_to_settle_after_a_turn_but_not_most_of_the_way():
     time = np.arange(4000) / 250.0
     up, down = np.linspace(0.0, 60.0, 1600), np.linspace(60.0, 40.0, 1600)
     motor = np.concatenate([up, down, np.tile([38.0, 40.0], 20).repeat(20)])  # then a turn each 0.08 s
-    samples = gather([Segment(time, motor, motor / 50.0, Kind.SWEEP)], 50.0, slow_deg_s=1e9)
+    samples = usable_samples(measured([Leg(time, motor, motor / 50.0, "sweep")]), 50.0, slow_deg_s=1e9)
     assert samples.usable[:1600].all()
     assert np.flatnonzero(~samples.usable[1600:3200]) == pytest.approx(np.arange(1, 26))
     assert np.mean(samples.usable[3200:]) > 0.6
@@ -119,9 +119,8 @@ def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
     time, count, noise = np.arange(5000) / 250.0, 0.09, 0.5
     position = np.where(rng.random(5000) < 0.05, count, 0.0)  # 6.5 arcsec at the load
     load = rng.normal(size=5000) * noise / 3600.0
-    samples = gather(
-        [Segment(time, np.zeros(5000), load, Kind.STANDSTILL, position_deg=position)], 50.0, slow_deg_s=1e9
-    )
+    leg = Leg(time, np.zeros(5000), load, "standstill", position_deg=position)
+    samples = usable_samples(measured([leg]), 50.0, slow_deg_s=1e9)
     assert samples.count_deg == pytest.approx(count)
     assert standing_arcsec(samples) == pytest.approx(noise, rel=0.05)
     error = samples.error_arcsec
@@ -135,11 +134,11 @@ def test_what_moved_unseen_or_slowly_is_not_at_rest():
     time = np.arange(1000) / 250.0
     creep = np.linspace(0.0, 0.02, 1000)  # a fifth of a count in four seconds, as in a sine's turn
     segments = [
-        Segment(time, np.zeros(1000), still[0], Kind.STANDSTILL),
-        Segment(time + 60.0, np.full(1000, 90.0), 90.0 / 50.0 + still[1], Kind.STANDSTILL),
-        Segment(time + 64.0, 90.0 + creep, (90.0 + creep) / 50.0 + still[2], Kind.SINE),
+        Leg(time, np.zeros(1000), still[0], "standstill"),
+        Leg(time + 60.0, np.full(1000, 90.0), 90.0 / 50.0 + still[1], "standstill"),
+        Leg(time + 64.0, 90.0 + creep, (90.0 + creep) / 50.0 + still[2], "sine"),
     ]
-    found = standing_arcsec(gather(segments, 50.0, slow_deg_s=1e9))
+    found = standing_arcsec(usable_samples(measured(segments), 50.0, slow_deg_s=1e9))
     assert found == pytest.approx(0.5, rel=0.06)
-    rests = standing_arcsec(gather(segments[:2], 50.0, slow_deg_s=1e9))
+    rests = standing_arcsec(usable_samples(measured(segments[:2]), 50.0, slow_deg_s=1e9))
     assert found == pytest.approx(rests, rel=1e-9)  # the creep is not in it

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.legs import Leg, fit
 
 from hdbridge.effects import Hysteresis
 from hdbridge.errors import InputError
-from hdbridge.identify import FitOptions, Kind, Segment, fit
+from hdbridge.identify import FitOptions
 
 
 def test_without_a_reversal_hysteresis_is_left_out(bench):
@@ -74,17 +75,19 @@ def segment(**changes):
         "time_s": time,
         "motor_deg": motor,
         "load_deg": motor / 20.0,
-        "kind": Kind.SWEEP,
-        "name": "a.csv",
+        "kind": "sweep",
     }
-    return Segment(**(whole | changes))
+    return Leg(**(whole | changes))
 
 
 @pytest.mark.parametrize(
     ("make", "ratio", "complaint"),
     [
-        (lambda: segment(load_deg=np.zeros(399)), 20.0, r"a\.csv: load_deg has shape \(399,\)"),
-        (lambda: segment(load_deg=np.full(400, np.nan)), 20.0, r"a\.csv: load_deg of sample 0 is nan"),
+        (
+            lambda: segment(load_deg=np.full(400, np.nan)),
+            20.0,
+            r"a\.csv: load_position_deg of sample 0 is nan",
+        ),
         (
             lambda: segment(time_s=np.arange(400)[::-1] / 50.0),
             20.0,
@@ -97,19 +100,20 @@ def segment(**changes):
 )
 def test_bad_input_is_refused_in_one_line(make, ratio, complaint):
     with pytest.raises(InputError, match=complaint) as caught:
-        fit([make()], ratio)
+        fit([make()], ratio, name="a.csv")
     assert "\n" not in str(caught.value)
 
 
 def test_a_record_of_nothing_but_fast_moves_is_refused():
     time = np.arange(400) / 50.0
     with pytest.raises(InputError, match="slow enough to be used"):
-        fit([segment(kind=Kind.STEP, time_s=time)], 20.0, FitOptions())
+        fit([segment(kind="step", time_s=time)], 20.0, FitOptions())
 
 
-def test_no_samples_at_all_are_refused():
+def test_hardly_any_samples_are_refused():
+    few = {name: np.arange(4) / 50.0 for name in ("time_s", "motor_deg", "load_deg")}
     with pytest.raises(InputError, match="expected at least"):
-        fit([], 20.0)
+        fit([segment(**few)], 20.0)
 
 
 @pytest.mark.parametrize(("unit_deg", "turns"), [(57.29578, 10.0), (360.0, 4.0)])

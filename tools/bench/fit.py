@@ -16,13 +16,15 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from identify_records import Truth, plan, record
+from identify_records import Truth, plan, record, recording
 
+from hdbridge.calibration import measured_of
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, Kind, Segment, fit
+from hdbridge.identify import FitOptions, fit
+from hdbridge.records.recording import Recording
 
 
-def segments(samples: int) -> list[Segment]:
+def made(samples: int) -> Recording:
     truth = Truth(orders={1: (4.9, -126.8), 2: (9.33, -132.1), 4: (12.21, 105.7), 6: (3.18, -127.0)})
     fixed = sum(len(leg) for _, leg in plan(truth.ratio, turns=0.001, steps=20))
     speed = 4.0
@@ -31,26 +33,17 @@ def segments(samples: int) -> list[Segment]:
         turns, speed = 2.0, 2.0 * 720.0 * 250.0 / (samples - fixed)
     legs = plan(truth.ratio, turns=turns, speed=speed, steps=20)
     rows = record(truth, np.random.default_rng(1), legs)
-    return [
-        Segment(
-            row["time_s"],
-            row["target_deg"],
-            row["load_deg"],
-            Kind.named(row["kind"]),
-            position_deg=row["position_deg"],
-        )
-        for row in rows
-    ]
+    return recording(rows)
 
 
 def main() -> None:
     sizes = [int(float(each)) for each in sys.argv[1:]] or [100_000, 300_000, 1_000_000]
     before: tuple[int, float] | None = None
     for size in sizes:
-        parts = segments(size)
-        count = sum(len(each) for each in parts)
+        measured = measured_of([made(size)])
+        count = len(measured.record)
         begun, cpu = time.perf_counter(), time.process_time()
-        fit(parts, 50.0, FitOptions(start=Start.FORWARD))
+        fit(measured, 50.0, FitOptions(start=Start.FORWARD))
         taken, cpu = time.perf_counter() - begun, time.process_time() - cpu
         growth = ""
         if before:

@@ -114,7 +114,7 @@ class Screen:
         residual = weight * here.left(mean)
         left = _Residual(
             Hypothesis(theory.effects, theory.start),
-            mean[: evidence.data.zeros],
+            mean[: evidence.data.full.zeros],
             residual,
             linearised.Linearised(tangent, residual, np.stack([known, np.zeros(len(known))], axis=1)),
         )

@@ -187,8 +187,8 @@ class Evidence:
 
     def _made(self, theory: Theory, loops: Sequence[Effect]) -> Fixed:
         estimator, motion, start = self.estimator, self.data.full.motion, theory.start
-        columns = [(estimator.zero[:, np.newaxis] == np.arange(self.data.zeros)).astype(np.float64)]
-        sizes = [np.full(self.data.zeros, ZERO_ARCSEC)]
+        columns = [(estimator.zero[:, np.newaxis] == np.arange(self.data.full.zeros)).astype(np.float64)]
+        sizes = [np.full(self.data.full.zeros, ZERO_ARCSEC)]
         for name in causes():
             kind = CATALOGUE[name]
             if kind.ordinary_arcsec and not kind.shape:

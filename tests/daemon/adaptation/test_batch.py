@@ -5,7 +5,7 @@ import pytest
 from support.adapting import AXIS, MODEL, Sampler, truth_of
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.identification import segments_of
+from hdbridge.calibration.identification import measured_of
 from hdbridge.control.bench import Bench
 from hdbridge.daemon.adaptation.estimator import Estimator
 from hdbridge.daemon.adaptation.measuring import Measuring
@@ -53,7 +53,7 @@ def test_recursion_equals_the_least_squares_of_the_identification(run):
 
     model = regressors.changed(estimator.estimate[: regressors.followed])
     options = FitOptions(start=Start.FORWARD, highest_order=8, load_orders=0, active=MODEL)
-    identified = fit(segments_of([run]), AXIS.gear.ratio, options)
+    identified = fit(measured_of([run]), AXIS.gear.ratio, options)
     offset = identified.interval("hysteresis", "offset_arcsec")
     assert offset.value == pytest.approx(44.0, abs=0.5)
     ours = {each.name: each for each in model.effects}
