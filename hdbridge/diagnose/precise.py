@@ -10,17 +10,13 @@ model, and what it takes over would be missing in the loop's own parameters.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
 from hdbridge.effects.orders import RAD_PER_DEG
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.nuisances import SWING, SWING_LAG, speeds_differ, swing_columns
-from hdbridge.estimation.terms import FOUND, Effort, Nuisances, unknown
-
-UNIT_S: Final = 1.0 / 30.0
-"""Time in which the columns count: about that of a radian of the motor."""
+from hdbridge.estimation.nuisances import speeds_differ, swing
+from hdbridge.estimation.terms import FOUND, Effort, Nuisances
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
@@ -49,5 +45,4 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
         return None
     angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
     both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
-    columns = estimator.at_points(swing_columns(RAD_PER_DEG * speed, both, UNIT_S))
-    return unknown(columns, [SWING, SWING_LAG])
+    return swing(RAD_PER_DEG * speed, both, estimator.at_points)

@@ -18,6 +18,7 @@ from hdbridge.estimation.calibration import CalibratedPart, priors
 from hdbridge.estimation.linear import side_by_side
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.noise import White
+from hdbridge.estimation.nuisances import zeros
 from hdbridge.estimation.observed import Observed
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
@@ -306,9 +307,8 @@ class Estimator:
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
         """A zero for each absolute zero, and what the hypothesis has in addition."""
-        columns = self.zero[:, np.newaxis] == np.arange(self.data.full.zeros)
-        zeros = unknown(columns, [f"zero {each}" for each in range(self.data.full.zeros)])
-        return zeros if hypothesis.nuisances is None else zeros.and_also(hypothesis.nuisances)
+        own = zeros(self.zero, self.data.full.zeros)
+        return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:
         """The sign that an effect's coefficients have; 0 where they may have either."""

@@ -12,16 +12,17 @@ orders' amplitudes; at one speed they are less well known.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import chain, pairwise
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
+from itertools import pairwise
 
 import numpy as np
 
-from hdbridge.effects import Effect, FloatArray
+from hdbridge.effects import Effect, FloatArray, IntArray
 from hdbridge.estimation.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS
 from hdbridge.estimation.design import Design
 from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.estimation.terms import FREE, Nuisances, Prior
+from hdbridge.estimation.terms import Nuisances, Prior, unknown
 from hdbridge.units import ARCSEC_PER_DEG
 
 DELAY = "delay_ms"
@@ -58,10 +59,9 @@ SHARE = 0.1
 """A nuisance of whose column less than this is left by what else is fitted stays out."""
 
 
-def zeros(design: Design) -> FloatArray:
-    """One column per absolute zero."""
-    which = design.blocks.zero[:, np.newaxis] == np.arange(design.samples.zeros)
-    return np.asarray(which, dtype=np.float64)
+def zeros(zero: IntArray, number: int) -> Nuisances:
+    """A column for each of so many absolute zeros; ``zero`` (b,) says which."""
+    return unknown(zero[:, np.newaxis] == np.arange(number), [f"zero {each}" for each in range(number)])
 
 
 def delay_column(design: Design) -> FloatArray:
@@ -118,21 +118,24 @@ def is_rounding(name: str) -> bool:
     return is_turn(name) or name.startswith(ROUNDING)
 
 
-def swing_columns(
-    rate: FloatArray, waves: Iterable[tuple[float, FloatArray, FloatArray]], unit_s: float
-) -> FloatArray:
-    """What the load shows beyond waves of the motor angle, shape (b, 2), arcsec.
+def swing(
+    rate: FloatArray,
+    waves: Iterable[tuple[float, FloatArray, FloatArray]],
+    mean: Callable[[FloatArray], FloatArray] = lambda columns: columns,
+) -> Nuisances:
+    """What the load shows beyond waves of the motor angle, arcsec per square and cube of a millisecond.
 
-    Per square and cube of ``unit_s``; ``rate`` (b,) is the motor's, radians per second. ``waves`` are orders,
-    what they contribute, (b,), and the same a quarter of a wave later.
+    ``rate`` (n,) is the motor's, radians per second. ``waves`` are orders, what they contribute, (n,), and
+    the same a quarter of a wave later; ``mean`` averages columns (n, 2) as the observations are.
     Driven by a cos(w t) well below its natural frequency f a load on a spring with damping ratio z answers
     with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): more, and later both ways.
     """
     columns = np.zeros((len(rate), 2))
     for order, wave, later in waves:
-        columns[:, 0] += (order * rate * unit_s) ** 2 * wave
-        columns[:, 1] += (order * rate * unit_s) ** 3 * later
-    return columns
+        columns[:, 0] += (1e-3 * order * rate) ** 2 * wave
+        columns[:, 1] += (1e-3 * order * rate) ** 3 * later
+    known = tuple(Prior(0.0, each**-2) for each in (SWING_MS2, SWING_MS3))
+    return Nuisances(mean(columns), (SWING, SWING_LAG), known)
 
 
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
@@ -151,26 +154,22 @@ def nuisances_of(
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
-    """Zeros and the nuisances named; ``waves`` as for `swing_columns`."""
-    parts: list[tuple[FloatArray, Sequence[str], Sequence[Prior]]] = []
-    count = design.samples.zeros
-    parts.append((zeros(design), [f"zero {number}" for number in range(count)], [FREE] * count))
+    """Zeros and the nuisances named; ``waves`` as for `swing`."""
+    parts = [zeros(design.blocks.zero, design.samples.zeros)]
     if DELAY in nuisances:
-        parts.append((delay_column(design), [DELAY], [FREE]))
+        parts.append(unknown(delay_column(design), [DELAY]))
     if ROUNDING in nuisances:
         column, sizes = rounding_columns(design)
         numbered = [f"{ROUNDING} {number}" for number in range(1, len(sizes))]
-        parts.append((column, [ROUNDING, *numbered], [Prior(0.0, each**-2.0) for each in sizes.tolist()]))
+        known = tuple(Prior(0.0, each**-2.0) for each in sizes.tolist())
+        parts.append(Nuisances(column, (ROUNDING, *numbered), known))
     if TURNS in nuisances:
         column, prior = turn_columns(design, effects)
-        parts.append((column, [f"turn {each}" for each in range(len(prior))], prior))
+        parts.append(Nuisances(column, tuple(f"turn {each}" for each in range(len(prior))), tuple(prior)))
     if SWING in nuisances and waves:
         rate = np.deg2rad(design.blocks.speed_deg_s * design.blocks.moving)
-        column = swing_columns(rate, waves, unit_s=1e-3)
-        known = [Prior(0.0, each**-2) for each in (SWING_MS2, SWING_MS3)]
-        parts.append((column, [SWING, SWING_LAG], known))
-    columns, names, priors = zip(*parts, strict=True)
-    return Nuisances(np.concatenate(columns, axis=1), tuple(chain(*names)), tuple(chain(*priors)))
+        parts.append(swing(rate, waves))
+    return reduce(Nuisances.and_also, parts)
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
 from hdbridge.effects.base import Shape
 from hdbridge.estimation.linear import side_by_side, solve_symmetric
 from hdbridge.estimation.shapes import free_shapes, leaves, moved, on_scale, shape_value, tangent, unit
-from hdbridge.estimation.terms import Column, Effort, Prior, Terms
+from hdbridge.estimation.terms import FREE, Column, Effort, Terms
 
 DAMPING = 1e-4
 TRIES = 6
@@ -112,18 +113,10 @@ class Solution:
     @cached_property
     def known(self) -> FloatArray:
         """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
-        prior = self._fit.terms.prior
-        result = np.zeros((len(self.columns), 2))
-        mean, information = np.array(self._fit.terms.nuisances.prior).reshape(-1, 2).T
-        result[: len(mean)] = np.stack([information, information * (mean - self.nuisances)], axis=1)
-        for at, each in enumerate(self.columns):
-            known = prior.get((each.effect, each.name)) if each.effect >= 0 else None
-            if known is not None:
-                effect = self.effects[each.effect]
-                shape = next((one for one in effect.shape if each.shape and one.name == each.name), None)
-                value = on_scale(effect, shape) if shape else float(effect.coefficients()[int(each.name)])
-                result[at] = known.information, known.information * (known.mean - value)
-        return result
+        mean, information = self._fit.terms.known(self.columns).T
+        shapes = [on_scale(self.effects[each.effect], each) for each in self.columns if each.shape]
+        value = np.concatenate([self._point.coefficients, shapes])
+        return np.stack([information, information * (mean - value)], axis=1)
 
     def free(self) -> int:
         """Parameters that do anything in the data."""
@@ -217,7 +210,10 @@ class Separable:
             gram[split:, :split] = gram[:split, split:].T
             gram[split:, split:] = matrix.T @ terms.weighting.apply(matrix)
             right[split:] = matrix.T @ self._right
-        information, mean, sign = self._known(effects, fixed.places, moving)
+        columns = self._linear(effects, fixed.places, moving)
+        mean, information = terms.known(columns).T
+        signs = {place: terms.sign(effect) for place, effect in enumerate(effects)}
+        sign = np.array([signs.get(each.effect, 0.0) for each in columns])
         gram[np.arange(size), np.arange(size)] += information
         right = right + information * mean
         inside = np.ones(size, dtype=np.bool_)
@@ -275,19 +271,12 @@ class Separable:
         )
         return self._fixed
 
-    def _known(
-        self, effects: Sequence[Effect], *places: tuple[int, ...]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Information and mean beforehand, and the sign, of each linear column."""
-        terms = self.terms
-        rows = [(each.information, each.mean, 0.0) for each in terms.nuisances.prior]
-        for place in (each for group in places for each in group):
-            sign = terms.sign(effects[place])
-            for number in range(len(effects[place].coefficients())):
-                known = terms.prior.get((place, str(number)), Prior(0.0, 0.0))
-                rows.append((known.information, known.mean, sign))
-        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
-        return table[:, 0], table[:, 1], table[:, 2]
+    def _linear(self, effects: Sequence[Effect], *places: tuple[int, ...]) -> list[Column]:
+        """The linear columns, the nuisances' first."""
+        columns = [Column(-1, name) for name in self.terms.nuisances.names]
+        for place in chain(*places):
+            columns += [Column(place, str(number)) for number in range(len(effects[place].coefficients()))]
+        return columns
 
     def _of_shapes(self, effects: Sequence[Effect]) -> float:
         """What the shapes cost for being other than was known beforehand."""
@@ -308,11 +297,10 @@ class Separable:
         cross = np.concatenate([here.fixed.matrix.T @ weighted, here.matrix.T @ weighted])[here.inside]
         inner = tangents.T @ weighted
         slope = tangents.T @ self._right - cross.T @ here.coefficients[here.inside]
-        for at, (place, shape) in enumerate(where):
-            known = self.terms.prior.get((place, shape.name))
-            if known:
-                inner[at, at] += known.information
-                slope[at] += known.information * (known.mean - on_scale(here.effects[place], shape))
+        known = [self.terms.prior.get((place, each.name), FREE) for place, each in where]
+        mean, information = np.array(known).T
+        inner += np.diag(information)
+        slope += information * (mean - [on_scale(here.effects[place], each) for place, each in where])
         gram = here.gram[np.ix_(here.inside, here.inside)]
         return inner - cross.T @ solve_symmetric(gram, cross), slope
 
@@ -349,11 +337,7 @@ class Separable:
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:
-        columns = [Column(-1, name) for name in self.terms.nuisances.names]
-        edge = []
-        for place in (*here.fixed.places, *here.moving):
-            count = len(here.effects[place].coefficients())
-            columns += [Column(place, str(number)) for number in range(count)]
+        columns, edge = self._linear(here.effects, here.fixed.places, here.moving), []
         for place, effect in enumerate(here.effects):
             for each in free_shapes(effect, self.terms.moves):
                 columns.append(Column(place, each.name, True, each.logarithmic))

@@ -10,7 +10,7 @@ import numpy as np
 from hdbridge.effects import Effect, FloatArray
 from hdbridge.effects.base import Shape
 from hdbridge.effects.described import Moves
-from hdbridge.estimation.terms import Columns
+from hdbridge.estimation.terms import Column, Columns
 
 LOGARITHM = 0.7
 RANGE = 0.15
@@ -98,7 +98,7 @@ def shape_value(effect: Effect, name: str) -> float:
     return float(parts[0][name])
 
 
-def on_scale(effect: Effect, shape: Shape) -> float:
+def on_scale(effect: Effect, shape: Shape | Column) -> float:
     """A shape parameter as it is stepped and known beforehand: its logarithm where it has one."""
     value = shape_value(effect, shape.name)
     return math.log(value) if shape.logarithmic else value

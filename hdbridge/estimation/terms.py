@@ -118,3 +118,9 @@ class Terms:
     """The sign that an effect's coefficients have; 0 where they may have either."""
     moves: frozenset[Moves] = LOCAL
     """Shapes that are moved; the others stay as they are."""
+
+    def known(self, columns: Sequence[Column]) -> FloatArray:
+        """Mean and information beforehand of columns that begin with the nuisances', shape (p, 2)."""
+        others = columns[len(self.nuisances.prior) :]
+        own = [self.prior.get((each.effect, each.name), FREE) for each in others]
+        return np.array([*self.nuisances.prior, *own], dtype=np.float64).reshape(-1, 2)

@@ -25,7 +25,6 @@ from hdbridge.estimation.nuisances import (
 )
 from hdbridge.estimation.samples import Measured, Samples
 from hdbridge.estimation.separable import Solution
-from hdbridge.estimation.terms import unknown
 from hdbridge.identify.conclude import conclude
 from hdbridge.identify.covariance import covariance, of_effect
 from hdbridge.identify.figures import outlying
@@ -97,7 +96,8 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
             f"they cannot be distinguished from anything else; sweep over a turn or more ({NO_DEGREES})"
         )
     waves = harmonics(design, [each.per_motor_turn for each in candidates])
-    always = np.concatenate([zeros(design), waves], axis=1)
+    free = zeros(design.blocks.zero, samples.zeros).columns
+    always = np.concatenate([free, waves], axis=1)
     weight = design.blocks.count
     effects: list[Effect] = []
     for effect in options.effects:
@@ -113,7 +113,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
             )
             continue
         effects.append(prototype)
-    known = np.concatenate([zeros(design), *(design.columns(each, exact=False) for each in effects)], axis=1)
+    known = np.concatenate([free, *(design.columns(each, exact=False) for each in effects)], axis=1)
     nuisances = []
     delay = delay_column(design)
     size = float(np.sqrt(weight @ delay[:, 0] ** 2 / np.sum(weight)))
@@ -135,9 +135,8 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
 
 def _search(state: State, warnings: list[str]) -> State:
     """Shapes from a grid, the elastic state at the start where it is not known, and a first noise model."""
-    waves = [f"{each} {part}" for each in state.candidates for part in ("cosine", "sine")]
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
-    columns = simple.in_addition().and_also(unknown(state.waves, waves))
+    columns = simple.in_addition().and_also(state.candidate_waves())
 
     def found(
         starts: list[Start], effects: tuple[Effect, ...]

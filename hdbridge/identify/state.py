@@ -9,18 +9,18 @@ import numpy as np
 from hdbridge.effects import Effect, FloatArray, is_ripple, ripple
 from hdbridge.estimation.blocks import make_blocks
 from hdbridge.estimation.design import Design, harmonics
-from hdbridge.estimation.linear import side_by_side
 from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
 from hdbridge.estimation.separable import Separable, Solution
-from hdbridge.estimation.shapes import tangent
 from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting, unknown
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, select
 from hdbridge.identify.result import Outliers
+from hdbridge.identify.shapes import LINEAR_ONLY
 from hdbridge.units import DEG_PER_TURN
 
+PARTS = ("cosine", "sine")
 WHOLE_TURN = 0.95
 """Turns that count as one."""
 COVERED_DEG = 30.0
@@ -60,13 +60,17 @@ class State(NamedTuple):
             waves.append((order, turned.real, turned.imag))
         return nuisances_of(self.design, self.nuisances, self.effects, waves)
 
+    def candidate_waves(self) -> Nuisances:
+        """All candidates."""
+        return unknown(self.waves, [f"{each} {part}" for each in self.candidates for part in PARTS])
+
     def columns(self) -> Nuisances:
         """Zeros and nuisances, and the chosen orders that are not the motor's."""
         others = [
             (f"{order} {part}", 2 * at + number)
             for at, order in enumerate(self.candidates)
             if order in self.selection.chosen and order.family is not Family.MOTOR
-            for number, part in enumerate(("cosine", "sine"))
+            for number, part in enumerate(PARTS)
         ]
         picked = self.waves[:, [at for _, at in others]]
         return self.in_addition().and_also(unknown(picked, [name for name, _ in others]))
@@ -90,20 +94,12 @@ class State(NamedTuple):
 
         With the tangents in, shapes are refitted with every order that is tried.
         """
-        extra, roughly = self.in_addition(), self.design.roughly
-        parts = [self.waves, extra.columns]
-        for effect in self.effects:
-            parts.append(roughly(effect))
-            parts += [tangent(roughly, effect, each, central=True)[:, np.newaxis] for each in effect.shape]
-        columns = side_by_side(parts, len(self.waves))
-        weighted = self.precision().apply(columns)
-        gram = columns.T @ weighted
-        inside = np.arange(len(extra.prior)) + self.waves.shape[1]
-        right = weighted.T @ self.design.blocks.error_arcsec
-        mean, known = np.array(extra.prior).T
-        gram[inside, inside] += known
-        right[inside] += known * mean
-        return gram, right
+        precision, nuisances = self.precision(), self.candidate_waves().and_also(self.in_addition())
+        found = self.under(precision, nuisances, exact=False).fit(self.effects, LINEAR_ONLY)
+        right = found.jacobian.T @ precision.apply(self.design.blocks.error_arcsec)
+        mean, known = np.array(nuisances.prior).T
+        right[: len(mean)] += known * mean
+        return found.information, right
 
     def selected(self, system: System | None = None) -> State:
         """With the orders that this noise lets one see; ``system`` is `information`, where it is at hand."""
