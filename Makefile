@@ -11,9 +11,15 @@ export PYTHONDONTWRITEBYTECODE :=
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
 
+# uv takes a third of pip's time and writes the bytecode on all processors; where it cannot be had, or does not
+# get at the packages, pip does it. uv reads no settings of pip: it is told the index.
+PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+INDEX := $${UV_DEFAULT_INDEX:-$${PIP_INDEX_URL:-https://pypi.org/simple}}
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@{ $(PIP) uv && UV_DEFAULT_INDEX="$(INDEX)" \
+		$(BIN)/uv pip install --quiet --python $(BIN)/python --compile-bytecode --editable '.[dev]'; } 2>/dev/null || \
+		$(PIP) --editable '.[dev]'
 	@touch $@
 
 demo: $(READY)   ## the main job: step a simulated axis under four compensation schemes
@@ -69,7 +75,7 @@ bench-realtime: $(READY)  ## what a cycle and the daemon's loop cost on PREEMPT_
 	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_daemon.py --json build/realtime/daemon.json
 
 $(VENV)/.docs: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(PIP) --editable '.[docs]'
 	@touch $@
 
 docs: $(VENV)/.docs  ## the guides and the API reference as a site with search, into build/site
