@@ -10,6 +10,8 @@ from hypothesis import HealthCheck, settings
 
 for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line does, see hdbridge/__main__.py
     os.environ.setdefault(each, "1")
+# Most of what a collection walks through here lives as long as the tests do.
+gc.set_threshold(20_000, 50, 100)
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # A change fails or it does not, but not by lot: more of always the same examples would tell little more.
 settings.register_profile("same", slow_machines, derandomize=True, max_examples=50)

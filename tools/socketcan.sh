@@ -21,14 +21,15 @@
 #
 # Exit status: the command's own; 124 timed out; 69 no SocketCAN to be had, user-mode-linux that does not boot on
 # this machine included; 70 user-mode-linux booted, and ended without running the command to its end.
-# SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux.
+# SOCKETCAN_MEMORY (default 1G) is the memory of user-mode-linux; SOCKETCAN_LOCKS (default /tmp/socketcan-UID) is what
+# the names of the files begin with by which runs at the same time share the processors.
 set -u
 
 readonly here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 readonly unavailable=69 broken=70 timed_out=124
 readonly packages=(user-mode-linux kmod iproute2 can-utils)
 readonly boot_limit_s=120 # it takes 2 s
-locks=/tmp/socketcan-$(id -u) && readonly locks
+locks=${SOCKETCAN_LOCKS:-/tmp/socketcan-$(id -u)} && readonly locks
 limit_s=600 force_uml=no check_only=no slowed=''
 
 say() { echo "socketcan: $*" >&2; }

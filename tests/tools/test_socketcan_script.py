@@ -27,7 +27,8 @@ def run_with(tmp_path: Path):
             path = tmp_path / name.replace("_", ".")
             path.write_text(f"#!/bin/sh\n{text}\n")
             path.chmod(0o755)
-        environment = dict(os.environ, PATH=f"{tmp_path}:{os.environ['PATH']}")
+        locks = {"SOCKETCAN_LOCKS": str(tmp_path / "locks")}  # others on this machine may run it
+        environment = dict(os.environ, PATH=f"{tmp_path}:{os.environ['PATH']}") | locks
         return subprocess.run(
             [SCRIPT, "--uml", "true"], env=environment, capture_output=True, text=True, check=False
         )
