@@ -50,13 +50,13 @@ class Axis:
             loop[index] = sign * min(sign * before + 2 * rise, 1.0)
         return total + self.offset * loop
 
-    def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0) -> list[Leg]:
-        """Legs of motor angles, one after the other at `RATE_HZ`, as segments."""
+    def record(self, legs: list[tuple[str, np.ndarray]], seed: int = 0, state: float = 1.0) -> list[Leg]:
+        """Legs of motor angles, one after the other at `RATE_HZ`, as segments; ``state`` as in `error`."""
         rng = np.random.default_rng(seed)
         motor = np.concatenate([each for _, each in legs])
         count = 360.0 / self.motor_counts
         motor = np.round(motor / count) * count
-        error = self.error(motor) + self.zero_arcsec + rng.normal(size=len(motor)) * self.noise
+        error = self.error(motor, state) + self.zero_arcsec + rng.normal(size=len(motor)) * self.noise
         load = motor / self.ratio + error / 3600.0
         time = np.arange(len(motor)) / RATE_HZ
         segments, at = [], 0
