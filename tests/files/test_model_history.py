@@ -247,19 +247,19 @@ from hdbridge.model import store
 from hdbridge.effects import Hysteresis
 from hdbridge.model import TransmissionModel
 profile, first = Path(sys.argv[1]), int(sys.argv[2])
-print("ready", flush=True)
 for offset in range(first, 3600):
     loop = Hysteresis(offset_arcsec=offset, width_deg=20, exponent=1.6)
     store.propose(profile, TransmissionModel(50.0, (loop,)), "again", datetime(2025, 1, 1, tzinfo=UTC))
     store.commit(profile, datetime(2025, 1, 1, tzinfo=UTC))
     if offset % 3 == 0:
         store.rollback(profile, "back", datetime(2025, 1, 1, tzinfo=UTC))
+    if offset == first:
+        print("committed once", flush=True)
 """
 
 
 def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
     make(profile, 1, 2)
-    committed = 2
     for attempt in range(6):
         worker = subprocess.Popen(
             [sys.executable, "-c", WORKER, str(profile), str(3 + 100 * attempt)], stdout=subprocess.PIPE
@@ -274,10 +274,9 @@ def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
         numbered = [each for each in versions if each.number]
         assert [each.number for each in numbered] == list(range(len(numbered), 0, -1))
         assert sum(each.active for each in numbered) == 1
-        committed = max(committed, len(numbered))
+        assert len(numbered) >= 3 + attempt, "what was committed before the kill is there"
         active = next(each for each in numbered if each.active)
         went_back = store.rollback(profile, "after the kill", DATE)
         assert went_back != active.number
         store.activate(profile, int(active.name), "and forth", DATE)
         assert store.find(profile, "active").number == active.number
-    assert committed > 2, "the worker never got to commit"

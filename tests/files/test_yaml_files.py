@@ -224,18 +224,18 @@ def test_writing_into_a_missing_folder_is_an_output_error(tmp_path):
 WRITER = """
 import sys
 from hdbridge.files.atomic import write_atomically
-print("ready", flush=True)
 number = 0
 while True:
     number += 1
     write_atomically(sys.argv[1], f"begin {number}\\n" + f"{number}\\n" * 20000 + f"end {number}\\n")
+    if number == 1:
+        print("written once", flush=True)
 """
 
 
 def test_a_killed_writer_leaves_the_old_content_or_the_new(tmp_path):
     path = tmp_path / "model.yaml"
     write_atomically(path, "begin 0\nend 0\n")
-    seen = set()
     for attempt in range(12):
         writer = subprocess.Popen(
             [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, env={**os.environ}
@@ -250,9 +250,7 @@ def test_a_killed_writer_leaves_the_old_content_or_the_new(tmp_path):
         number = lines[0].removeprefix("begin ")
         assert lines[-1] == f"end {number}"
         assert set(lines[1:-1]) <= {number}
-        assert len(lines) in {2, 20002}
-        seen.add(number)
-    assert len(seen) > 1, "the writer never got to write"
+        assert len(lines) == 20002
     assert {each.name for each in tmp_path.iterdir()} <= {"model.yaml", ".model.yaml.tmp"}
     write_atomically(path, "last")
     assert [each.name for each in tmp_path.iterdir()] == ["model.yaml"]
