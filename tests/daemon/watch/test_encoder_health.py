@@ -1,5 +1,6 @@
 """Faults of the load encoder are named; a gear that wears is not taken for one."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +44,21 @@ def judged(samples, health=None, batch=50):
 
 
 def working(truth=MODEL, duration_s=360.0, seed=1, speed_deg_s=10.0):
+    if truth is MODEL:
+        return as_modelled(duration_s, seed, speed_deg_s).copy()
+    return made(truth, duration_s, seed, speed_deg_s)
+
+
+def made(truth, duration_s, seed, speed_deg_s):
     return SampleMaker(AXIS, MODEL, truth, seed).make(
         moves_and_rests(duration_s, PERIOD_S, seed, speed_deg_s)
     )
+
+
+@cache
+def as_modelled(duration_s, seed, speed_deg_s):
+    """Most tests begin with the same samples."""
+    return made(MODEL, duration_s, seed, speed_deg_s)
 
 
 def faulty(change, **options):
@@ -130,7 +143,14 @@ def test_a_jump_stays_until_the_drive_was_verified_again():
 
 def test_it_does_not_depend_on_how_the_samples_come():
     samples = faulty(lambda load, _: load + 100.0 / 3600.0, duration_s=165.0)
-    at_s = [judged(samples, batch=batch)[1][0] for batch in (2, 5, 100)]
+    before, after = samples[: FAULT - 500], samples[FAULT - 500 :]
+    at_s = []
+    for batch in (2, 5, 100):
+        health = EncoderHealth(AXIS, MODEL)
+        assert judged(before, health)[-1][1].believed
+        seen = judged(after, health, batch)
+        assert [each.fault for _, each in seen] == [None, EncoderFault.JUMPED]
+        at_s.append(seen[1][0])
     assert max(at_s) - min(at_s) <= 1.1
 
 
