@@ -14,7 +14,7 @@ import numpy as np
 
 from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linear import orthonormal, solve_symmetric
+from hdbridge.estimation.linear import solve_symmetric
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.stretches import of_length, sandwich
 
@@ -109,10 +109,9 @@ def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
         return False
     own = fitted.places(place)
     columns = np.hstack([fitted.tangent[:, own[:1]], estimator.weighted(changing[estimator.index])])
-    basis = orthonormal(np.delete(fitted.tangent, own, axis=1))
-    left = columns - basis @ (basis.T @ columns)
-    moment = left.T @ fitted.residual
-    step = np.linalg.lstsq(left.T @ left, moment, rcond=1e-10)[0]
+    others = np.setdiff1d(np.arange(fitted.count()), own)
+    gram, moment = fitted.linearised.of(others).left(columns)
+    step = np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
     along = float(fitted.hypothesis.effects[place].coefficients()[0]) + np.cumsum(step)
     scales = estimator.scales
     differs = float(np.ptp(along)) > scales.bend * float(np.max(np.abs(along)))

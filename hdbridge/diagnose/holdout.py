@@ -7,6 +7,8 @@ were found by search, are those of the whole record.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hdbridge.effects import FloatArray, IntArray
@@ -40,7 +42,7 @@ def held_out_change(
     after = fitted.linearised
     kept = np.setdiff1d(np.arange(fitted.count()), columns)
     given = after.residual + estimator.weight * change_arcsec
-    return _gain(estimator, Linearised(after.columns[:, kept], given, after.known[kept]), after)
+    return _gain(estimator, replace(after.of(kept), residual=given), after)
 
 
 def _gain(estimator: Estimator, before: Linearised, after: Linearised) -> Gain | None:

@@ -1,4 +1,4 @@
-"""Seeing: what a model gets wrong, over every coordinate that a cause may depend on.
+"""What a model gets wrong, over every coordinate that a cause may depend on.
 
 A residual is looked at over motor angle, load angle, direction, speed, acceleration, torque, temperature,
 time and what has passed since the last reversal: means over bins on every other stretch of time, and how much
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,10 +18,6 @@ from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import Coordinate
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.stretches import of_number
-
-if TYPE_CHECKING:
-    from hdbridge.diagnose.result import Diagnosis
-
 
 STRETCHES: Final = 64
 """Of time, every other one is held out in turn."""
@@ -60,18 +56,6 @@ class ResidualViews:
             name: (share(each, self.given_arcsec), share(each, self.left_arcsec))
             for name, each in self.coordinates.items()
         }
-
-
-def see(diagnosis: Diagnosis) -> ResidualViews:
-    """Look at a diagnosis's residuals."""
-    traces = diagnosis.traces
-    return ResidualViews(
-        traces.measured_arcsec - traces.model_arcsec,
-        traces.measured_arcsec - traces.extended_arcsec,
-        traces.direction,
-        traces.time_s,
-        coordinates(traces.motion, traces.rows, diagnosis.model.ratio),
-    )
 
 
 def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:

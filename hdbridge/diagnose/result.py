@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from hdbridge.diagnose.acceptance import Gate
-from hdbridge.diagnose.residual_views import see
+from hdbridge.diagnose.residual_views import ResidualViews, coordinates
 from hdbridge.effects import Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.gain import Gain
@@ -228,9 +228,20 @@ class Diagnosis:
             "scales": self.scales.described(),
             "seen_over": {
                 name: {"share_of_baseline": round(before, 4), "share_of_extended": round(after, 4)}
-                for name, (before, after) in see(self).shares().items()
+                for name, (before, after) in self.views().shares().items()
             },
         }
+
+    def views(self) -> ResidualViews:
+        """Its residuals, and what they can be looked at over."""
+        traces = self.traces
+        return ResidualViews(
+            traces.measured_arcsec - traces.model_arcsec,
+            traces.measured_arcsec - traces.extended_arcsec,
+            traces.direction,
+            traces.time_s,
+            coordinates(traces.motion, traces.rows, self.model.ratio),
+        )
 
     def verdict(self) -> str:
         """One sentence."""

@@ -16,7 +16,6 @@ import numpy as np
 from hdbridge.diagnose.lookalikes import lookalikes
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, aliases_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.screening import proposed
 
 
@@ -39,8 +38,8 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
         theirs = [at for at, each in enumerate(effects) if each.name == other.name]
         if known & set(theirs):
             continue  # its calibration distinguishes the two
-        own = [i for i, each in enumerate(fitted.parameters) if each.effect not in theirs]
-        fit = Linearised(fitted.tangent[:, own], fitted.residual, fitted.linearised.known[own])
+        own = np.array([i for i, each in enumerate(fitted.parameters) if each.effect not in theirs])
+        fit = fitted.linearised.of(own)
         shift = fit.taken_over(columns)
         left = columns - fit.columns @ shift
         claimed = noise * np.sum(columns**2, axis=0)

@@ -43,6 +43,15 @@ class Linearised:
         """s, shape (r,): of a column's moment c'r the fit leaves c'r - (B'c)'s; none at its minimum."""
         return np.asarray(self.directions.T @ (self.columns.T @ self.residual + self.known[:, 1]))
 
+    def of(self, places: IntArray) -> Linearised:
+        """With some of its columns only."""
+        return Linearised(self.columns[:, places], self.residual, self.known[places])
+
+    def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the fit leaves of the Gram matrix (k, k) and of the moment (k,) of other columns (m, k)."""
+        shadow = self.basis.T @ columns
+        return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
+
     def taken_over(self, columns: FloatArray) -> FloatArray:
         """Coefficients with which the fit would take over other columns (m, k), shape (p, k)."""
         return np.asarray(self.directions @ (self.basis.T @ columns))

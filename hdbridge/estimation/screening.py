@@ -78,26 +78,23 @@ class Screen:
         shadow = fit.basis.T @ matrix
         moment = matrix.T @ fit.residual - shadow.T @ fit.slack
         return [
-            _score(candidate, gram, shadow[:, part], moment[part])
+            _score(candidate, np.diag(gram), gram - shadow[:, part].T @ shadow[:, part], moment[part])
             for candidate, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
         ]
 
 
 def score_of(candidate: Candidate, columns: FloatArray, fitted: Fitted) -> Score:
     """The score of one candidate from its weighted columns."""
-    fit = fitted.linearised
-    shadow = fit.basis.T @ columns
-    moment = columns.T @ fit.residual - shadow.T @ fit.slack
-    return _score(candidate, columns.T @ columns, shadow, moment)
+    return _score(candidate, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
 
 
-def _score(candidate: Candidate, gram: FloatArray, shadow: FloatArray, moment: FloatArray) -> Score:
-    size = np.diag(gram)
+def _score(candidate: Candidate, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
+    """From the squares of its columns, and what a hypothesis leaves of their Gram matrix and moment."""
     seen = size > 0.0
     if not np.any(seen):
         return Score(candidate, 0.0, 0, 0.0)
     scale = np.sqrt(size[seen])
-    left = (gram - shadow.T @ shadow)[np.ix_(seen, seen)] / np.outer(scale, scale)
+    left = gram[np.ix_(seen, seen)] / np.outer(scale, scale)
     share = float(np.max(np.diag(left)))
     values, vectors = np.linalg.eigh(left)
     kept = values > SHARE_LEFT

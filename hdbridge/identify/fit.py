@@ -31,7 +31,7 @@ from hdbridge.identify.figures import outlying
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import System
 from hdbridge.identify.result import FitResult
-from hdbridge.identify.shapes import LINEAR_ONLY, searched
+from hdbridge.identify.shape_search import LINEAR_ONLY, searched
 from hdbridge.identify.state import State, candidate_orders, turns_covered
 from hdbridge.identify.usable import usable_samples
 from hdbridge.units import ARCSEC_PER_DEG

@@ -17,7 +17,7 @@ from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting, unkno
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, select
 from hdbridge.identify.result import Outliers
-from hdbridge.identify.shapes import LINEAR_ONLY
+from hdbridge.identify.shape_search import LINEAR_ONLY
 from hdbridge.units import DEG_PER_TURN
 
 PARTS = ("cosine", "sine")

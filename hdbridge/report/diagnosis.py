@@ -9,7 +9,7 @@ from hdbridge import __version__
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
 from hdbridge.diagnose import Diagnosis, Finding
-from hdbridge.diagnose.residual_views import ResidualViews, see
+from hdbridge.diagnose.residual_views import ResidualViews
 from hdbridge.effects import CATALOGUE
 from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
 from hdbridge.report.partial_residuals import partial_residual
@@ -43,7 +43,7 @@ def diagnosis_page(
     ``offer`` is what became of the extended model, where it was proposed for commit.
     ``command`` is the diagnosis as it was asked for.
     """
-    seen = see(diagnosis)
+    seen = diagnosis.views()
     verdict = _verdict(diagnosis, stepping)
     given = provenance.items() if isinstance(provenance, Mapping) else provenance
     sections = [_to_do(diagnosis)]
