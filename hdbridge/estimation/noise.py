@@ -186,7 +186,7 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
         np.clip(x, lower, upper),
         method="L-BFGS-B",
         bounds=list(zip(lower, upper, strict=True)),
-        options={"eps": DIFFERENCE, "ftol": 1e-8},
+        options={"eps": DIFFERENCE, "ftol": 1e-7},
     )
     best = model(found.x)
     share = 1.0 / np.sqrt(max(1.0 - parameters / max(len(blocks), 1), 0.1))
