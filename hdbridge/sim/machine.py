@@ -151,7 +151,9 @@ class Machine:
         seen, told.temperature_c[:] = self._loops.follow_all(
             start_deg, speed_deg_s, steps, self._heat, self._limit_nm, outer_nm
         )
-        noise = np.array([self._noise.gauss(0.0, self._noise_deg) if self._noise_deg else 0.0 for _ in steps])
+        noise = np.zeros(len(steps))
+        if self._noise_deg:
+            noise = np.array([self._noise.gauss(0.0, self._noise_deg) for _ in steps])
         self._see(tuple(seen[-1].tolist()))
         self._noise_now_deg = float(noise[-1])
         _, motor_deg, _, load_deg, body_deg, _, _, weight_nm, torque_nm, _, _ = seen.T

@@ -23,12 +23,13 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
-from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, scaled, softened, solve
-from hdbridge.twin.misfit import CHANNELS, coarse, noise_floor, prepare
+from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, solve, told
+from hdbridge.twin.misfit import CHANNELS, coarse, prepare
 from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import FALSE_ALARM
+from hdbridge.twin.scales import Scales, noise_floor
 
 MOST_CAUSES = 4
 """Changes that are looked for at most."""
@@ -162,7 +163,7 @@ class _Search:
     def at(self, causes: tuple[str, ...], truth: Truth) -> _Place:
         """What the recording says at a truth, to which these causes have led."""
         twin = np.array(coordinates(self._twin, self._every))
-        here = solve(self._replays, truth, self._every, twin, 0, known=self._scale, everything=True)
+        here = solve(self._replays, truth, self._every, twin, 0, known=Scales(self._scale), everything=True)
         rng = np.random.default_rng(0)
         low, high = np.array([each.bounds for each in self._every]).T
         places = [
@@ -172,7 +173,7 @@ class _Search:
         drawn = self._replays.drawn([at_coordinates(truth, self._every, each.tolist()) for each in places])
         left = np.stack(
             [
-                softened(scaled(shown, self._scale)[self._rows]) - here.jacobian @ (each - here.place)
+                told(shown, Scales(self._scale), self._rows) - here.jacobian @ (each - here.place)
                 for each, shown in zip(places, drawn, strict=True)
             ]
         )
@@ -255,7 +256,7 @@ class _Search:
         return [(cause, nearest[cause][1]) for cause in ranked[:CONTENDERS]]
 
     def _cost(self, found: dict[str, FloatArray], scale: dict[str, Any]) -> float:
-        left = softened(scaled(found, scale)[self._rows])
+        left = told(found, Scales(scale), self._rows)
         return 0.5 * float(left @ left)
 
     def _scale_at(self, near: _Place) -> dict[str, Any]:
@@ -268,7 +269,7 @@ class _Search:
     def _fit(self, causes: tuple[str, ...], start: Truth, near: _Place) -> tuple[tuple[str, ...], Fitted]:
         parameters = tuple(each for each in self._every if each.cause in causes)
         prior = np.array(coordinates(self._twin, parameters))
-        known = self._scale_at(near)
+        known = Scales(self._scale_at(near))
         return causes, solve(self._replays, start, parameters, prior, STEPS, known=known, everything=True)
 
     def _moved(self, cause: str, at: _Place, *more: str) -> _Moved:

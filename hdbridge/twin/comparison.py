@@ -18,6 +18,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
+from hdbridge.twin.settling import band_arcsec, overshoot_arcsec, scatter_s, settling_s
 from hdbridge.units import ARCSEC_PER_DEG
 
 Rows = NDArray[np.bool_]
@@ -36,10 +37,6 @@ TITLES: Final[Mapping[str, str]] = {
     NOISE_AT_REST: "noise at rest", NOISE_IN_MOTION: "noise in motion",
 }  # fmt: skip
 
-SETTLED_ARCSEC: Final = 10.0
-"""A load within this of where it comes to rest has settled: three motor counts of 8000 at a ratio of 50."""
-SETTLED_NOISE: Final = 5.0
-"""... or within so many times the noise of the load's reading, where that is more."""
 STAND_S: Final = 0.2
 """The command stands so long after a motion for the stop to count."""
 SIGHT_S: Final = 1.0
@@ -297,6 +294,8 @@ class _Stop:
     settled_s: tuple[float, float]
     overshoot_arcsec: tuple[float, float]
     noise_arcsec: float
+    scatter_s: float
+    """By how much the two settling times are apart by noise alone."""
 
 
 def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_Stop]:
@@ -316,19 +315,14 @@ def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_
             way = float(np.sign(real.command_deg[stop] - real.command_deg[began]))
             rest = np.zeros(len(real.time_s), dtype=np.bool_)
             rest[stop + (end - stop) // 2 : end] = True
-            noise = noise_of(real.load_arcsec, rest, [part])
-            band = max(SETTLED_ARCSEC, SETTLED_NOISE * noise)
-            seen = [_settling(each, stop, end, way, band) for each in (real, twin)]
-            yield _Stop(stop - 1, (seen[0][0], seen[1][0]), (seen[0][1], seen[1][1]), noise)
-
-
-def _settling(of: _Signals, stop: int, end: int, way: float, band: float) -> tuple[float, float]:
-    """Time from the command's rest until the load stays within the band, and how far it went beyond."""
-    load = of.load_arcsec[stop:end]
-    off = load - np.mean(load[-max(LEAST_SAMPLES // 2, len(load) // 4) :])
-    outside = np.flatnonzero(np.abs(off) > band)
-    last = min(int(outside[-1]) + 1, len(load) - 1) if len(outside) else 0
-    return float(of.time_s[stop + last] - of.time_s[stop]), max(0.0, float(np.max(way * off)))
+            noises = [noise_of(each.load_arcsec, rest, [part]) for each in (real, twin)]
+            loads = [each.load_arcsec[stop:end] for each in (real, twin)]
+            times = real.time_s[stop:end]
+            band = band_arcsec(noises[0])
+            settled = [settling_s(times, *each, band) for each in zip(loads, noises, strict=True)]
+            scatter = scatter_s(times, loads[1], noises[1], band, noises)
+            beyond = [overshoot_arcsec(each, way) for each in loads]
+            yield _Stop(stop - 1, (settled[0], settled[1]), (beyond[0], beyond[1]), noises[0], scatter)
 
 
 def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator[Row]:
@@ -336,8 +330,9 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
         return
     sample_s = float(np.median(np.diff(time_s)))
     noise = _rms(np.array([each.noise_arcsec for each in stops]))
+    scatter = _rms(np.array([each.scatter_s for each in stops]))
     for channel, pairs, own in (
-        (SETTLING_TIME, [each.settled_s for each in stops], sample_s),
+        (SETTLING_TIME, [each.settled_s for each in stops], max(sample_s, scatter)),
         (OVERSHOOT, [each.overshoot_arcsec for each in stops], noise),
     ):
         values = np.array(pairs)

@@ -11,21 +11,22 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.bootstrap import unbiased
-from hdbridge.twin.least_squares import WORTH, Fitted, Progress, solve
-from hdbridge.twin.misfit import coarse, prepare, scales
+from hdbridge.twin.least_squares import Fitted, Progress, solve
+from hdbridge.twin.misfit import CHANNELS, coarse, prepare
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
     BY_NAME,
     LOAD,
     PARAMETERS,
     Parameter,
+    at_coordinates,
     coordinates,
     value_in,
     with_values,
 )
 from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.scales import Loops, scales
 
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where the resonance of the load is looked for: a fit finds only the nearest of its minima."""
@@ -53,9 +54,12 @@ NEAR_STEPS = 12
 """Steps at most over all of the recording, by the noise that is expected;"""
 STEPS = 30
 """... and to the end."""
-AGAIN = 3
-"""So often at most a fit goes on from where its bias has been taken off: where that is nearer to the record
-by smooth replays as well, the fit has ended at a lesser minimum."""
+LOOPS = 6
+"""Replays with a drive's steps, and as many smooth ones, that show what these do."""
+ROUNDS = 3
+"""So often at most that is looked at anew, where the fit has gone;"""
+SAME = 0.3
+"""... that is, by more than so many standard deviations."""
 OPTIONAL = (*LAST, "load friction", "temperature", "current limit", "motor encoder delay")
 """Not fitted unless asked for: the ordinary motion does not show them, or others can take their place."""
 
@@ -94,7 +98,8 @@ def fit(
         first = _best_of(replays, _starts(begun), parameters, prior)
     progress(0.3)
     with Replays(data, workers) as replays:
-        most = scales(data, *replays([start]))
+        (before,) = replays([start])
+        most = scales(data, before)
         # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel that
         # tells it from the right one.
         near = solve(
@@ -114,15 +119,34 @@ def fit(
             off = abs(float(tried.place[-1] - around[-1])) / math.sqrt(float(tried.covariance[-1, -1]))
             if best.cost - tried.cost > EARNED * best.inflation and off > SURE:
                 best = tried
-        told = unbiased(replays, best)
         around = np.array(coordinates(begun, best.parameters))
-        for _ in range(AGAIN):
-            if told.cost > best.cost - WORTH:
+        for _ in range(ROUNDS):
+            last, loops = best, loops_about(replays, best)
+            best = solve(
+                replays, best.truth, best.parameters, around, STEPS, most=most, near=best, loops=loops
+            )
+            if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
                 break
-            again = solve(replays, told.truth, best.parameters, around, STEPS, most=most, near=best)
-            best, told = again, unbiased(replays, again)
     progress(1.0)
-    return told
+    return best
+
+
+def loops_about(replays: Replays, fitted: Fitted) -> Loops:
+    """What a drive's loops do otherwise than smooth ones about a fit, within its covariance."""
+    rng = np.random.default_rng(0)
+    low, high = np.array([each.bounds for each in fitted.parameters]).T
+    root = np.linalg.cholesky(fitted.covariance)
+    places = fitted.place + rng.standard_normal((LOOPS, len(root))) @ root.T
+    truths = [
+        at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
+    ]
+    shown = replays([*truths, *truths], [None] * LOOPS + ["loops"] * LOOPS)
+    pairs = list(zip(shown[:LOOPS], shown[LOOPS:], strict=True))
+    apart = {name: np.stack([other[name] - one[name] for one, other in pairs]) for name in CHANNELS}
+    return Loops(
+        {name: np.mean(each, axis=0) for name, each in apart.items()},
+        {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
+    )
 
 
 def _starts(truth: Truth) -> list[Truth]:

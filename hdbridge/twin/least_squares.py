@@ -10,7 +10,7 @@ sandwich of the Jacobian and the legs' own gradients), because what a replay can
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,11 @@ from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.stretches import counted as numbered
 from hdbridge.estimation.stretches import sums
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import CHANNELS, Data, counted, scales
+from hdbridge.twin.likelihood import rooted
+from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.scales import Loops, Scales, scales
 
 STEP = 0.01
 """Step of the first Jacobian's differences, in a parameter's spread."""
@@ -34,18 +36,19 @@ FARTHEST = 0.1
 """The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
 DAMPINGS = (0.0, 0.001, 0.01, 0.1)
 """Shares of the information's diagonal that are added to it (Marquardt)."""
-ALONG = (1.0, 0.4, 0.15)
-"""How far along each of these steps to go."""
+ALONG = ((1.0,), (0.4, 0.15))
+"""How far along each of these steps to go; less far only where that brings nothing."""
 PROBED = 0.1
 """How far along each of them its second derivative is taken."""
 SETTLED = 2
 """So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
 WORTH = 1.0
 """A drop of half the squares by less is no evidence of anything."""
-RESCALED = 3
-"""After so many steps the scales are made anew: what a start leaves is no measure of the noise."""
 SOFT = 4.0
 """Residuals beyond so many scales count less: a replay that slips elsewhere is no measure of a parameter."""
+
+LEAST = 1e-9
+"""Of the information of all legs, a share that none of them has alone."""
 
 Progress = Callable[[float], None]
 
@@ -60,8 +63,8 @@ class Fitted:
     """Coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
     """Of the coordinates, shape (p, p)."""
-    scales: dict[str, float]
-    """Scale of each channel's residuals."""
+    scales: Scales
+    """Of the residuals."""
     residuals: dict[str, FloatArray]
     vector: FloatArray
     """The scaled residuals of the fitted rows, softened."""
@@ -96,17 +99,18 @@ def solve(
     prior: FloatArray,
     steps: int,
     progress: Progress = lambda _: None,
-    known: dict[str, float] | None = None,
+    known: Scales | None = None,
     everything: bool = False,
-    most: dict[str, float] | None = None,
+    most: Scales | None = None,
     near: Fitted | None = None,
+    loops: Loops | None = None,
 ) -> Fitted:
     """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
 
     ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
-    what every third step leaves, ``most`` at most: a channel that has become worse does not count for less.
+    what each step leaves, ``most`` at most: a channel that has become worse does not count for less.
     Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
-    directions the first differences are made along.
+    directions the first differences are made along, ``loops`` what a drive's loops do otherwise.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -118,46 +122,53 @@ def solve(
         return replays([at_coordinates(start, parameters, each.tolist()) for each in places])
 
     (found,) = led([place])
-    scale = known if known is not None else _capped(scales(data, found), most)
-
-    def vector(found: dict[str, FloatArray]) -> FloatArray:
-        return scaled(found, scale)[rows]
+    scale = known if known is not None else _capped(scales(data, found, loops), most)
 
     def cost(place: FloatArray, found: dict[str, FloatArray]) -> float:
-        """Half the squares of the softened residuals and the prior's."""
-        left, off = softened(vector(found)), (place - prior) / spread
+        """Half the squares of the residuals as they count, and the prior's."""
+        left, off = told(found, scale, rows), (place - prior) / spread
         return 0.5 * float(left @ left + off @ off)
 
     moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
     idle = done = 0
     while True:
-        now = vector(found)
+        now = scale.scaled(found)[rows]
         ends = _ends(place, moves, low, high)
-        changes = np.stack([vector(each) for each in led(ends)]) - now
+        changes = np.stack([scale.scaled(each)[rows] for each in led(ends)]) - now
         slopes: FloatArray = (np.linalg.pinv(np.stack(ends) - place) @ changes).T
-        slopes, left = slopes * _softening(now)[:, None], softened(now)
+        left, weights = counting(now, scale, rows)
+        slopes *= weights[:, None]
         if done == steps or idle == SETTLED:
             break
         moves = _moves(slopes, spread)
         damped = _damped_steps(slopes, left, place, prior, spread, (low, high))
         probes = led([np.clip(place + PROBED * each.step, low, high) for each in damped])
-        tried = []
+        paths = []
         for each, probe in zip(damped, probes, strict=True):
-            bent = (softened(vector(probe)) - left) / PROBED - slopes @ each.step
-            turn = each.turn(slopes.T @ bent / PROBED)
-            tried += [np.clip(place + far * each.step + far**2 * turn, low, high) for far in ALONG]
-        reached = led(tried)
-        before, after = cost(place, found), [cost(*each) for each in zip(tried, reached, strict=True)]
-        best = int(np.argmin(after))
-        if after[best] < before:
-            place, found = tried[best], reached[best]
-        idle = idle + 1 if before - after[best] < WORTH else 0
+            bent = (told(probe, scale, rows) - left) / PROBED - slopes @ each.step
+            paths.append((each.step, each.turn(slopes.T @ bent / PROBED)))
+        before = after = cost(place, found)
+        for shares in ALONG:
+            tried = [
+                np.clip(place + far * step + far**2 * turn, low, high)
+                for step, turn in paths
+                for far in shares
+            ]
+            reached = led(tried)
+            costs = [cost(*each) for each in zip(tried, reached, strict=True)]
+            best = int(np.argmin(costs))
+            if costs[best] < after:
+                place, found, after = tried[best], reached[best], costs[best]
+            if before - after >= WORTH:
+                break
+        idle = idle + 1 if before - after < WORTH else 0
         done += 1
-        if known is None and done % RESCALED == 0:
-            scale = _capped(scales(data, found), most)
+        if known is None:
+            scale = _capped(scales(data, found, loops), most)
         progress(done / steps)
     truth = at_coordinates(start, parameters, place.tolist())
     covariance = sandwich(slopes, left, legs_of_rows(data, rows), spread)
+    scale = replace(scale, loops=None)
     return Fitted(truth, parameters, place, covariance, scale, found, left, slopes, 0.5 * float(left @ left))
 
 
@@ -172,13 +183,22 @@ def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
     return np.concatenate([data.leg] * len(CHANNELS))[rows]
 
 
-def scaled(found: dict[str, FloatArray], scale: dict[str, float]) -> FloatArray:
-    """The residuals of all channels, one after the other, in units of their scales."""
-    return np.concatenate([found[name] / scale[name] for name in CHANNELS])
+def told(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
+    """The residuals of some rows as they count: by likelihood, softened."""
+    return counting(scale.scaled(found)[rows], scale, rows)[0]
 
 
-def _capped(found: dict[str, float], most: dict[str, float] | None) -> dict[str, float]:
-    return found if most is None else {name: min(scale, most[name]) for name, scale in found.items()}
+def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Scaled residuals of some rows as they count, and the derivative of that."""
+    half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
+    root, slope = rooted(off, half, stray)
+    return softened(root), slope * _softening(root)
+
+
+def _capped(found: Scales, most: Scales | None) -> Scales:
+    if most is None:
+        return found
+    return replace(found, deviation={n: min(s, most.deviation[n]) for n, s in found.deviation.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,14 +305,25 @@ def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
 def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
     """Covariance of the coordinates where residuals of one leg go together and legs are independent.
 
+    By how far each leg alone has drawn the fit: without it, that would have ended elsewhere (jackknife by
+    legs; Bell and McCaffrey, Survey Methodology 28, 2002). One leg that a replay cannot follow draws a fit
+    by all that the others leave open, and has little left itself.
+
     By principal directions: of a few legs no more can be said. None is better known than independent
     residuals of the present size would have it, nor worse than before the fit. What the slopes would still
     take of the residuals is no scatter of the legs.
     """
     along = principal(slopes, spread)
-    noise = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-    by_leg = over_legs((slopes @ along) * noise[:, None], legs)
+    rows = slopes @ along
+    left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    numbers = numbered(legs.astype(np.intp))
+    order = np.argsort(numbers, kind="stable")
+    drawn = []
+    for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
+        others = (1.0 + LEAST) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
+        drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
+    squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
     before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
-    white = max(1.0, float(noise @ noise) / max(len(left) - len(spread), 1))
-    times = np.minimum(np.maximum(np.sum(np.square(by_leg), axis=0), white), before)
+    white = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
+    times = np.minimum(np.maximum(squares, white), before)
     return np.asarray(along * times @ along.T, dtype=np.float64)

@@ -59,7 +59,7 @@ def with_knowledge(fitted: Fitted) -> Truth:
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],
         "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
-        "noise": {name: float(f"{fitted.scales[name]:.6g}") for name in CHANNELS},
+        "noise": {name: float(f"{fitted.scales.noise[name]:.6g}") for name in CHANNELS},
     }
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(

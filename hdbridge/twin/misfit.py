@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ COARSE_S = 15.0
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
 """Kinds of leg that are no reason to take a piece."""
 HELD_OUT = 4
-MAD_TO_SIGMA = 1.4826
+Seed = int | Literal["loops"] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,17 +157,18 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
 
 
-def traces_of(data: Data, truth: Truth, seed: int | None = None) -> list[dict[str, FloatArray]]:
+def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, FloatArray]]:
     """What a replay shows, by piece and channel, as `Piece.measured` has it.
 
-    A smooth one, or with a seed one that is rounded and noisy as a recording is.
+    A smooth one; with a seed one that is rounded and noisy as a recording is; or one that is smooth but for
+    the steps of its loops.
     """
-    simulated = smooth(truth) if seed is None else truth
+    simulated = smooth(truth) if seed is None else silent(truth) if seed == "loops" else truth
     shown = []
     for number, piece in enumerate(data.pieces):
         commands = piece.commands
-        draw = 0 if seed is None else len(data.pieces) * seed + number
-        traces = run(commands, data.axis, simulated, draw, smooth=seed is None)
+        draw = len(data.pieces) * seed + number if isinstance(seed, int) else 0
+        traces = run(commands, data.axis, simulated, draw, smooth=not isinstance(seed, int))
         wanted = demand_deg(commands, data.axis)
         shown.append(
             {
@@ -178,23 +180,31 @@ def traces_of(data: Data, truth: Truth, seed: int | None = None) -> list[dict[st
     return shown
 
 
-def residuals(data: Data, truth: Truth, seed: int | None = None) -> dict[str, FloatArray]:
+def residuals(data: Data, truth: Truth, seed: Seed = None) -> dict[str, FloatArray]:
     """Measured minus simulated, by channel, over all rows; zero where a row does not count.
 
     What zeros are apart is taken off in each piece: the load's angle has none in common with the motor's, and
-    a command that is off by as much wherever the axis rests is told by another zero. Of the load's angle what
-    it does not share with the motor counts: a motor that is late takes the load along. With a ``seed``
-    the simulated recording is rounded and noisy.
+    a command that is off by as much wherever the axis rests, by more than a count, is told by another zero.
+    Of the load's angle what it does not share with the motor counts: a motor that is late takes the load
+    along. ``seed`` as in `traces_of`.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
+    step_deg = rounding(data.axis)[FOLLOWING]
     for piece, shown in zip(data.pieces, traces_of(data, truth, seed), strict=True):
         for name in CHANNELS:
             off = piece.measured[name] - shown[name]
             if name == FOLLOWING and piece.rest.any():
-                off = off - np.median(off[piece.rest > 0.0])
+                rest = piece.rest > 0.0
+                if abs(np.median(piece.measured[name][rest])) > step_deg:
+                    off = off - np.median(off[rest])
             found[name].append(off * piece.counts[name])
     found[LOAD] = _not_taken_along(data, found[FOLLOWING], found[LOAD])
     return {name: np.concatenate(each) for name, each in found.items()}
+
+
+def beyond(values: FloatArray, least: float) -> FloatArray:
+    """What values have beyond one that says nothing, each in its own sense."""
+    return np.asarray(np.sign(values) * np.maximum(np.abs(values) - least, 0.0), dtype=np.float64)
 
 
 def _not_taken_along(
@@ -203,10 +213,11 @@ def _not_taken_along(
     """The load's residuals by piece, without what the motor's have brought about, and without their zeros.
 
     How large their share is the residuals themselves show: one where the loops are not as the axis's are and
-    both shafts are late, about zero where the motor's residuals are its encoder's rounding.
+    both shafts are late. The motor encoder's rounding is not in it.
     """
     inside = [piece.counts[LOAD] > 0.0 for piece in data.pieces]
-    ahead = [-each * ARCSEC_PER_DEG / data.axis.gear.ratio for each in following]
+    rounded_deg = 0.5 * rounding(data.axis)[FOLLOWING]
+    ahead = [-beyond(each, rounded_deg) * ARCSEC_PER_DEG / data.axis.gear.ratio for each in following]
     motor, shaft = (
         np.concatenate([each[i] - np.mean(each[i]) for each, i in zip(whole, inside, strict=True) if i.any()])
         if any(i.any() for i in inside)
@@ -227,40 +238,18 @@ def counted(data: Data) -> dict[str, FloatArray]:
     return {name: np.concatenate([each.counts[name] for each in data.pieces]) for name in CHANNELS}
 
 
-def noise_floor(data: Data) -> dict[str, float]:
-    """Least scale of each channel: its rounding, and what its encoder's rounding makes of the torque."""
-    axis, truth = data.axis, data.base
-    step_deg = 360.0 / axis.motor_encoder.counts_per_turn
-    rated_nm = axis.drive.rated_torque_nm
-    encoder = truth.motor.encoder
-    fine_rad = 2.0 * np.pi / (encoder.counts_per_turn * encoder.interpolation)
-    shaken = truth.servo.velocity_gain_nm_s_per_rad * fine_rad / truth.substep_s
-    load = truth.load_.encoder
+def rounding(axis: AxisConfig) -> dict[str, float]:
+    """By channel, in its unit, the step that a recording is rounded to."""
     return {
-        FOLLOWING: step_deg / 12.0**0.5,
-        TORQUE: float(np.hypot(1e-3 * rated_nm, shaken)) / 12.0**0.5,
-        LOAD: float(np.hypot(axis.load_encoder.resolution_arcsec / 12.0**0.5, load.noise_arcsec)),
+        FOLLOWING: 360.0 / axis.motor_encoder.counts_per_turn,
+        TORQUE: 1e-3 * axis.drive.rated_torque_nm,
+        LOAD: axis.load_encoder.resolution_arcsec,
     }
-
-
-def scales(data: Data, found: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Scale of each channel from its residuals in motion, robustly; no less than its noise.
-
-    Not from those at rest: where a recording rests half of the time, they would be the scale.
-    """
-    floor, counts = noise_floor(data), counted(data)
-    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
-    given = {}
-    for name in CHANNELS:
-        inside = found[name][moving & (counts[name] > 0.0)]
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(inside))) if len(inside) else 0.0
-        given[name] = max(floor[name], spread)
-    return given
 
 
 def smooth(truth: Truth) -> Truth:
     """The truth with loops that close on a much finer encoder, and no noise."""
-    motor, load, servo = truth.motor.encoder, truth.load_.encoder, truth.servo
+    motor, servo = truth.motor.encoder, truth.servo
     steps = max(FINEST_STEPS_PER_TURN // motor.counts_per_turn, motor.interpolation)
     finer = steps / motor.interpolation
     # Not as a truth file may have it: its bands are in steps of the loops' encoder.
@@ -271,14 +260,15 @@ def smooth(truth: Truth) -> Truth:
         }
     )
     encoder = motor.model_copy(update={"interpolation": steps})
-    silent = load.model_copy(update={"noise_arcsec": 0.0})
-    return truth.model_copy(
-        update={
-            "motor": truth.motor.model_copy(update={"encoder": encoder}),
-            "load_": truth.load_.model_copy(update={"encoder": silent}),
-            "servo": loops,
-        }
+    return silent(truth).model_copy(
+        update={"motor": truth.motor.model_copy(update={"encoder": encoder}), "servo": loops}
     )
+
+
+def silent(truth: Truth) -> Truth:
+    """The truth without noise."""
+    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
+    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
 
 def _piece(

@@ -8,8 +8,9 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import CHANNELS, MAD_TO_SIGMA, Data, noise_floor
+from hdbridge.twin.misfit import CHANNELS, Data
 from hdbridge.twin.parameters import LOAD
+from hdbridge.twin.scales import MAD_TO_SIGMA, Scales, noise_floor
 from hdbridge.units import ARCSEC_PER_DEG
 
 ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
@@ -41,13 +42,13 @@ def noise_in_motion(data: Data) -> dict[str, float]:
     return found
 
 
-def expected(data: Data) -> dict[str, float]:
+def expected(data: Data) -> Scales:
     """By channel, in its unit: what a replay of the true axis would leave.
 
     Of following error and torque that is their rounding: what third differences leave of a torque is mostly
     motion. What the load encoder has beyond its rounding only the recording tells.
     """
-    return noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]}
+    return Scales(noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]})
 
 
 def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
@@ -49,7 +50,7 @@ UNEVEN = 0.25
 class Commands:
     """What one part of a recording told the drive, cycle by cycle, with the approach before it."""
 
-    counts: tuple[int, ...]
+    counts: tuple[float, ...]
     """Demand of the motor in counts at the end of each cycle; begins where the drive is switched on."""
     lead: int
     """How many of them are the approach."""
@@ -140,16 +141,10 @@ def run(
         truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
     machine = Machine(truth, seed, may_compile=True, loaded=commands.told_nm is not None)
     machine.torque_limit_permille = 10.0 * axis.limits.torque_percent  # as the master tells the drive
-    dt_s, cycle_s, owed_s = machine.dt_s, commands.cycle_s, 0.0
     permille_nm = axis.motor_encoder.direction * axis.drive.rated_torque_nm / 1000.0
     sense = float(axis.motor_encoder.direction)
-    substeps = []
-    for _ in commands.counts:
-        owed_s += cycle_s
-        substeps.append(int(owed_s / dt_s + 1e-6))
-        owed_s -= substeps[-1] * dt_s
-    demand = [float(counts) for counts in (commands.counts[0], *commands.counts)]
-    told = _told(machine, demand, substeps, commands, outer_nm)
+    substeps = _substeps(len(commands.counts), commands.cycle_s, machine.dt_s)
+    told = _told(machine, [commands.counts[0], *commands.counts], substeps, commands, outer_nm)
     motor, load = told.motor_reading, told.load_reading
     if not smooth:
         motor, load = np.floor(motor + 0.5), np.floor(load + 0.5)
@@ -160,6 +155,17 @@ def run(
     load = axis.load_encoder.direction * load * 360.0 / truth.load_.encoder.counts_per_turn
     place = commands.row_cycles
     return Traces(*(_between(each, place) for each in (motor, load, torque, warmth, outer)))
+
+
+@cache
+def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
+    """How many substeps each cycle has: what one is short of, the next one makes up for."""
+    found, owed_s = [], 0.0
+    for _ in range(cycles):
+        owed_s += cycle_s
+        found.append(int(owed_s / dt_s + 1e-6))
+        owed_s -= found[-1] * dt_s
+    return tuple(found)
 
 
 def _benched(bench: Bench, commands: Commands, axis: AxisConfig) -> list[Record]:
@@ -182,7 +188,7 @@ def _benched(bench: Bench, commands: Commands, axis: AxisConfig) -> list[Record]
 def _told(
     machine: Machine,
     demand: list[float],
-    substeps: list[int],
+    substeps: Sequence[int],
     commands: Commands,
     outer_nm: FloatArray,
 ) -> Cycles:
@@ -243,7 +249,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         # The motion goes on to the end of its cycle: the last row lies within that.
         speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
         demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
-    recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).astype(np.int64).tolist()
+    recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
     approach = _approach(truth, axis, demand_deg, cycle_s)
     told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
     if told_nm is not None:
@@ -258,7 +264,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     if target[0] == target[1] and just_on(part, 0):
         off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
     off = [each for each in off if each.stop > each.start]
-    return Commands((*approach, *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off))
+    return Commands((*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off))
 
 
 def _weightless(truth: Truth) -> Truth:
@@ -350,7 +356,7 @@ def _between(column: FloatArray, cycles: FloatArray) -> FloatArray:
     return np.interp(cycles, np.arange(len(column)), column)
 
 
-def _degrees(counts: Sequence[int], axis: AxisConfig) -> FloatArray:
+def _degrees(counts: Sequence[float], axis: AxisConfig) -> FloatArray:
     encoder = axis.motor_encoder
     return encoder.direction * np.asarray(counts, dtype=np.float64) * 360.0 / encoder.counts_per_turn
 

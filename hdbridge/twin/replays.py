@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import Data, residuals
+from hdbridge.twin.misfit import Data, Seed, residuals
 
 WORTH_S = 2.0
 """Replays that take the axis no longer than this are made here: a process costs as much as some of them."""
@@ -41,9 +41,9 @@ class Replays:
             self._pool.shutdown(cancel_futures=True)
 
     def __call__(
-        self, truths: Iterable[Truth], seeds: Iterable[int | None] = repeat(None)
+        self, truths: Iterable[Truth], seeds: Iterable[Seed] = repeat(None)
     ) -> list[dict[str, FloatArray]]:
-        """The residuals of each truth, in order, by smooth replays; by noisy ones where there are seeds."""
+        """The residuals of each truth, in order, by replays as `misfit.traces_of` has them."""
         if self._pool is None:
             return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
         return list(self._pool.map(_residuals, truths, seeds))
@@ -67,6 +67,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _residuals(truth: Truth, seed: int | None) -> dict[str, FloatArray]:
+def _residuals(truth: Truth, seed: Seed) -> dict[str, FloatArray]:
     assert _data is not None
     return residuals(_data, truth, seed)

@@ -22,9 +22,8 @@ from hdbridge.twin.least_squares import (
     information_of,
     legs_of_rows,
     over_legs,
-    scaled,
-    softened,
     solve,
+    told,
 )
 from hdbridge.twin.misfit import counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value, with_values
@@ -76,7 +75,7 @@ def without(
     kept = {each.name: free_value(fitted.truth if each in moved else start, each) for each in others}
     begun = [led, with_values(before, kept)]
     rows = fitted_rows(replays.data)
-    costs = [float(np.sum(np.square(softened(scaled(each, fitted.scales)[rows])))) for each in replays(begun)]
+    costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)
     prior, nearest = np.array(coordinates(start, others)), begun[int(np.argmin(costs))]
     return solve(replays, nearest, others, prior, STEPS, known=fitted.scales, near=near).truth
@@ -90,4 +89,4 @@ def held_out(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> 
     data = replays.data
     out = data.out if data.out.any() else np.ones(len(data.out))
     rows = np.concatenate([each * out > 0.0 for each in counted(data).values()])
-    return softened(scaled(found, fitted.scales)[rows]), legs_of_rows(data, rows)
+    return told(found, fitted.scales, rows), legs_of_rows(data, rows)

@@ -19,10 +19,11 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
-from hdbridge.twin.misfit import CHANNELS, counted, noise_floor, prepare, residuals
+from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.scales import noise_floor
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

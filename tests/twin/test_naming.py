@@ -14,6 +14,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
+from hdbridge.twin.scales import Scales
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 NAMES = ("Coulomb friction", "servo dead time", "command filter")
@@ -61,7 +62,7 @@ def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, 
     parameters = tuple(BY_NAME[name] for name in NAMES)
     prior = np.array(coordinates(TRUTH, parameters))
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
-    fitted = solve(replays, TRUTH, parameters, prior, 12, known=noise)
+    fitted = solve(replays, TRUTH, parameters, prior, 12, known=Scales(noise))
     found, sets = name_causes(replays, replays, TRUTH, fitted)
     return found, (*sets, *alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data))))
 

@@ -14,10 +14,11 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import CHANNELS, Data, noise_floor, prepare
+from hdbridge.twin.misfit import CHANNELS, Data, prepare
 from hdbridge.twin.naming import unexplained
 from hdbridge.twin.noise import noise_in_motion
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
+from hdbridge.twin.scales import noise_floor
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
