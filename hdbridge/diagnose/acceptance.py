@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.effects import BoolArray, FloatArray
+from hdbridge.effects import BoolArray, Effect, FloatArray
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.estimation.linear import side_by_side, solve_symmetric
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.stretches import of_length, sandwich
 
@@ -44,16 +44,19 @@ def robust_chi_square(
     nuisances: FloatArray | None = None,
     rows: BoolArray | slice = slice(None),
     only: int | None = None,
+    laws: FloatArray | None = None,
 ) -> float:
-    """Of one effect of a hypothesis: its coefficients against zero, by their sandwich over blocks of time.
+    """Of one effect of a hypothesis: its coefficients against zero, but for those that are incidental, by
+    their sandwich over blocks of time.
 
     Everything else is refitted, and the columns ``nuisances`` (weighted) are in addition to it; only ``rows``
-    count, where given, and of the coefficients the one with the number ``only``.
+    count, where given, and of the coefficients the one with the number ``only``. ``laws`` are weighted
+    columns by a standard deviation of which other laws may be wrong.
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
-    coefficients = fitted.hypothesis.effects[place].coefficients()
-    if only is not None:
-        own, coefficients = [own[only]], coefficients[[only]]
+    effect = fitted.hypothesis.effects[place]
+    asked = _evident(effect) if only is None else [only]
+    own, coefficients = [own[each] for each in asked], effect.coefficients()[asked]
     columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
     known = np.zeros((columns.shape[1], 2))
     known[: fitted.count()] = fitted.linearised.known
@@ -66,6 +69,9 @@ def robust_chi_square(
     # The noise itself is a floor: a residual may be quieter than it by luck.
     least = 0.25 * inverse[own] + inverse.T @ (np.maximum(known[:, :1], 0.0) * inverse)
     longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
+    if laws is not None:
+        shift = fit.taken_over(laws[rows])[own]
+        least = least + shift @ shift.T
     spreads = [sandwich(influence, of_length(time_s, min(each, longest_s))) + least for each in BLOCKS_S]
     return min(float(coefficients @ solve_symmetric(each, coefficients)) for each in spreads)
 
@@ -73,23 +79,42 @@ def robust_chi_square(
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
-    needed = estimator.scales.robust + estimator.scales.robust_more * (len(effect.coefficients()) - 1)
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(_evident(effect)) - 1)
     robust = robust_chi_square(estimator, fitted, place)
     if robust < needed:
         return Gate(robust, needed, "not seen in enough independent stretches")
+    laws = _other_laws(estimator, fitted, place)
+    if laws.shape[1]:
+        robust = min(robust, robust_chi_square(estimator, fitted, place, laws=laws))
+        if robust < needed:
+            return Gate(robust, needed, "may be what the law of another cause is wrong by")
     if effect.tracker().memory_deg > 0.0:
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
-        robust = min(robust, robust_chi_square(estimator, fitted, place, free))
+        robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
         if robust < needed:
             return Gate(robust, needed, "an elastic loop of another shape does as well")
     stretch = effect.shows(estimator.motion)
     if stretch is not None:
         rows = stretch.rows[estimator.index]
-        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows))
+        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows, laws=laws))
         if robust < needed:
             return Gate(robust, needed, stretch.otherwise)
     changes = _changes(estimator, fitted, place)
     return Gate(robust, needed, "not the same everywhere" if changes else "")
+
+
+def _evident(effect: Effect) -> list[int]:
+    """The numbers of the coefficients that are evidence of an effect."""
+    named = effect.named_coefficients()
+    return [column for each in named if each.name not in effect.incidental for column in each.columns]
+
+
+def _other_laws(estimator: Estimator, fitted: Fitted, place: int) -> FloatArray:
+    """What the laws of all effects but one may be wrong by, weighted columns (m, k)."""
+    hypothesis = fitted.hypothesis
+    others = hypothesis.without(place).effects
+    forms = [estimator.law_discrepancy(each, hypothesis.start) for each in others]
+    return side_by_side(forms, len(fitted.residual))
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:

@@ -14,7 +14,7 @@ from hdbridge.diagnose.result import Parameter
 from hdbridge.diagnose.systematic import systematic
 from hdbridge.effects import Effect, FloatArray, IntArray, Moves
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.intervals import NORMAL_95, intervals_of, joined, labelled
+from hdbridge.estimation.intervals import NORMAL_95, half_widths, joined, labelled, leaves
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.estimation.stretches import of_length, sandwich, sums
 from hdbridge.estimation.terms import Column
@@ -93,19 +93,22 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
         path = labelled(effect.parameters(), each.path)
         wave = len(each.columns) > 1
         names |= {joined(path, leaf): each.name + leaf for leaf in (WAVE if wave else ("",))}
-    logarithmic = {each.name for each in effect.shape if each.logarithmic}
+    shapes = {each.name: each for each in effect.shape}
+    values = dict(leaves(effect.parameters()))
     result: dict[str, Parameter] = {}
-    for found in intervals_of(effect, columns, spread):
-        name = names.get(found.parameter, found.parameter.rpartition(".")[2])
-        value, low, high = found.value, found.low, found.high
-        is_size = found.parameter in names and not name.endswith("phase_deg")
-        if name in logarithmic:
-            share = min(found.half_width / value, 20.0)
-            low, high = value * math.exp(-share), value * math.exp(share)
+    for path, half in half_widths(effect, columns, spread).items():
+        name, value = names.get(path, path.rpartition(".")[2]), values[path]
+        low, high = value - half, value + half
+        is_size = path in names and not name.endswith("phase_deg")
+        shape = shapes.get(name)
+        if shape is not None and shape.logarithmic:  # no further than it may be
+            factor = math.exp(min(half / value, math.log(shape.upper / shape.lower)))
+            low = min(value, max(value / factor, shape.lower))
+            high = max(value, min(value * factor, shape.upper))
         amplitude = result.get(name.replace("phase_deg", "amplitude_arcsec"))
         if amplitude is not None and amplitude.low <= 0.0:  # what may be nothing has any phase
             low, high = value - 180.0, value + 180.0
-        if found.half_width > 0.0 and name not in result:  # a shape that several parts share is told once
+        if half > 0.0 and name not in result:  # a shape that several parts share is told once
             result[name] = Parameter(value, unit_of(name), low, high, is_size)
     return result
 

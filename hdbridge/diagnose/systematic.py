@@ -52,11 +52,9 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
 
 def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
     """What systematic errors add to the covariance of all parameters, shape (p, p)."""
-    start, motion = fitted.hypothesis.start, estimator.data.full.motion
     added = np.zeros((fitted.count(), fitted.count()))
     for place, effect in enumerate(fitted.hypothesis.effects):
-        form = estimator.weighted(estimator.at_points(effect.law_discrepancy(motion, start)))
-        shift = fitted.linearised.taken_over(form)
+        shift = fitted.linearised.taken_over(estimator.law_discrepancy(effect, fitted.hypothesis.start))
         added += shift @ shift.T
         own = fitted.places(place)
         for each in confounded(estimator, fitted, place):

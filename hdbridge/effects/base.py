@@ -122,6 +122,8 @@ class Effect(BaseModel, ABC):
     """Its form, where no grid covers the places at which it may be: of its first shapes."""
     ordinary_arcsec: ClassVar[float] = 0.0
     """Peak that any healthy axis has of it, or of what cannot be distinguished from it."""
+    incidental: ClassVar[frozenset[str]] = frozenset()
+    """Names of coefficients that are no evidence of it: what they stand for is there without it, too."""
     inexact: ClassVar[float] = 0.0
     """Share of its square by which a real one may differ from the law here, in the form of a smaller one of
     its kind."""

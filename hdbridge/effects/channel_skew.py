@@ -30,8 +30,6 @@ from hdbridge.units import ARCSEC_PER_DEG
 OTHERS_MS2, LATE_SHARE = 30.0, 4.0
 """A delayed sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz
 and more) it is at most so many ms^2 and so many times the delay squared."""
-SPEED_SHARE = 0.15
-"""A skew whose part in speed is less than this of its part in acceleration is none."""
 
 
 class ChannelSkew(Linear):
@@ -69,6 +67,8 @@ class ChannelSkew(Linear):
     )
     ordinary_arcsec: ClassVar[float] = 1.0
     """No two encoders are read at the same instant."""
+    incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
+    """The load's own wind-up goes with it."""
     linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")
     typical: ClassVar[Mapping[str, Any]] = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
@@ -108,8 +108,8 @@ class ChannelSkew(Linear):
             return "too much of it follows the acceleration for a delay"
         parts = np.abs(self.columns(observations.motion) * self.coefficients())
         speed, acceleration = np.quantile(parts, 0.998, axis=0)
-        if speed < SPEED_SHARE * acceleration:
-            return "all but no part of it follows the speed"
+        if speed < acceleration:
+            return "more of it follows the acceleration than the speed"
         return ""
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

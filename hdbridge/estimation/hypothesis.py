@@ -200,6 +200,10 @@ class Estimator:
         """Columns in units of the noise."""
         return np.asarray(columns * self.weight[:, np.newaxis])
 
+    def law_discrepancy(self, effect: Effect, start: Start) -> FloatArray:
+        """What an effect's law may be wrong by, a weighted column per standard deviation, shape (m, k)."""
+        return self.weighted(self.at_points(effect.law_discrepancy(self.data.full.motion, start)))
+
     def free_loop(self, start: Start) -> Nuisances:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
         memory.

@@ -42,22 +42,27 @@ class Interval:
 
 def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> list[Interval]:
     """Of one effect's parameters; ``cov`` (c, c) is the covariance of its ``columns`` of the fit."""
-    steps = 0.05 * np.sqrt(np.maximum(np.diag(cov), 1e-24))
     shapes = {each.name: each for each in effect.shape}
     base = dict(leaves(effect.parameters()))
     result = []
-    for name, slope in slopes(effect, columns, steps).items():
-        value = base[name]
-        half = NORMAL_95 * math.sqrt(max(float(slope @ cov @ slope), 0.0))
-        known = True
+    for name, half in half_widths(effect, columns, cov).items():
+        value, widest, known = base[name], half, True
         if name in shapes:
             widest = max(float(shapes[name].upper) - value, value - float(shapes[name].lower))
             known = half < 0.5 * (
                 value if shapes[name].logarithmic else shapes[name].upper - shapes[name].lower
             )
-            half = half if known else widest
-        result.append(Interval(effect.name, name, value, half, known))
+        result.append(Interval(effect.name, name, value, half if known else widest, known))
     return result
+
+
+def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> dict[str, float]:
+    """`NORMAL_95` standard deviations of each parameter, by the slopes at its value."""
+    steps = 0.05 * np.sqrt(np.maximum(np.diag(cov), 1e-24))
+    return {
+        name: NORMAL_95 * math.sqrt(max(float(slope @ cov @ slope), 0.0))
+        for name, slope in slopes(effect, columns, steps).items()
+    }
 
 
 def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict[str, FloatArray]:

@@ -8,16 +8,19 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.stats import binom
 
 from hdbridge.diagnose import diagnose
-from hdbridge.diagnose.parameters import covariance, parameters_of
+from hdbridge.diagnose.parameters import covariance, named_parameters, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start
+from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start, VelocityWindup
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
+from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.observed import gather
+from hdbridge.estimation.terms import Column
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
@@ -88,6 +91,15 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     # So few are inside by chance in one run of a thousand, were the share as low as LEAST.
     assert sum(inside) >= binom.ppf(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
     assert np.median(halves) < 0.02
+
+
+def test_a_shape_that_is_hardly_known_is_known_by_its_logarithm_and_within_its_range() -> None:
+    drag = VelocityWindup(coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.02, shear_deg_s=1000.0)
+    (shape,) = drag.shape
+    for deviation, factor in ((0.3, math.exp(0.3 * NORMAL_95)), (30.0, math.inf)):
+        told = named_parameters(drag, [Column(0, shape.name, shape=True)], np.array([[deviation**2]]))
+        assert told[shape.name].low == pytest.approx(max(1000.0 / factor, shape.lower), rel=1e-3)
+        assert told[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
 
 
 def test_a_change_of_an_order_is_no_better_known_than_what_it_has_changed_from(

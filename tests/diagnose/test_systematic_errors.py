@@ -7,13 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from support.rates import least
 
 from hdbridge.diagnose import Diagnosis
+from hdbridge.diagnose.acceptance import gate
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import Effect, LoadOrders, LocalDefect, Start, VelocityWindup
+from hdbridge.effects import ChannelSkew, Effect, LoadOrders, LocalDefect, Start, VelocityWindup
 from hdbridge.effects.orders import orders_from
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.observed import gather
@@ -60,6 +62,24 @@ def test_a_drag_that_falls_off_by_another_power_of_the_speed_is_within_its_inter
             holds(told["shear_deg_s"], shear),
         ]
     assert enough(inside), inside
+
+
+@pytest.mark.parametrize(
+    ("effects", "beside"),
+    [
+        ({"velocity_windup": {"coulomb": 1.0, "viscous": 0.05, "shear": 100.0}}, [VelocityWindup]),
+        ({"inertial_windup": {"s2": 2e-5}}, []),
+    ],
+    ids=["beside a drag that falls off by another power of the speed", "beside a load's own wind-up"],
+)
+def test_what_is_there_without_a_delay_is_no_evidence_of_one(
+    columns: Columns, model: TransmissionModel, effects: Any, beside: list[type[Effect]]
+) -> None:
+    estimator = Estimator(gather(Record(columns(effects)), 50.0))
+    others = (*model.effects, *(each.candidate(50.0) for each in beside))
+    fitted = estimator.fit(Hypothesis((*others, ChannelSkew.candidate(50.0)), Start.FORWARD))
+    found = gate(estimator, fitted, len(others))
+    assert found.robust < 0.5 * found.needed
 
 
 def test_the_height_of_a_bump_of_another_form_is_within_its_interval(

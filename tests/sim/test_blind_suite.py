@@ -233,6 +233,14 @@ def test_a_change_of_a_motor_order_is_that_against_the_given_model(tools: Any) -
     assert all(each.covered for each in verdict.compared)
 
 
+def test_a_spring_is_compared_as_soft_as_a_cause_hidden_after_it_has_left_it(tools: Any) -> None:
+    hidden = secret("compliance", compliance_arcsec_per_nm=0.5, stiffness_nm_per_rad=412529.6)
+    truth = {"gear": {"stiffness_nm_per_rad": 206264.8}}
+    found = answer(finding("compliance", c1_arcsec_per_nm=value(1.0)))
+    (compared,) = tools("blindscore").judged(hidden, found, 1.0, "", truth, {}).compared
+    assert compared.true == pytest.approx(1.0)
+
+
 def test_growths_are_compared_in_per_cent_and_springs_as_compliances(tools: Any) -> None:
     judged = tools("blindscore").judged
     hidden = secret("torque_modulation", also=("compliance",), growth_per_nm=0.03)

@@ -152,7 +152,7 @@ def _load_orders(secret: Secret) -> Values:
 
 def _compliance(secret: Secret) -> Values:
     """The softness and the ends of each stage; of a finding without stages, the wind-up under the highest
-    torque by that torque.
+    torque by that torque, which is the softer the more a cause hidden later has softened the spring.
     """
     stiffness = secret.stiffness or secret.parameters.get("stiffness_nm_per_rad")
     if stiffness is None:
@@ -160,7 +160,8 @@ def _compliance(secret: Secret) -> Values:
     first = ARCSEC_PER_RAD / float(stiffness)
     stages = secret.gear.get("stiffening")
     if "torque1_nm" not in secret.found or not stages:
-        return {"c1_arcsec_per_nm": float(secret.parameters.get("compliance_arcsec_per_nm", first))}
+        softer = float(secret.parameters.get("stiffness_nm_per_rad", stiffness)) / float(stiffness)
+        return {"c1_arcsec_per_nm": softer * float(secret.parameters.get("compliance_arcsec_per_nm", first))}
     return {
         "c1_arcsec_per_nm": first,
         "c2_arcsec_per_nm": ARCSEC_PER_RAD / float(stages["second_stiffness_nm_per_rad"]),
