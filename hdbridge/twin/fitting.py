@@ -96,20 +96,19 @@ def fit(
         begun = _at_best_frequency(replays, begun)
         progress(0.1)
         first = _best_of(replays, _starts(begun), parameters, prior)
-    progress(0.3)
+    progress(0.2)
     with Replays(data, workers) as replays:
         (before,) = replays([start])
         most = scales(data, before)
-        # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel that
-        # tells it from the right one.
-        near = solve(
-            replays, first.truth, parameters, prior, NEAR_STEPS, lambda share: progress(0.3 + 0.2 * share),
-            known=expected(data), near=first,
-        )  # fmt: skip
-        best = solve(
-            replays, near.truth, parameters, prior, STEPS, lambda share: progress(0.5 + 0.4 * share),
-            most=most, near=near,
-        )  # fmt: skip
+        ends = []
+        for number, each in enumerate(first):
+            progress(0.2 + 0.7 * number / len(first))
+            # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
+            # that tells it from the right one.
+            near = solve(replays, each.truth, parameters, prior, NEAR_STEPS, known=expected(data), near=each)
+            ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
+        progress(0.9)
+        best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
         for name in LAST:
             wider = (*parameters, BY_NAME[name])
             if value_in(begun, BY_NAME[name]) is None or name in more:
@@ -171,11 +170,11 @@ def _starts(truth: Truth) -> list[Truth]:
 
 def _best_of(
     replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
-) -> Fitted:
-    """The fit from the first place, unless that from another one is better beyond doubt.
+) -> tuple[Fitted, ...]:
+    """The fit from the first place, and beside it that from another one where that is better so far.
 
-    The first is where the simulation stands: what motion does not show keeps its value. Of the others those
-    that fall behind are given up.
+    The first is where the simulation stands: what motion does not show keeps its value, unless another place
+    is better beyond doubt in the end. Of the others those that fall behind are given up.
     """
     noise = expected(replays.data)
     own, *others = (solve(replays, each, parameters, prior, FIRST_STEPS, known=noise) for each in starts)
@@ -185,7 +184,7 @@ def _best_of(
             solve(replays, each.truth, parameters, prior, steps, known=noise, near=each)
             for each in (own, *others)
         )
-    return others[0] if own.cost - others[0].cost > EARNED else own
+    return (own, others[0]) if others[0].cost < own.cost else (own,)
 
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:

@@ -21,7 +21,7 @@ from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.estimation.stretches import counted as numbered
 from hdbridge.estimation.stretches import sums
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.likelihood import rooted
+from hdbridge.twin.likelihood import FINE, rooted, surprise
 from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
@@ -66,6 +66,8 @@ class Fitted:
     scales: Scales
     """Of the residuals."""
     residuals: dict[str, FloatArray]
+    rows: NDArray[np.bool_]
+    """Those that were fitted, one channel after the other."""
     vector: FloatArray
     """The scaled residuals of the fitted rows, softened."""
     jacobian: FloatArray
@@ -82,6 +84,17 @@ class Fitted:
     def inflation(self) -> float:
         """Mean square of the scaled residuals, 1 at least: what one of them is worth."""
         return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))
+
+    @property
+    def loss(self) -> float:
+        """Minus the log likelihood of the fitted readings, by the fit's own scales, which need to have steps.
+
+        Of two fits of the same readings the one with less is likelier, by the exponential of the difference.
+        """
+        half, stray = (each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS)))
+        size = np.abs(self.scales.scaled(self.residuals)[self.rows])
+        wide = np.maximum(half, FINE)
+        return float(np.sum(surprise(size, wide, stray) - np.log(half / wide)))
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % intervals by the parameters' names."""
@@ -169,7 +182,8 @@ def solve(
     truth = at_coordinates(start, parameters, place.tolist())
     covariance = sandwich(slopes, left, legs_of_rows(data, rows), spread)
     scale = replace(scale, loops=None)
-    return Fitted(truth, parameters, place, covariance, scale, found, left, slopes, 0.5 * float(left @ left))
+    cost_now = 0.5 * float(left @ left)
+    return Fitted(truth, parameters, place, covariance, scale, found, rows, left, slopes, cost_now)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
