@@ -45,8 +45,8 @@ EXCHANGED = 2
 STEPS = 6
 DRAWS = 8
 """Rounded and noisy replays about a place, within what the twin leaves open. A recording is held against
-their mean: rounding is no noise (see `bootstrap`). And a sample counts by how far they are apart: how a motor
-breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
+their mean: rounding is no noise (see `likelihood`). And a sample counts by how far they are apart: how a
+motor breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
 LEAST_SUSPECT = 0.25
 """Share of that which the slopes have to promise: they say little of what goes out of step."""
 TOLERATED = (1.0 / 3.0) ** 2
