@@ -72,8 +72,11 @@ class Fitted:
     """The scaled residuals of the fitted rows, softened."""
     jacobian: FloatArray
     """Of these, by coordinate."""
-    cost: float
-    """Half the sum of the squares of the scaled residuals, softened."""
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of the squares of the scaled residuals, softened."""
+        return 0.5 * float(self.vector @ self.vector)
 
     @property
     def misfit(self) -> float:
@@ -182,8 +185,7 @@ def solve(
     truth = at_coordinates(start, parameters, place.tolist())
     covariance = sandwich(slopes, left, legs_of_rows(data, rows), spread)
     scale = replace(scale, loops=None)
-    cost_now = 0.5 * float(left @ left)
-    return Fitted(truth, parameters, place, covariance, scale, found, rows, left, slopes, cost_now)
+    return Fitted(truth, parameters, place, covariance, scale, found, rows, left, slopes)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
