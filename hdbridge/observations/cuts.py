@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from hdbridge.effects import FloatArray
+from hdbridge.observations.stamps import coarse, spread
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -49,6 +50,14 @@ class Observed:
 def observed(record: Record, ratio: float) -> Observed:
     """What a record says was observed; the same record where nothing is wrong with it."""
     remarks = []
+    if repeated := sum(coarse(part.time_s, part.motor_position_deg) for part in record.parts()):
+        remarks.append(
+            f"{_name(record)}{repeated} of {len(record)} samples have the time of the one before, though the "
+            "motor has moved on: a clock coarser than the sampling; the samples are spread evenly over its "
+            "ticks"
+        )
+        times = np.concatenate([spread(part.time_s) for part in record.parts()])
+        record = Record({**record.columns, "time_s": times}, record.source, record.starts)
     kept = np.ones(len(record), dtype=np.bool_)
     for first, end in _edges(record):
         kept[first:end] = ~_misread(record.rows(first, end), ratio)

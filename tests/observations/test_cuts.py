@@ -66,6 +66,23 @@ def test_one_reading_of_zero_takes_no_order_from_a_fit() -> None:
     assert any("misread" in each for each in found.warnings)
 
 
+@pytest.mark.parametrize("tick_s", [0.02, 0.025, 0.07])
+def test_samples_of_a_coarse_clock_are_spread_over_its_ticks_and_that_is_told(tick_s: float) -> None:
+    record = sweeps()
+    ticks = tick_s * np.floor(record.time_s / tick_s + 1e-9)
+    seen = observed(Record({**record.columns, "time_s": ticks}), RATIO)
+    assert np.all(np.diff(seen.record.time_s) > 0.0)
+    assert np.max(np.abs(seen.record.time_s - record.time_s)) <= 0.01
+    assert seen.cuts == ()
+    assert "coarser" in seen.remarks[0]
+
+
+def test_samples_taken_twice_stay_as_they_are() -> None:
+    record = sweeps()
+    twice = Record({name: np.repeat(column, 2) for name, column in record.columns.items()})
+    assert observed(twice, RATIO).record is twice
+
+
 def test_an_axis_as_it_moves_is_neither_cut_nor_misread() -> None:
     record = sweeps()
     seen = observed(record, RATIO)
