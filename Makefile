@@ -39,7 +39,11 @@ unit-as-it-goes:
 # Each worker begins with a run of neighbouring tests, which share what was measured, and helps the others in the
 # end. One more than there are processors: a sixth of the time, a worker waits for a process or a clock.
 WORKERS ?= $(shell echo $$(( $(PROCESSORS) + 1 )))
-UNIT    := $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal --ignore=tests/socketcan
+# Only the plugins that the tests use: pytest rewrites the assertions in all modules of a package that brings a
+# plugin by itself (hypothesis, schemathesis, hdbridge), in each worker anew where there is no bytecode yet.
+PLUGINS := --disable-plugin-autoload -p xdist -p pytest_timeout -p _hypothesis_pytestplugin -p hdbridge.pytest_plugin \
+	-p schemathesis.pytest.plugin
+UNIT    := $(BIN)/python -m pytest -q $(PLUGINS) -n $(WORKERS) --dist worksteal --ignore=tests/socketcan
 unit: $(READY)   ## the tests on the virtual bus
 	$(UNIT) -m "not slow"
 
@@ -47,7 +51,7 @@ test-slow: $(READY)  ## what is too slow for every run (HIDDEN_SEEDS="1 2 3" dra
 	$(UNIT) -m slow
 
 test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
-	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs -p no:schemathesis tests/socketcan; status=$$?; \
+	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs --disable-plugin-autoload -p pytest_timeout -p hdbridge.pytest_plugin tests/socketcan; status=$$?; \
 	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED, for the reason above: this machine has no vcan"; \
 	else exit $$status; fi
 

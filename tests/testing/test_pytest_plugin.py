@@ -11,6 +11,8 @@ import pytest
 from hdbridge.files.bundled import bundled_profile
 
 STRICT = ("--strict-markers", "-W", "error", "-p", "no:cacheprovider")
+IN_PROCESS = ("-W", "ignore:Module already imported:pytest.PytestAssertRewriteWarning")
+"""What these tests have imported, a second pytest in their process cannot rewrite."""
 PASSES = "def test_it(hdbridge_drive):\n    assert hdbridge_drive.state == 'switch on disabled'\n"
 
 
@@ -20,7 +22,7 @@ def session(pytester):
 
     def run(text: str, *options: str) -> pytest.RunResult:
         pytester.makepyfile(text)
-        return pytester.runpytest_inprocess(*STRICT, *options)
+        return pytester.runpytest_inprocess(*STRICT, *IN_PROCESS, *options)
 
     return run
 
