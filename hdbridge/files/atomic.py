@@ -80,12 +80,16 @@ def check_writable(path: Path | str) -> None:
             raise InputError(f"{path}: cannot be written: there is no folder {target.parent}")
         if not os.access(target.parent, os.W_OK | os.X_OK):
             raise InputError(f"{path}: cannot be written: the folder {target.parent} does not permit it")
-        with _temporary(target):
-            _temporary_name(target).unlink()
+        _try_out(target)
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
     except RuntimeError:  # Python 3.11 and 3.12 say it so
         raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
+
+
+def _try_out(target: Path) -> None:
+    with _temporary(target):
+        _temporary_name(target).unlink()
 
 
 def descriptor_of(path: Path | str) -> int | None:
@@ -139,7 +143,10 @@ def make_folder(path: Path | str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise InputError(f"{path}: cannot make this folder: {problem.strerror}") from None
-    check_writable(folder / "a file")
+    try:
+        _try_out(folder.resolve() / "tried")
+    except OSError as problem:
+        raise InputError(f"{path}: cannot write into this folder: {problem.strerror}") from None
     return folder
 
 

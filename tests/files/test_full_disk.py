@@ -1,7 +1,12 @@
-"""A disk that is full: the old file stands, and nothing that fills the disk is left."""
+"""A disk that is full or takes nothing: the old file stands, and nothing that fills the disk is left."""
 
 import subprocess
 import sys
+
+import pytest
+
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder
 
 SCRIPT = """
 import resource, sys
@@ -24,3 +29,8 @@ def test_the_old_file_stands_and_no_part_of_the_new_one_remains(tmp_path):
     assert "model.yaml: cannot be written" in done.stdout
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_takes_no_files_is_refused_by_its_own_name():
+    with pytest.raises(InputError, match=r"^/proc: cannot write into this folder"):
+        make_folder("/proc")
