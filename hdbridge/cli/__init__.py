@@ -44,6 +44,7 @@ PANELS: Final = {
     },
     "The model of an axis": {
         "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
+        "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
         "fit": "Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.",
         "report": "Fit a recording again and tell its result; no axis is needed, nothing moves.",
         "diagnose": "Compare records with a model; name what the model lacks, or say what cannot be told.",

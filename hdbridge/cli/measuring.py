@@ -71,8 +71,8 @@ class Measurement:
         journal.check_is_of(axis)
         return cls(axis, journal.plan, resume, date, journal)
 
-    def announce(self, after: str) -> None:
-        """Tell what is left of the plan and how long that takes; ``after`` says what comes then."""
+    def announce(self, after: str = "") -> None:
+        """Tell what is left of the plan and how long that takes; ``after``: what comes then."""
         from hdbridge.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
@@ -82,7 +82,7 @@ class Measurement:
         there = f" ({len(done)} tasks are there already)" if self.journal else ""
         notes.print(
             f"plan '{self.plan.name}': {len(left.tasks)} tasks{there}, {left.duration_s / 60:.1f} min of the "
-            f"axis, and {after}",
+            f"axis{f', and {after}' if after else ''}",
             soft_wrap=True,
         )
 

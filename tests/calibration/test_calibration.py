@@ -69,6 +69,17 @@ def test_the_recording_is_kept_with_what_moved_how(calibrated_once):
     assert (cell.folder / "rec" / "stepping-after.csv.gz").exists()
 
 
+def test_measure_records_the_same_and_makes_nothing_of_it(calibrated_once, cell):
+    done = cell.run("measure", "axis", "--simulate", "--plan", "short.yaml", "--out", "rec")
+    assert "recording: rec, 5 tasks" in done.stdout
+    assert "hdbridge twin axis rec" in done.stdout
+    assert sorted(each.name for each in cell.axis.iterdir()) == ["axis.yaml", "truth.yaml"]
+    measured = Recording.load(cell.folder / "rec")
+    assert measured.record == Recording.load(calibrated_once[0].folder / "rec").record
+    again = cell.run("measure", "axis", "--simulate", "--resume", "rec")
+    assert "0 tasks (5 tasks are there already)" in again.stderr
+
+
 def test_the_model_says_where_it_comes_from(calibrated_once):
     cell, _ = calibrated_once
     source = TransmissionModel.load(cell.axis / "pending.yaml").provenance

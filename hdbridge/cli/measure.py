@@ -1,0 +1,82 @@
+"""``hdbridge measure``: a recording of an axis by a plan, and nothing made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from hdbridge.cli.measuring import out_option, resume_option
+from hdbridge.cli.options import (
+    ChannelOption,
+    ForceOption,
+    InterfaceOption,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    console,
+    load_axis,
+)
+from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("measure")(command)
+
+
+def command(
+    profile: ProfileArgument,
+    plan: Annotated[
+        str,
+        typer.Option(
+            "--plan",
+            metavar="quick|full|dynamics|FILE",
+            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
+        ),
+    ] = "quick",
+    out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
+    resume: Annotated[
+        Path | None, resume_option("Go on with an interrupted recording: what its plan still lacks.")
+    ] = None,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
+
+    The axis moves as in a calibration, within the limits of its axis file and without compensation; no model
+    is fitted and none changes. Ctrl-C stops the axis, and --resume goes on.
+    """
+    from hdbridge.calibration import measure
+    from hdbridge.cli.booted import booted
+    from hdbridge.cli.measuring import Measurement, kept_in, phases
+    from hdbridge.model.store import measuring
+
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel, simulate=simulate)
+    work = Measurement.asked(axis, plan, out, resume)
+    work.announce()
+    with (
+        kept_in(work.folder),
+        measuring(files.axis),
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
+    ):
+        journal = work.begun(drive, seed if simulate else None)
+        with phases() as progress:
+            measure(drive, journal, progress=progress, interrupted=interrupted)
+    recording = journal.recording()
+    name, folder = escape(profile), escape(str(work.folder))
+    lines = [f"recording: {folder}, {len(journal.done)} tasks, {len(recording.record)} samples"]
+    if files.model.exists():
+        lines.append(f"what the model lacks: hdbridge diagnose {folder} --model {escape(str(files.model))}")
+    lines.append(f"what the simulated drive gets wrong: hdbridge twin {name} {folder}")
+    for line in lines:
+        console.print(line, soft_wrap=True)
