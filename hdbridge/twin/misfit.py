@@ -299,7 +299,8 @@ def _piece(
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }
     counts = {
-        FOLLOWING: np.where(unknown, 0.0, everywhere),
+        # Where a motor came to rest within its count is one reading, not one for each row.
+        FOLLOWING: np.where(unknown | (stuck & stands), 0.0, everywhere),
         TORQUE: np.where(stuck | stands | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
         LOAD: np.where(elastic, 0.0, everywhere),
     }
