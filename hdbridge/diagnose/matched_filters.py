@@ -8,7 +8,6 @@ transform over one turn at the *predicted* load angle, 2^17 bins.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +38,7 @@ PEAKS = 3
 def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
     """Of each kind that is sought, those that promise most on what a fit leaves."""
     residual, load_deg = fast_residual(estimator, fitted)
-    with_load_angle(estimator, load_deg)
+    estimator.with_load_angle(load_deg)
     present = fitted.hypothesis.effects
     result: list[Candidate] = []
     shapes: Iterator[tuple[float, ...]]
@@ -196,15 +195,3 @@ def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray)
     power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
     least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
     yield from _highest(power, 3, least)
-
-
-def with_load_angle(estimator: Estimator, load_deg: FloatArray) -> None:
-    """Make the predicted load angle what effects of the load encoder's lines count on."""
-    data = estimator.data
-    full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
-    points = full
-    if len(data.points) < len(full):
-        mean = data.mean(load_deg)
-        points = replace(data.points, motion=replace(data.points.motion, load_deg=mean))
-    estimator.data = replace(data, full=full, points=points)
-    estimator.load_angles += 1

@@ -1,9 +1,9 @@
-"""Columns of a fit, averaged over blocks, for effects that know nothing of blocks."""
+"""Calibration's observations: samples, their blocks, and the elastic state in which each chain begins."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from hdbridge.effects.base import Memoryless
 from hdbridge.effects.path import branches
 from hdbridge.estimation.blocks import Blocks
 from hdbridge.estimation.linear import side_by_side
-from hdbridge.estimation.samples import Samples, motion_at
-from hdbridge.estimation.shapes import unit
+from hdbridge.estimation.regressors import Regressors
+from hdbridge.estimation.samples import Samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,50 +23,25 @@ class Design:
     samples: Samples
     blocks: Blocks
     starts: tuple[Start, ...]
-    sketch: tuple[tuple[IntArray, IntArray], ...]
-    """Per chain: samples that stand for all (blocks' middles and turns), and which are middles."""
-
-    memo: dict[Effect, FloatArray] = field(default_factory=dict)
-    """Columns of effects without shape or memory, which are asked for again and again."""
+    regressors: Regressors
 
     @classmethod
     def of(cls, samples: Samples, blocks: Blocks, starts: Sequence[Start]) -> Design:
         """Prepare columns for these blocks."""
-        return cls(samples, blocks, tuple(starts), tuple(_sketches(samples, blocks)))
+        motions = [samples.along(each) for each in samples.chains]
+        return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
 
     def beginning(self, starts: Sequence[Start]) -> Design:
         """The same with other states at the start."""
         return replace(self, starts=tuple(starts))
 
-    def roughly(self, effect: Effect) -> FloatArray:
-        """Columns in which the middles of the blocks stand for all samples."""
-        return self.columns(effect, exact=False)
+    def columns(self, effect: Effect) -> FloatArray:
+        """Regressors of an effect, block averages, shape (b, p)."""
+        return self.regressors.columns(effect, self.starts)
 
-    def columns(self, effect: Effect, exact: bool = True) -> FloatArray:
-        """Columns of an effect, shape (b, p); ``exact`` averages all samples, else middles stand for them."""
-        if exact and not effect.shape and isinstance(effect.tracker(), Memoryless):
-            return side_by_side([self._kept(unit(each)) for each in effect.pieces()], len(self.blocks))
-        width = len(effect.coefficients())
-        result = np.empty((len(self.samples) if exact else len(self.blocks), width))
-        for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
-            motion = self.samples.along(chain)
-            if exact:
-                result[chain.rows] = effect.columns(motion, start)
-            else:
-                picked, middles = self.sketch[number]
-                inside = self.blocks.chain == number
-                result[inside] = effect.columns(motion_at(motion, picked), start)[middles]
-        return self.blocks.mean(result) if exact else result
-
-    def _kept(self, piece: Effect) -> FloatArray:
-        if piece not in self.memo:
-            self.memo[piece] = self.blocks.mean(piece.columns(self.samples.motion))
-        return self.memo[piece]
-
-    def told(self, effects: Sequence[Effect], exact: bool = True) -> FloatArray:
+    def told(self, effects: Sequence[Effect]) -> FloatArray:
         """What effects say together, shape (b,)."""
-        parts = (self.columns(each, exact) @ each.coefficients() for each in effects)
-        return np.asarray(sum(parts, start=np.zeros(len(self.blocks))))
+        return self.regressors.told(effects, self.starts)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
         """What a reach further at the turn before would change, arcsec (b,), what share of that reach may lie
@@ -78,16 +53,15 @@ class Design:
         change, missed = np.zeros((2, len(self.blocks)))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
         last = 0
-        for number, (chain, start) in enumerate(zip(self.samples.chains, self.starts, strict=True)):
-            picked, middles = self.sketch[number]
-            motion = motion_at(self.samples.along(chain), picked)
+        along = zip(self.samples.chains, self.regressors.motions, self.starts, strict=True)
+        for number, (chain, motion, start) in enumerate(along):
             turning, signs = branches(motion.motor_deg, Start.VIRGIN)
             inside = self.blocks.chain == number
+            middles = self.blocks.middle[inside] - chain.rows.start
             branch = np.searchsorted(turning, middles, "left")
             turn[inside] = last + branch
             last += len(turning) + 1
-            at = picked[turning[1:-1]]
-            between = missed_deg(self.samples.motor_deg[chain.rows], at)
+            between = missed_deg(motion.motor_deg, np.array(turning[1:-1], dtype=np.intp))
             reach = self.samples.count_deg + 2.0 * between
             if not np.any(reach):
                 continue
@@ -112,10 +86,7 @@ class Design:
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
         """Observation minus effects per sample, minus ``rest`` per block; NaN where not usable."""
-        left = self.samples.error_arcsec.copy()
-        for chain, start in zip(self.samples.chains, self.starts, strict=True):
-            for effect in effects:
-                left[chain.rows] -= effect.predict(self.samples.along(chain), start)
+        left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
         result[index] = left[index] - np.repeat(rest, self.blocks.sizes)
@@ -130,18 +101,6 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
     angles = (np.deg2rad(each) * design.samples.motor_deg for each in orders)
     parts = [design.blocks.mean(np.stack([np.cos(each), np.sin(each)], axis=1)) for each in angles]
     return side_by_side(parts, len(design.blocks))
-
-
-def _sketches(samples: Samples, blocks: Blocks) -> list[tuple[IntArray, IntArray]]:
-    result = []
-    for number, chain in enumerate(samples.chains):
-        middles = blocks.middle[blocks.chain == number] - chain.rows.start
-        motor_deg = samples.motor_deg[chain.rows]
-        turning, _ = branches(motor_deg, Start.VIRGIN)
-        first_moves = np.flatnonzero(np.diff(motor_deg))[:1]
-        picked = np.unique(np.concatenate([middles, turning, first_moves]).astype(np.intp))
-        result.append((picked, np.searchsorted(picked, middles)))
-    return result
 
 
 def clusters(blocks: Blocks, number: int) -> IntArray:

@@ -15,11 +15,11 @@ import numpy as np
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
 from hdbridge.effects.play import stop
 from hdbridge.estimation.calibration import CalibratedPart, priors
-from hdbridge.estimation.linear import side_by_side
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.noise import White
 from hdbridge.estimation.nuisances import zeros
 from hdbridge.estimation.observed import Observed
+from hdbridge.estimation.regressors import Regressors
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
@@ -28,7 +28,6 @@ from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, T
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 """A search compares hypotheses whose chi squares are tens and more apart."""
 KEPT_FITS = 8
-KEPT_COLUMNS = 64
 """What is asked for again and again is kept; so many, for they are large. Of older fits only where
 they ended is."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
@@ -138,8 +137,7 @@ class Estimator:
         self.zero: IntArray = points.zero[self.index]
         self.load_angles = 0
         """How often the predicted load angle was exchanged."""
-        self._memo: dict[object, FloatArray] = {}
-        self._recent: OrderedDict[object, FloatArray] = OrderedDict()
+        self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._fits: OrderedDict[object, Fitted] = OrderedDict()
         self._origins: dict[object, _Origin] = {}
         self._noise: dict[object, FloatArray] = {}
@@ -158,31 +156,7 @@ class Estimator:
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
-        if (
-            not (effect.shape or effect.carries or effect.curved)
-            and Channel.LOAD_ANGLE not in effect.channels
-        ):
-            # The same in every fit.
-            return side_by_side([self._kept(each, start) for each in effect.pieces()], len(self.index))
-        # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
-        # depend on those, and these are fields of them.
-        recent = (unit(effect), start, self.load_angles if Channel.LOAD_ANGLE in effect.channels else 0)
-        if recent in self._recent:
-            self._recent.move_to_end(recent)
-            return self._recent[recent]
-        columns = self.at_points(effect.columns(self.data.full.motion, start))
-        self._recent[recent] = columns
-        if len(self._recent) > KEPT_COLUMNS:
-            self._recent.popitem(last=False)
-        return columns
-
-    def _kept(self, effect: Effect, start: Start) -> FloatArray:
-        """Columns of what has no shape, once and for all, shape (m, p)."""
-        one = unit(effect)
-        key = (one, start if one.tracker().memory_deg else None)
-        if key not in self._memo:
-            self._memo[key] = self.at_points(one.columns(self.data.full.motion, start))
-        return self._memo[key]
+        return self._regressors.columns(effect, (start,))
 
     def at_points(self, values: FloatArray) -> FloatArray:
         """Of every sample to the usable points, as the observations are averaged."""
@@ -322,17 +296,21 @@ class Estimator:
 
     def predicted(self, fitted: Fitted) -> FloatArray:
         """What the hypothesis says for each sample, zeros included, arcsec, shape (n,)."""
-        full = self.data.full
-        total = fitted.zeros[full.zero] + self.level
-        for effect in fitted.hypothesis.effects:
-            total = total + effect.predict(full.motion, fitted.hypothesis.start)
-        return np.asarray(total)
+        effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
+        return fitted.zeros[self.data.full.zero] + self.level + self._regressors.predicted(effects, (start,))
 
     def told(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """What effects say together at the usable points, arcsec, shape (m,)."""
-        full = self.data.full.motion
-        total = sum((each.predict(full, start) for each in effects), start=np.zeros(len(full)))
-        return self.at_points(total)
+        return self._regressors.told(effects, (start,))
+
+    def with_load_angle(self, load_deg: FloatArray) -> None:
+        """Make a predicted load angle (n,) what effects of the load encoder's lines count on."""
+        data = self.data
+        full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
+        points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
+        self.data = replace(data, full=full, points=points)
+        self._regressors.along([full.motion])
+        self.load_angles += 1
 
 
 def _smooth(values: FloatArray) -> FloatArray:

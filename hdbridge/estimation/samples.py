@@ -125,6 +125,7 @@ class Samples:
         for chain in self.chains:
             time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
             motor[chain.rows] = np.interp(time - delay_s, time, angle)
+        motor.setflags(write=False)
         error = self.error_arcsec + (self.motor_deg - motor) / self.ratio * ARCSEC_PER_DEG
         return replace(self, motion=replace(self.motion, motor_deg=motor), error_arcsec=error)
 

@@ -106,14 +106,14 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
             warnings.append(f"{effect.name}: not fitted, the record has no {', '.join(missing)}")
             continue
         prototype = options.prototype(effect)
-        if share_left(design.columns(prototype, exact=False), always, weight) < EFFECT_SHARE:
+        if share_left(design.columns(prototype), always, weight) < EFFECT_SHARE:
             warnings.append(
                 f"{effect.name}: left out: not distinguished from the zero in this record (no reversal?); "
                 "record both directions"
             )
             continue
         effects.append(prototype)
-    known = np.concatenate([free, *(design.columns(each, exact=False) for each in effects)], axis=1)
+    known = np.concatenate([free, *(design.columns(each) for each in effects)], axis=1)
     nuisances = []
     delay = delay_column(design)
     size = float(np.sqrt(weight @ delay[:, 0] ** 2 / np.sum(weight)))
@@ -142,7 +142,7 @@ def _search(state: State, warnings: list[str]) -> State:
         starts: list[Start], effects: tuple[Effect, ...]
     ) -> tuple[float, tuple[Effect, ...], list[Start]]:
         begun = state._replace(design=state.design.beginning(starts))
-        return *searched(begun.under(begun.precision(), columns, exact=False), effects), starts
+        return *searched(begun.under(begun.precision(), columns), effects), starts
 
     best = found(list(state.design.starts), state.effects)
     for number, chain in enumerate(state.design.samples.chains):
@@ -158,14 +158,14 @@ def _search(state: State, warnings: list[str]) -> State:
     effects = tuple(each for each in best[1] if not each.violations())
     design = state.design.beginning(best[2]).blurred(effects)
     state = state._replace(design=design, effects=effects)
-    solution = state.under(state.precision(), columns, exact=False).fit(effects, LINEAR_ONLY)
+    solution = state.under(state.precision(), columns).fit(effects, LINEAR_ONLY)
     return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
 
 
 def _settle(state: State) -> tuple[State, Solution, System]:
     """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
     state = state.selected()
-    solution = state.fitted(exact=False)
+    solution = state.fitted()
     samples = state.design.samples
     weight, outliers = outlying(
         state.design.residual(solution.effects, state.columns().columns @ solution.nuisances),

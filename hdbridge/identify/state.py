@@ -13,7 +13,7 @@ from hdbridge.estimation.noise import NoiseModel, Precision
 from hdbridge.estimation.nuisances import nuisances_of
 from hdbridge.estimation.samples import Samples
 from hdbridge.estimation.separable import Separable, Solution
-from hdbridge.estimation.terms import Effort, Nuisances, Terms, Weighting, unknown
+from hdbridge.estimation.terms import Nuisances, Terms, Weighting, unknown
 from hdbridge.identify.options import FitOptions
 from hdbridge.identify.orders import Family, Order, Selection, System, select
 from hdbridge.identify.result import Outliers
@@ -80,14 +80,13 @@ class State(NamedTuple):
         motor = [each.number for each in self.selection.chosen if each.family is Family.MOTOR]
         return ((ripple(motor),) if motor else ()) + self.effects
 
-    def under(self, weighting: Weighting, columns: Nuisances, exact: bool = True) -> Separable:
-        """Fits of effects; ``exact`` averages all samples into their blocks, else middles stand for them."""
-        of = self.design.columns if exact else self.design.roughly
-        return Separable(Terms(self.design.blocks.error_arcsec, of, weighting, columns))
+    def under(self, weighting: Weighting, columns: Nuisances) -> Separable:
+        """Fits of effects."""
+        return Separable(Terms(self.design.blocks.error_arcsec, self.design.columns, weighting, columns))
 
-    def fitted(self, effort: Effort | None = None, exact: bool = True) -> Solution:
+    def fitted(self) -> Solution:
         """The minimum near where the model stands."""
-        return self.under(self.precision(), self.columns(), exact).fit(self.model(), effort)
+        return self.under(self.precision(), self.columns()).fit(self.model())
 
     def information(self) -> System:
         """J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
@@ -95,7 +94,7 @@ class State(NamedTuple):
         With the tangents in, shapes are refitted with every order that is tried.
         """
         precision, nuisances = self.precision(), self.candidate_waves().and_also(self.in_addition())
-        found = self.under(precision, nuisances, exact=False).fit(self.effects, LINEAR_ONLY)
+        found = self.under(precision, nuisances).fit(self.effects, LINEAR_ONLY)
         right = found.jacobian.T @ precision.apply(self.design.blocks.error_arcsec)
         mean, known = np.array(nuisances.prior).T
         right[: len(mean)] += known * mean
