@@ -99,14 +99,14 @@ def test_usage_errors_have_status_2(hdbridge):
     assert "PROFILE" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["step", "calibrate", "improve", "scan", "doctor"])
+@pytest.mark.parametrize("command", ["step", "measure", "calibrate", "improve", "scan", "doctor"])
 def test_a_simulated_drive_has_no_bus_to_choose(hdbridge, command):
     done = hdbridge(command, "article", "--simulate", "--interface", "socketcan")
     assert done.returncode == 2
     assert "leave out --interface and --channel" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["step", "calibrate", "scan"])
+@pytest.mark.parametrize("command", ["step", "measure", "calibrate", "scan"])
 def test_the_virtual_bus_without_a_drive_is_refused_at_once(hdbridge, command):
     done = hdbridge(command, "article")
     assert done.returncode == 2
