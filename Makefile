@@ -7,7 +7,7 @@ PROCESSORS := $(shell nproc 2>/dev/null || echo 2)
 # The tests begin hundreds of processes: without bytecode on disk, each compiles the package anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test unit check format unit-as-it-goes test-socketcan test-slow blind bench-realtime docs clean
+.PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow blind bench-realtime docs clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -44,10 +44,14 @@ WORKERS ?= $(shell echo $$(( $(PROCESSORS) + 1 )))
 PLUGINS := --disable-plugin-autoload -p xdist -p pytest_timeout -p _hypothesis_pytestplugin -p hdbridge.pytest_plugin \
 	-p schemathesis.pytest.plugin
 UNIT    := $(BIN)/python -m pytest -q $(PLUGINS) -n $(WORKERS) --dist worksteal --ignore=tests/socketcan
-unit: $(READY)   ## the tests on the virtual bus
+unit: compiled   ## the tests on the virtual bus
 	$(UNIT) -m "not slow"
 
-test-slow: $(READY)  ## what is too slow for every run (HIDDEN_SEEDS="1 2 3" draws it more often)
+# Compiling takes 10 s and more of a processor, in each of the workers unless it is done before they begin.
+compiled: $(READY)
+	@$(BIN)/python tools/compile_simulation.py
+
+test-slow: compiled  ## what is too slow for every run (HIDDEN_SEEDS="1 2 3" draws it more often)
 	$(UNIT) -m slow
 
 test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)

@@ -77,7 +77,7 @@ class Machine:
         """
         if substeps < 1:
             return
-        if self._to_compile is not None and fast.waiting.over():
+        if self._to_compile is not None and fast.waiting.over(substeps):
             self._loops = fast.compiled_loops(self._to_compile)
             self._to_compile = None
         loops, slow = self._loops, self._slow(outer_nm)

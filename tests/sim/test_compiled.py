@@ -225,7 +225,7 @@ def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: py
     loops: list[object] = []
     monkeypatch.setattr(fast.waiting, "left", 10**9)
     before = record()
-    monkeypatch.setattr(fast.waiting, "left", 100)
+    monkeypatch.setattr(fast.waiting, "left", 4000)
     after = record()
     assert [type(each) for each in loops] == [Loops, compiled.CompiledLoops]
     assert before.keys() == after.keys()
