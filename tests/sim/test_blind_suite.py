@@ -241,6 +241,21 @@ def test_a_spring_is_compared_as_soft_as_a_cause_hidden_after_it_has_left_it(too
     assert compared.true == pytest.approx(1.0)
 
 
+def test_an_interpolation_error_is_compared_by_its_harmonics_and_not_by_its_signals(tools: Any) -> None:
+    signals = {"lines_per_turn": 2000, "sine_offset": 0.1, "gain_mismatch": 0.2}
+    names = [f"order_{order}_amplitude_arcsec" for order in (1, 2)]
+    hidden, truth = (
+        secret("subdivisional_error", lines_per_turn=2000),
+        {"load": {"encoder": {"signals": signals}}},
+    )
+    found = finding("subdivisional_error", **dict.fromkeys(names, value(10.0)))
+    compared = tools("blindscore").judged(hidden, answer(found), 1.0, "", truth, {}).compared
+    # The reading is the angle of exp(i p) (1 + u z + w z^2), z = exp(-i p), to u z + (w - u^2 / 2) z^2.
+    u, w = 0.1 / 1.1, 0.1 / 1.1
+    expected = [u * 206264.8 / 2000, (w - 0.5 * u**2) * 206264.8 / 2000]
+    assert [each.true for each in compared] == pytest.approx(expected, rel=1e-6)
+
+
 def test_growths_are_compared_in_per_cent_and_springs_as_compliances(tools: Any) -> None:
     judged = tools("blindscore").judged
     hidden = secret("torque_modulation", also=("compliance",), growth_per_nm=0.03)
