@@ -54,3 +54,20 @@ def test_a_lagging_motor_turns_where_it_turned_and_not_where_it_was_told_to():
     path = driving_angle(command, np.round(motor / count) * count)
     assert turns(path) == turns(motor)
     assert np.max(np.abs(path - motor)) < 1.5 * count
+
+
+@pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])
+def test_what_follows_the_acceleration_is_as_large_as_it_is_at_any_sampling_rate(rate_hz: float) -> None:
+    """Moves that speed up and slow down as half a cosine in 0.25 s, told in whole counts."""
+    time = np.arange(0.0, 60.0, 1.0 / rate_hz)
+    turn, amplitude = 2.0 * np.pi / 0.5, 45.0
+    since = np.mod(time, 0.8137)
+    number = np.floor(time / 0.8137)
+    moving = since < 0.5
+    way = np.where(moving, since / 0.5 - np.sin(turn * since) / (2.0 * np.pi), 1.0)
+    command = amplitude * (number + way)
+    true = np.where(moving, 2.0 * amplitude / 0.5 * np.pi / 0.5 * np.sin(turn * since), 0.0)
+    count = 360.0 / 65536
+    told = np.round(command / count) * count
+    acceleration = kinematics(told, told, time, reading_of(told))[2]
+    assert true @ acceleration / (acceleration @ acceleration) == pytest.approx(1.0, abs=0.01)
