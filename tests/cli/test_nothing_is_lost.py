@@ -82,8 +82,8 @@ def test_what_nohup_ignores_stays_ignored(tmp_path):
 
 
 def test_a_disk_that_fills_while_the_axis_moves_takes_no_figures_along(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "hdbridge", "step", "article", "--simulate", "--count", "2",
+    done = subprocess.run(  # -B: bytecode cut off at 100 bytes would make every later process fail
+        [sys.executable, "-B", "-m", "hdbridge", "step", "article", "--simulate", "--count", "2",
          "--scheme", "none", "--json", "out.json", "--html", "out.html", "--record", "kept"],
         cwd=tmp_path, capture_output=True, text=True, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),

@@ -24,7 +24,7 @@ def test_the_old_file_stands_and_no_part_of_the_new_one_remains(tmp_path):
     path = tmp_path / "model.yaml"
     path.write_text("old")
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(path)], capture_output=True, text=True, check=True
+        [sys.executable, "-B", "-c", SCRIPT, str(path)], capture_output=True, text=True, check=True
     )
     assert "model.yaml: cannot be written" in done.stdout
     assert path.read_text() == "old"

@@ -59,7 +59,7 @@ def test_free_space_is_asked_before_and_what_is_missing_is_counted(tmp_path):
 
 def test_a_write_that_fails_leaves_a_whole_file_and_is_made_up_for(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
+        [sys.executable, "-B", "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
     )
     counts, *told = done.stdout.splitlines()
     assert counts == "750 500 2", done.stdout
