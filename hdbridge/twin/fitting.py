@@ -41,16 +41,14 @@ EARNED = 8.0
 to be gone on from: exp(8) to one."""
 SURE = 4.0
 """... and its distance from where it was, in standard deviations."""
-FILTER_SHARES = (0.25, 0.6, 0.9)
+FILTER_SHARES = (0.25, 0.9)
 """Shares of the lag that may be the command filter's, to begin with."""
-MOTOR_INERTIAS = (0.6, 1.6)
-"""... and what the motor's inertia may be, in those of the start: no regression shows it."""
 FIRST_STEPS = 6
-"""From each of these starts a fit goes so many steps: with three that of a drawn axis came to 2.4 times the
-least misfit in `NEAR_STEPS`, with six to 1.1 times."""
-HEATS = ((3, 4), (1, 8))
-"""From the start, and so many of the others that came out best, it goes so many more."""
-NEAR_STEPS = 12
+"""From each of the starts a fit goes so many steps, as many more from the first and the best of the others,
+and as many from the better of these with its gains exchanged;"""
+MORE_STEPS = 10
+"""... then so many from the first, and the best of what else there is."""
+NEAR_STEPS = 30
 """Steps at most over all of the recording, by the noise that is expected;"""
 STEPS = 30
 """... and to the end."""
@@ -149,23 +147,27 @@ def loops_about(replays: Replays, fitted: Fitted) -> Loops:
 
 
 def _starts(truth: Truth) -> list[Truth]:
-    """The truth, and with several motor inertias and command filters that make the same lag.
-
-    The dead time is the rest of the lag. From each of them a fit finds the nearest of the misfit's minima.
-    """
+    """The truth, and with other shares of command filter and dead time in the same lag."""
     lag_ms = 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
     return [truth] + [
         with_values(
-            truth,
-            {
-                "motor inertia": times * truth.motor.inertia_kg_m2,
-                "command filter": 0.5 * share * lag_ms,
-                "servo dead time": (1.0 - share) * lag_ms,
-            },
+            truth, {"command filter": 0.5 * share * lag_ms, "servo dead time": (1.0 - share) * lag_ms}
         )
-        for times in MOTOR_INERTIAS
         for share in FILTER_SHARES
     ]
+
+
+def exchanged(truth: Truth) -> Truth:
+    """The truth with position gain and the inverse of the integral time exchanged.
+
+    While the axis moves that is the same loop, for only their sum and their product are in its answer: each
+    of the two has a minimum of its own.
+    """
+    servo = truth.servo
+    return with_values(
+        truth,
+        {"position gain": 1e3 / servo.integral_time_ms, "integral time": 1e3 / servo.position_gain_per_s},
+    )
 
 
 def _best_of(
@@ -176,15 +178,18 @@ def _best_of(
     The first is where the simulation stands: what motion does not show keeps its value, unless another place
     is better beyond doubt in the end. Of the others those that fall behind are given up.
     """
-    noise = expected(replays.data)
-    own, *others = (solve(replays, each, parameters, prior, FIRST_STEPS, known=noise) for each in starts)
-    for places, steps in HEATS:
-        others = sorted(others, key=lambda each: each.cost)[:places]
-        own, *others = (
-            solve(replays, each.truth, parameters, prior, steps, known=noise, near=each)
-            for each in (own, *others)
-        )
-    return (own, others[0]) if others[0].cost < own.cost else (own,)
+
+    def led(start: Truth, steps: int, near: Fitted | None = None) -> Fitted:
+        return solve(replays, start, parameters, prior, steps, known=expected(replays.data), near=near)
+
+    def cost(fitted: Fitted) -> float:
+        return fitted.cost
+
+    own, *others = (led(each, FIRST_STEPS) for each in starts)
+    own, other = (led(each.truth, FIRST_STEPS, each) for each in (own, min(others, key=cost)))
+    third = led(exchanged(min(own, other, key=cost).truth), FIRST_STEPS)
+    own, other = (led(each.truth, MORE_STEPS, each) for each in (own, min(other, third, key=cost)))
+    return (own, other) if other.cost < own.cost else (own,)
 
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:

@@ -58,8 +58,10 @@ def trips(truth: Truth, folder: Path) -> Path:
             bench.hold(0.6)
             ends.append(bench.samples * bench.cycle_s)
 
-    record = record_of(truth, lead)
+    led = record_of(truth, lead)
     legs = tuple(Segment(kind="step", start_s=a, end_s=b) for a, b in pairwise(ends))
+    # A drive is told whole counts; what it was led by here has fractions of them.
+    record = replay_directly(Recording(led, legs, axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
     Recording(record, legs, axis="demo", ratio=50.0).save(folder)
     return folder
 
@@ -205,6 +207,7 @@ def test_an_axis_is_learned_and_a_later_change_of_it_is_named(profile: Path) -> 
     assert lower < 0.036
     assert upper > 0.032
     assert learned.motor.coulomb_nm == pytest.approx(0.034, rel=0.1)
+    assert learned.motor.inertia_kg_m2 == pytest.approx(3.4e-5, rel=0.3)
     run_here(profile, "model", "commit", profile, "--twin")
     same = run_here(profile, "twin", profile, recording, "--check")
     assert same.stdout.startswith("Nothing has changed since the twin was made.")
