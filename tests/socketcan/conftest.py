@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -194,10 +194,38 @@ def master_on(channel: str, profile: Path | None = None, *, shared: bool = False
             drive.close()
 
 
+class Drives:
+    """The simulated drive in a process that is used for as long as it lives: it takes 3 s to begin."""
+
+    def __init__(self) -> None:
+        self._stack = ExitStack()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def running(self, channel: str) -> subprocess.Popen[bytes]:
+        if self._process is None or self._process.poll() is not None:
+            self.end()
+            self._process = self._stack.enter_context(drive_process(channel))
+        return self._process
+
+    def end(self) -> None:
+        self._stack.close()
+        self._process = None
+
+
+@pytest.fixture(scope="module")
+def drives() -> Iterator[Drives]:
+    made = Drives()
+    yield made
+    made.end()
+
+
 @pytest.fixture
-def simulated(interface: str) -> Iterator[subprocess.Popen[bytes]]:
-    with drive_process(interface) as process:
-        yield process
+def simulated(
+    interface: str, drives: Drives, request: pytest.FixtureRequest
+) -> Iterator[subprocess.Popen[bytes]]:
+    yield drives.running(interface)
+    if "may_configure" in request.fixturenames:  # the interface has been taken away from it
+        drives.end()
 
 
 @pytest.fixture
