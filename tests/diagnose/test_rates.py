@@ -42,7 +42,7 @@ def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
 
 
 def test_a_hidden_cause_is_named_first() -> None:
-    verdicts = judged(CAUSES[::3], [1])
+    verdicts = judged(CAUSES[::6], [1])
     holds(verdicts, 0.95, "first_right")
     holds(verdicts, 0.95, "silent")
 

@@ -55,8 +55,12 @@ def said(program: str, *arguments: object, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_layout_has_the_same_name_in_each_process_and_no_other_has_it() -> None:
-    small, large = said(NAME, 16, 32)
+def test_a_layout_has_the_same_name_in_each_process_and_no_other_has_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["", "16", "32"])
+    exec(NAME, {})
+    small, large = capsys.readouterr().out.splitlines()
     assert small != large
     assert said(NAME, 32) == [large]
 
