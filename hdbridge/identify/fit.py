@@ -138,28 +138,27 @@ def _search(state: State, warnings: list[str]) -> State:
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
     columns = simple.in_addition().and_also(state.candidate_waves())
 
-    def found(
-        starts: list[Start], effects: tuple[Effect, ...]
-    ) -> tuple[float, tuple[Effect, ...], list[Start]]:
-        begun = state._replace(design=state.design.beginning(starts))
-        return *searched(begun.under(begun.precision(), columns), effects), starts
+    def found(begun: State) -> tuple[Solution, State]:
+        return searched(begun.under(begun.precision(), columns), begun.effects), begun
 
-    best = found(list(state.design.starts), state.effects)
+    best = found(state)
     for number, chain in enumerate(state.design.samples.chains):
-        if chain.start is None and best[1]:
-            _, effects, starts = best
-            others = (
-                [*starts[:number], each, *starts[number + 1 :]] for each in (Start.VIRGIN, Start.BACKWARD)
-            )
-            best = min((best, *(found(each, effects) for each in others)), key=lambda each: each[0])
-    for each in best[1]:
+        if chain.start is None and state.effects:
+            begun = best[1]._replace(effects=best[0].effects)
+            starts = begun.design.starts
+            others = [
+                begun._replace(design=begun.design.beginning([*starts[:number], each, *starts[number + 1 :]]))
+                for each in (Start.VIRGIN, Start.BACKWARD)
+            ]
+            best = min((best, *map(found, others)), key=lambda each: each[0].chi_square)
+    solution, state = best
+    for each in solution.effects:
         if each.violations():
             warnings.append(f"{each.name}: left out, the record shows it only with an impossible sign")
-    effects = tuple(each for each in best[1] if not each.violations())
-    design = state.design.beginning(best[2]).blurred(effects)
-    state = state._replace(design=design, effects=effects)
+    effects = tuple(each for each in solution.effects if not each.violations())
+    state = state._replace(design=state.design.blurred(effects), effects=effects)
     solution = state.under(state.precision(), columns).fit(effects, LINEAR_ONLY)
-    return state._replace(noise=fit_noise(solution.residual, design.blocks, solution.jacobian.shape[1]))
+    return state._replace(noise=fit_noise(solution.residual, state.design.blocks, solution.jacobian.shape[1]))
 
 
 def _settle(state: State) -> tuple[State, Solution, System]:
