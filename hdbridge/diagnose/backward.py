@@ -45,11 +45,9 @@ def _swapped(search: Search, fitted: Fitted) -> Fitted:
     """With the best one in the place of each finding that is taken out, and the law chosen anew."""
     for place in range(search.base, len(fitted.hypothesis.effects)):
         without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
-        search.forget()
         other = search.best_addition(without, search.cost(fitted))
         if other is not None and search.cost(other) < search.cost(fitted):
             fitted = other
-    search.forget()
     return fitted
 
 

@@ -39,7 +39,7 @@ def identifiability(
     basis = orthonormal(fitted.linearised.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
-        columns = estimator.columns(candidate.effect, fitted.hypothesis.start)[::stride]
+        columns = estimator.columns(candidate, fitted.hypothesis.start)[::stride]
         span = np.quantile(columns, 0.998, axis=0) - np.quantile(columns, 0.002, axis=0)
         seen = span > 1e-12
         if not np.any(seen):
@@ -48,8 +48,8 @@ def identifiability(
         rest = unit - basis @ (basis.T @ unit)
         squares = np.sum(rest**2, axis=0)
         size, share = np.sqrt(stride * np.max(squares)), np.max(squares / np.sum(unit**2, axis=0))
-        if candidate.cause not in best or size > best[candidate.cause][0]:
-            best[candidate.cause] = float(size), float(share), rest, candidate.effect
+        if candidate.name not in best or size > best[candidate.name][0]:
+            best[candidate.name] = float(size), float(share), rest, candidate
     spans = {name: orthonormal(rest) for name, (_, _, rest, _) in best.items()}
     result: dict[str, Identifiability] = {}
     for cause in causes():
@@ -74,10 +74,10 @@ def identifiability(
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
     for candidate in candidates(estimator.data, ()):
         # What is not measured may look like what is.
-        each = result[candidate.cause]
-        for kind, _ in lookalikes(candidate.effect, estimator.data.ratio):
+        each = result[candidate.name]
+        for kind, _ in lookalikes(candidate, estimator.data.ratio):
             if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
-                result[candidate.cause] = replace(each, aliases=(*each.aliases, kind.name))
+                result[candidate.name] = replace(each, aliases=(*each.aliases, kind.name))
     return result
 
 

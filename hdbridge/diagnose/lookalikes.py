@@ -33,7 +33,6 @@ def plausible_only(search: Search, fitted: Fitted) -> Fitted:
         search.refusals[name] = reasons[place]
         gone.add(name)
         without = search.estimator.fit(fitted.hypothesis.without(place))
-        search.forget()
         fitted = search.best_addition(without, left_out=gone) or without
     return fitted
 

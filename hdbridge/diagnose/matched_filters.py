@@ -14,7 +14,6 @@ import numpy as np
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Sought
 from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.estimation.hypothesis import Estimator, Fitted
-from hdbridge.estimation.screening import Candidate
 from hdbridge.estimation.shapes import shape_value
 from hdbridge.observations.reading import median_deviation
 from hdbridge.units import DEG_PER_TURN
@@ -35,12 +34,12 @@ PEAKS = 3
 """So many of the highest lines are fitted."""
 
 
-def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
+def found(estimator: Estimator, fitted: Fitted) -> list[Effect]:
     """Of each kind that is sought, those that promise most on what a fit leaves."""
     residual, load_deg = fast_residual(estimator, fitted)
     estimator.with_load_angle(load_deg)
     present = fitted.hypothesis.effects
-    result: list[Candidate] = []
+    result: list[Effect] = []
     shapes: Iterator[tuple[float, ...]]
     for kind in CATALOGUE.values():
         match kind.sought:
@@ -52,7 +51,7 @@ def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
                 shapes = tones(estimator, residual, [each for each in present if each.sought is Sought.TONE])
             case Sought.LINE:
                 lines = load_lines(estimator, residual, load_deg)
-                result += [Candidate(kind.name, each) for at in lines for each in kind.at_lines(at)]
+                result += [each for at in lines for each in kind.at_lines(at)]
                 continue
             case _:
                 continue
@@ -61,7 +60,7 @@ def found(estimator: Estimator, fitted: Fitted) -> list[Candidate]:
         names = [each.name for each in kind.shape]
         for each in shapes:
             shape = dict(zip(names, each, strict=True))
-            result.append(Candidate(kind.name, example.fitted(one, shape)))
+            result.append(example.fitted(one, shape))
     return result
 
 

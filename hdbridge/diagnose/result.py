@@ -67,7 +67,7 @@ class Finding:
     peak_arcsec: float
     """Half the span of what it does in this record."""
     robust: float = 0.0
-    """Block-robust chi square."""
+    """Chi square that it takes away; of a change within the model that of the change itself."""
     left_arcsec: float = 0.0
     """Of something unexplained: root mean square that is left beyond the noise."""
     taken_arcsec: float = 0.0

@@ -44,7 +44,6 @@ class Search:
         """How many effects of each hypothesis are the baseline's."""
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
-        self._refused: set[object] = set()
         self.refusals: dict[str, str] = {}
         """Causes that were refused though the evidence spoke for them, with the reason in words."""
         law = next((each for each in self._base if each.part is Part.LOOP), None)
@@ -65,7 +64,6 @@ class Search:
         other = self._begin()
         self.estimator.loop_sign *= -1.0
         rival = self.best_addition(known) or known
-        self.forget()
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
 
@@ -79,17 +77,16 @@ class Search:
         left = np.mean((trail.fitted.residual**2 - 1.0) / self.estimator.weight**2)
         if not names or left < self.scales.floor_arcsec**2:
             return trail
-        self.forget()
         other = self._greedily({names[0]})
-        self.forget()
         if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
             return other
         return trail
 
     def _greedily(self, left_out: Set[str] = frozenset()) -> Trail:
         fitted, law_gain = self.with_best_law(self._begin())
+        refused: set[object] = set()
         for number in range(MOST):
-            found = self.best_addition(fitted, left_out=left_out)
+            found = self.best_addition(fitted, left_out=left_out, refused=refused)
             if number < ANEW and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
@@ -132,20 +129,22 @@ class Search:
 
     # --- one more cause
 
-    def forget(self) -> None:
-        """Candidates that were refused with other findings in the fit are looked at again."""
-        self._refused.clear()
-
     def best_addition(
-        self, fitted: Fitted, most: float = math.inf, left_out: Set[str] = frozenset()
+        self,
+        fitted: Fitted,
+        most: float = math.inf,
+        left_out: Set[str] = frozenset(),
+        refused: set[object] | None = None,
     ) -> Fitted | None:
         """With the best cause more, none of those ``left_out``, refitted; None where none earns its keep.
 
-        One that costs more than ``most`` is of no use, and need not be the best that there is.
+        One that costs more than ``most`` is of no use, and need not be the best that there is. Candidates
+        that were ``refused`` are passed over, and further ones noted there.
         """
+        refused = set() if refused is None else refused
         best: tuple[float, Fitted] | None = None
-        for score in self._shortlist(fitted, left_out):
-            cause = score.candidate.cause
+        for score in self._shortlist(fitted, left_out, refused):
+            cause = score.effect.name
             trial = self._restated(self._with(fitted, score, most), cause)
             toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
             net = fitted.chi_square - trial.chi_square - toll
@@ -154,7 +153,7 @@ class Search:
             if reason:
                 self.refusals[cause] = reason
             if none or reason:
-                self._refused.add(_key(score))
+                refused.add(_key(score))
             elif best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
@@ -211,7 +210,7 @@ class Search:
         causes = {each.name for each in fitted.hypothesis.effects[self.base :]}
         asked = {alias for cause in causes for alias in aliases_of(cause)}
         asked |= {
-            each.candidate.cause
+            each.effect.name
             for each in self._scores(fitted)
             if each.gain > self.scales.penalty * each.freedom + self.scales.enter
         }
@@ -224,7 +223,9 @@ class Search:
         low, high = np.quantile(values, [0.002, 0.998])
         return 0.5 * float(high - low)
 
-    def _shortlist(self, fitted: Fitted, left_out: Set[str]) -> list[Score]:
+    def _shortlist(
+        self, fitted: Fitted, left_out: Set[str], refused: Set[object] = frozenset()
+    ) -> list[Score]:
         """The best candidate of each of the best causes, and of each number of parameters that it may have.
 
         One of more parameters gains more only once its shapes are fitted.
@@ -233,24 +234,24 @@ class Search:
         scores = [
             each
             for each in self._scores(fitted)
-            if _key(each) not in self._refused
-            and each.candidate.cause not in passed
-            and not (each.candidate.effect.waves() and each.share < self.scales.wave_share_left)
+            if _key(each) not in refused
+            and each.effect.name not in passed
+            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
             if net[id(each)] > self.scales.enter:
-                best.setdefault((each.candidate.cause, each.freedom), each)
+                best.setdefault((each.effect.name, each.freedom), each)
         causes = list(dict.fromkeys(cause for cause, _ in best))[:BEST]
         return [each for (cause, _), each in best.items() if cause in causes]
 
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)
         scores = screen.scores(fitted)
-        for candidate in matched_filters.found(self.estimator, fitted):
-            columns = self.estimator.columns(candidate.effect, fitted.hypothesis.start)
-            scores.append(score_of(candidate, self.estimator.weighted(columns), fitted))
+        for effect in matched_filters.found(self.estimator, fitted):
+            columns = self.estimator.columns(effect, fitted.hypothesis.start)
+            scores.append(score_of(effect, self.estimator.weighted(columns), fitted))
         return scores
 
     def _screen(self, fitted: Fitted) -> Screen:
@@ -287,10 +288,9 @@ class Search:
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
-        self.forget()
         best: dict[str, Fitted] = {}
         for score in self._shortlist(without, {cause}):
-            name = score.candidate.cause
+            name = score.effect.name
             trial = self._with(without, score, most)
             if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
                 continue
@@ -300,7 +300,7 @@ class Search:
 
     def _with(self, fitted: Fitted, score: Score, most: float) -> Fitted:
         """With one of the candidates more; roughly where it costs more than ``most``."""
-        hypothesis = joined(fitted.hypothesis, score.candidate.effect, self.base)
+        hypothesis = joined(fitted.hypothesis, score.effect, self.base)
         return self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
 
 
@@ -321,7 +321,7 @@ def _last(fitted: Fitted, cause: str) -> int:
 
 def _key(score: Score) -> object:
     """What distinguishes one candidate from another: its kind, its coefficients, its degrees of freedom."""
-    effect = score.candidate.effect
+    effect = score.effect
     if effect.sought is not None:
         return effect.name
     return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)

@@ -19,24 +19,16 @@ from hdbridge.estimation.hypothesis import Estimator, Fitted
 SHARE_LEFT = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """One effect that might be there."""
-
-    cause: str
-    effect: Effect
-    """With the shape of this point of the grid; its coefficients are of no account."""
-
-
-def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Candidate]:
-    """What the catalogue proposes for a record and the model ``base``; all whose channels are there.
+def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:
+    """What the catalogue proposes for a record and the model ``base``, over grids of shapes; all whose
+    channels are there. Their coefficients are of no account.
 
     To be ``screened`` are those that would be an addition to the model, and that a grid covers; else all.
     """
     kinds = [CATALOGUE[each] for each in causes()]
     if screened:
         kinds = [each for each in kinds if each.changes is None and each.sought is None]
-    return [Candidate(kind.name, each) for kind in kinds for each in proposed(kind, observations, base)]
+    return [each for kind in kinds for each in proposed(kind, observations, base)]
 
 
 def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
@@ -49,7 +41,7 @@ def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effe
 class Score:
     """What a candidate promises."""
 
-    candidate: Candidate
+    effect: Effect
     gain: float
     """Chi square that it would take away, linearised."""
     freedom: int
@@ -61,9 +53,9 @@ class Score:
 class Screen:
     """The weighted columns of all candidates, made once."""
 
-    def __init__(self, estimator: Estimator, candidates: Sequence[Candidate], start: Start) -> None:
+    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start) -> None:
         self._candidates = tuple(candidates)
-        blocks = [estimator.weighted(estimator.columns(each.effect, start)) for each in candidates]
+        blocks = [estimator.weighted(estimator.columns(each, start)) for each in candidates]
         self._slices: list[slice] = []
         at = 0
         for block in blocks:
@@ -78,27 +70,27 @@ class Screen:
         shadow = fit.basis.T @ matrix
         moment = matrix.T @ fit.residual - shadow.T @ fit.slack
         return [
-            _score(candidate, np.diag(gram), gram - shadow[:, part].T @ shadow[:, part], moment[part])
-            for candidate, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
+            _score(effect, np.diag(gram), gram - shadow[:, part].T @ shadow[:, part], moment[part])
+            for effect, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
         ]
 
 
-def score_of(candidate: Candidate, columns: FloatArray, fitted: Fitted) -> Score:
+def score_of(effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
     """The score of one candidate from its weighted columns."""
-    return _score(candidate, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
+    return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
 
 
-def _score(candidate: Candidate, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
+def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
     """From the squares of its columns, and what a hypothesis leaves of their Gram matrix and moment."""
     seen = size > 0.0
     if not np.any(seen):
-        return Score(candidate, 0.0, 0, 0.0)
+        return Score(effect, 0.0, 0, 0.0)
     scale = np.sqrt(size[seen])
     left = gram[np.ix_(seen, seen)] / np.outer(scale, scale)
     share = float(np.max(np.diag(left)))
     values, vectors = np.linalg.eigh(left)
     kept = values > SHARE_LEFT
     if not np.any(kept):
-        return Score(candidate, 0.0, 0, share)
+        return Score(effect, 0.0, 0, share)
     inner = vectors[:, kept].T @ (moment[seen] / scale)
-    return Score(candidate, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
+    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)

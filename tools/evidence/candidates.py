@@ -120,7 +120,7 @@ class Screen:
         )
         for each in matched_filters.found(evidence.estimator, left):  # type: ignore[arg-type]
             places = 1.0
-            if not free_shapes(each.effect, FOUND):
-                is_line = each.effect.sought is Sought.LINE
+            if not free_shapes(each, FOUND):
+                is_line = each.sought is Sought.LINE
                 places = matched_filters.BINS / 2 if is_line else float(len(left.residual))
-            yield Candidate(each.effect, places)
+            yield Candidate(each, places)
