@@ -14,11 +14,13 @@ import signal
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from hdbridge.daemon.logs import LogSettings
-from hdbridge.daemon.machine import Machine
 from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machine import Machine
 
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
