@@ -2,7 +2,7 @@
 
 The residuals of following error, torque and load angle are scaled by what each channel is left with; a weak
 prior about the start holds what the motion does not show. The misfit has long, narrow and curved valleys, for
-filter, dead time and feed-forwards make up for each other: steps of several lengths are tried, each some way
+filter, dead time and feed-forwards make up for each other: steps of several dampings are tried, each some way
 along a path that turns with the valley. The covariance allows for residuals that go together within a leg (a
 sandwich of the Jacobian and the legs' own gradients), because what a replay cannot follow is no white noise.
 """
@@ -34,11 +34,11 @@ RESPONSE = 1.0
 motion shows less."""
 FARTHEST = 0.1
 """The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
-LONGEST = 4.0
-"""The longest step that is tried, in spreads of the parameters. Far from the minimum the linear reckoning
-would take what the motion shows least to where it shows nothing any more, and hardly ever comes back."""
-LENGTHS = (1.0, 0.4, 0.15, 0.05)
-"""How long the steps that are tried are, as shares of that, or of the whole step where it is shorter."""
+DAMPINGS = (0.0, 0.001, 0.01, 0.1)
+"""Shares of the information's diagonal that are added to it (Marquardt)."""
+LONGEST = (4.0, 1.5, 0.6, 0.2)
+"""How long each of these steps is at most, in spreads of the parameters. Far from the minimum the linear
+reckoning would take what the motion shows least to where it shows nothing any more, and hardly comes back."""
 ALONG = ((1.0,), (0.4, 0.15))
 """How far along each of these steps to go; less far only where that brings nothing."""
 PROBED = 0.1
@@ -245,21 +245,18 @@ def _damped_steps(
     spread: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> list[_Damped]:
-    """Steps by the linear reckoning, within the bounds, the longest first.
+    """Steps by the linear reckoning, within the bounds, the boldest first (Levenberg, Marquardt).
 
-    The best of each of some lengths in units of the spreads (Levenberg; a trust region).
     All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
     """
     information = information_of(slopes, spread)
     gradient = slopes.T @ left + (place - prior) / spread**2
-    worth, directions = _eigen(slopes, spread)
-    along = directions.T @ (gradient * spread)
     low, high = bounds
     room = (np.minimum(low - place, -1e-12), np.maximum(high - place, 1e-12))
-    longest = min(LONGEST, _length(along, worth, 0.0))
     found = []
-    for share in LENGTHS:
-        damped = information + np.diag(_damping(along, worth, share * longest) / spread**2)
+    for damping, longest in zip(DAMPINGS, LONGEST, strict=True):
+        damped = information + damping * np.diag(np.diag(information))
+        damped += np.diag(_held(damped, gradient, spread, longest) / spread**2)
         root = np.linalg.cholesky(damped)
         # Least squares of which these are the normal equations.
         target = -np.linalg.solve(root, gradient)
@@ -267,17 +264,15 @@ def _damped_steps(
     return found
 
 
-def _length(along: FloatArray, worth: FloatArray, damping: float) -> float:
-    """Of a damped step, in spreads, by gradient and information along the principal directions."""
-    return float(np.linalg.norm(along / (worth + damping)))
+def _held(information: FloatArray, gradient: FloatArray, spread: FloatArray, longest: float) -> float:
+    """What is to be added to the information, in units of the prior's, for a step no longer than this."""
+    worth, directions = np.linalg.eigh(information * np.outer(spread, spread))
+    along = directions.T @ (gradient * spread)
 
+    def beyond(more: float) -> float:
+        return float(np.linalg.norm(along / (worth + more))) - longest
 
-def _damping(along: FloatArray, worth: FloatArray, length: float) -> float:
-    """What has to be added to the information for a step that is no longer than this."""
-    most = float(np.linalg.norm(along)) / length if length > 0.0 else 0.0
-    if most == 0.0 or _length(along, worth, 0.0) <= length:
-        return 0.0
-    return float(brentq(lambda damping: _length(along, worth, damping) - length, 0.0, most))
+    return float(brentq(beyond, 0.0, np.linalg.norm(along) / longest)) if beyond(0.0) > 0.0 else 0.0
 
 
 def _ends(place: FloatArray, moves: FloatArray, low: FloatArray, high: FloatArray) -> list[FloatArray]:
