@@ -80,14 +80,12 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
     needed = estimator.scales.robust + estimator.scales.robust_more * (len(_evident(effect)) - 1)
-    robust = robust_chi_square(estimator, fitted, place)
-    if robust < needed:
-        return Gate(robust, needed, "not seen in enough independent stretches")
     laws = _other_laws(estimator, fitted, place)
-    if laws.shape[1]:
-        robust = min(robust, robust_chi_square(estimator, fitted, place, laws=laws))
-        if robust < needed:
-            return Gate(robust, needed, "may be what the law of another cause is wrong by")
+    robust = robust_chi_square(estimator, fitted, place, laws=laws)
+    if robust < needed:
+        if robust_chi_square(estimator, fitted, place) < needed:
+            return Gate(robust, needed, "not seen in enough independent stretches")
+        return Gate(robust, needed, "may be what the law of another cause is wrong by")
     if effect.tracker().memory_deg > 0.0:
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
         robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
@@ -96,6 +94,8 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     stretch = effect.shows(estimator.motion)
     if stretch is not None:
         rows = stretch.rows[estimator.index]
+        others = fitted.hypothesis.without(place)
+        laws = np.hstack([laws, estimator.angle_discrepancy(others.effects, others.start)])
         robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows, laws=laws))
         if robust < needed:
             return Gate(robust, needed, stretch.otherwise)

@@ -24,6 +24,7 @@ from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.separable import Separable, Solution
 from hdbridge.estimation.shapes import unit
 from hdbridge.estimation.terms import LOCAL, Column, Effort, Nuisances, Prior, Terms, unknown
+from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 """A search compares hypotheses whose chi squares are tens and more apart."""
@@ -177,6 +178,19 @@ class Estimator:
     def law_discrepancy(self, effect: Effect, start: Start) -> FloatArray:
         """What an effect's law may be wrong by, a weighted column per standard deviation, shape (m, k)."""
         return self.weighted(self.at_points(effect.law_discrepancy(self.data.full.motion, start)))
+
+    def angle_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
+        """What the driving angle may be wrong by within its counts, a weighted column, shape (m, 1).
+
+        The error is against that angle, and a loop is steepest where the motor stops.
+        """
+        full = self.data.full
+        other = replace(full.motion, motor_deg=full.rested_deg)
+        change = (full.rested_deg - full.motor_deg) * (ARCSEC_PER_DEG / full.ratio)
+        for each in effects:
+            if each.tracker().memory_deg > 0.0:
+                change = change + each.predict(other, start) - each.predict(full.motion, start)
+        return self.weighted(self.at_points(change)[:, np.newaxis])
 
     def free_loop(self, start: Start) -> Nuisances:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with

@@ -167,6 +167,7 @@ def _averaged(full: Samples, runs: IntArray) -> Samples:
     return replace(
         full,
         motion=of_each(full.motion, lambda values: means(values, runs)),
+        rested_deg=means(full.rested_deg, runs),
         load_deg=means(full.load_deg, runs),
         error_arcsec=means(full.error_arcsec, runs),
         sigma_arcsec=np.sqrt(means(full.sigma_arcsec**2, runs) / size),

@@ -57,6 +57,8 @@ class Samples:
     ratio: float
     motion: Motion
     """Driving angle, time, speed, acceleration and the channels that were recorded."""
+    rested_deg: FloatArray
+    """Another driving angle that was read alike (`hdbridge.observations.kinematics.Driven`)."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
@@ -183,8 +185,9 @@ def observe(
         kinematics(position[rows], None if target is None else target[rows], time[rows], reading)
         for rows in rows_of
     ]
-    driving, speed, acceleration = (np.concatenate(each) for each in zip(*pieces, strict=True))
-    driving.setflags(write=False)  # so that where it reverses is worked out once
+    driving, speed, acceleration, rested = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    for angle in (driving, rested):
+        angle.setflags(write=False)  # so that where it reverses is worked out once
     motion = Motion(driving, time, record.measured, speed, acceleration, load_deg=driving / ratio)
     against = driving if against_command and target is not None else position
     error = (record.load_position_deg - against / ratio) * ARCSEC_PER_DEG
@@ -197,6 +200,7 @@ def observe(
     return Samples(
         ratio=ratio,
         motion=motion,
+        rested_deg=rested,
         load_deg=record.load_position_deg,
         error_arcsec=error,
         sigma_arcsec=sigma,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,18 @@ SETTLE_S = 0.1
 20 Hz."""
 
 
+class Driven(NamedTuple):
+    """What drove the axis in one record, arrays of shape (n,)."""
+
+    motor_deg: FloatArray
+    speed_deg_s: FloatArray
+    acceleration_deg_s2: FloatArray
+    rested_deg: FloatArray
+    """The angle if at rest the motor stood in the middle of the counts that it was read in, and not as near
+    to where it was told to be as they allow; the same without a command.
+    """
+
+
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
     """How finely the motor's angle was read: one encoder for all parts, so the one that saw it best tells."""
     largest = max(parts, key=lambda rows: rows.stop - rows.start)
@@ -46,10 +59,8 @@ def settling(fast: BoolArray, time_s: FloatArray) -> BoolArray:
     return np.asarray(fast | ((time_s - last < SETTLE_S) & (time_s >= last)))
 
 
-def kinematics(
-    position: FloatArray, target: FloatArray | None, time: FloatArray, reading: Reading
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Driving angle, speed and acceleration of one record."""
+def kinematics(position: FloatArray, target: FloatArray | None, time: FloatArray, reading: Reading) -> Driven:
+    """What drove the axis in one record."""
     steps = np.diff(time)
     period_s = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     window = max(1, round(WINDOW_S / period_s)) | 1
@@ -65,7 +76,18 @@ def kinematics(
         span = 4 * window + 1
         resting |= np.abs(_slope(driving, time, span)) * span * np.median(np.diff(time)) < 0.5 * count
     speed[resting] = acceleration[resting] = 0.0
-    return driving, speed, acceleration
+    rested = driving if target is None else _rested(driving, position, resting, window, 0.5 * count)
+    return Driven(driving, speed, acceleration, rested)
+
+
+def _rested(
+    driving: FloatArray, position: FloatArray, resting: BoolArray, window: int, band: float
+) -> FloatArray:
+    path = driving.copy()
+    edges = np.flatnonzero(np.diff(resting, prepend=False, append=False))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        path[first:end] = uniform_filter1d(position[first:end], 2 * window + 1, mode="nearest")
+    return steadied(path, path, band)
 
 
 def _driving(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from hdbridge.diagnose.acceptance import gate
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import ChannelSkew, Effect, LoadOrders, LocalDefect, Start, VelocityWindup
+from hdbridge.effects import ChannelSkew, Creep, Effect, LoadOrders, LocalDefect, Start, VelocityWindup
+from hdbridge.effects.creep import Relaxation
 from hdbridge.effects.orders import orders_from
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 from hdbridge.estimation.observed import gather
@@ -79,6 +81,29 @@ def test_what_is_there_without_a_delay_is_no_evidence_of_one(
     others = (*model.effects, *(each.candidate(50.0) for each in beside))
     fitted = estimator.fit(Hypothesis((*others, ChannelSkew.candidate(50.0)), Start.FORWARD))
     found = gate(estimator, fitted, len(others))
+    assert found.robust < 0.5 * found.needed
+
+
+def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_creep(
+    plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It moves 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and lets go."""
+    path, told = plant.path, []
+
+    def ahead(plan: Any, rng: np.random.Generator) -> Any:
+        time_s, motor, legs = path(plan, rng)
+        told.append(motor)
+        steps = np.sign(np.diff(motor, prepend=motor[:1]))
+        last = np.maximum.accumulate(np.where(steps != 0.0, np.arange(len(steps)), 0))
+        still_s = time_s - time_s[last]
+        return time_s, motor + 0.8 * 360.0 / 8000.0 * steps[last] * (still_s < 0.3), legs
+
+    monkeypatch.setattr(plant, "path", ahead)
+    record = columns(slow_noise=0.0)
+    estimator = Estimator(gather(Record({**record, "motor_target_deg": told[0][::10]}), 50.0))
+    base = estimator.fit(Hypothesis(model.effects, Start.FORWARD)).hypothesis
+    creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
+    found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
     assert found.robust < 0.5 * found.needed
 
 
