@@ -21,6 +21,9 @@ from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 MOST = 6
 BEST = 3
 """So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
+RARE, RARE_SHARE = 20, 0.002
+"""Samples, and no more than this share of them, in which an effect may be larger than it is said to be. A
+damaged tooth is passed in a few hundred samples of the longest record."""
 ANEW = 3
 """So often the law of the loop is chosen anew after a pick."""
 
@@ -218,9 +221,10 @@ class Search:
         return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
 
     def peak(self, fitted: Fitted, place: int) -> float:
-        """Half the span of what an effect does in this record, arcsec, without its rarest extremes."""
+        """Half the span of what an effect does in this record, arcsec, but for `RARE` at either end."""
         values = self.estimator.does(fitted.hypothesis.effects[place], fitted.hypothesis.start)
-        low, high = np.quantile(values, [0.002, 0.998])
+        share = min(RARE_SHARE, RARE / len(values))
+        low, high = np.quantile(values, [share, 1.0 - share])
         return 0.5 * float(high - low)
 
     def _shortlist(
