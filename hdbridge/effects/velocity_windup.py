@@ -32,9 +32,9 @@ STRAIGHT = 20.0
 this part of itself."""
 
 
-EXPONENT = 0.2
-"""Standard deviation of the exponent of speed over shear speed: that of greases is from 2/3 to 1 (Cross
-1965)."""
+EXPONENT = 0.58
+"""Standard deviation of the exponent of speed over shear speed. It lies between 0, an oil that does not thin,
+and 1, a paste that yields at one stress: so far from the law's 1, rms, if all are as likely."""
 
 
 class VelocityWindup(Linear):
