@@ -71,6 +71,17 @@ class InertialWindup(Linear):
         acceleration = np.clip(acceleration_of(motion, self.name), -limit, limit)
         return (-ARCSEC_PER_DEG / self.ratio * acceleration)[:, np.newaxis]
 
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """The next term of the resonance that this law is far below: by J / K times the second derivative
+        of its wind-up the load swings beyond it, shape (n, 1).
+        """
+        beyond = np.zeros(len(motion))
+        step_s = 0.0 if motion.time_s is None else float(np.median(np.diff(motion.time_s)))
+        if step_s > 0.0:
+            bend = np.diff(self.predict(motion, start), 2) / step_s**2
+            beyond[1:-1] = self.inertia_over_stiffness_s2 * bend
+        return beyond[:, np.newaxis]
+
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """On-line tracker; acceleration comes with the moment."""
         gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import bilinear, lfilter
 from support.rates import least
 
 from hdbridge.diagnose import Diagnosis
@@ -16,7 +17,16 @@ from hdbridge.diagnose.acceptance import gate
 from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.result import Parameter
-from hdbridge.effects import ChannelSkew, Creep, Effect, LoadOrders, LocalDefect, Start, VelocityWindup
+from hdbridge.effects import (
+    ChannelSkew,
+    Creep,
+    Effect,
+    InertialWindup,
+    LoadOrders,
+    LocalDefect,
+    Start,
+    VelocityWindup,
+)
 from hdbridge.effects.creep import Relaxation
 from hdbridge.effects.orders import orders_from
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
@@ -105,6 +115,26 @@ def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_cre
     creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
     found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
     assert found.robust < 0.5 * found.needed
+
+
+def test_the_wind_up_of_a_load_that_swings_on_its_spring_is_within_its_interval(
+    plant: ModuleType, model: TransmissionModel
+) -> None:
+    """The law is that far below the resonance, and these moves speed up in 0.15 s."""
+    plan = plant.Plan(rate_hz=50.0, scale=0.05, load_turns=0.1, steps=16)
+    inside: list[bool] = []
+    for seed in range(81, 87):
+        rng = np.random.default_rng(seed)
+        turn = 2.0 * np.pi * rng.uniform(18.0, 30.0)
+        time_s, motor, _ = plant.path(plan, np.random.default_rng(seed))
+        acceleration = np.gradient(np.gradient(motor, time_s), time_s)
+        resonance = bilinear([1.0], [1.0, 0.3 * turn, turn**2], fs=1.0 / (time_s[1] - time_s[0]))
+        swung = lfilter(*resonance, acceleration)
+        record = plant.record(plant.Truth(), plan, seed)
+        record["load_position_deg"] -= swung[::10] / 50.0
+        told = parameters(record, model, InertialWindup.candidate(50.0))
+        inside.append(holds(told["inertia_over_stiffness_s2"], turn**-2.0))
+    assert enough(inside), inside
 
 
 def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
