@@ -103,7 +103,16 @@ def fit(
             progress(0.2 + 0.7 * number / len(first))
             # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
             # that tells it from the right one.
-            near = solve(replays, each.truth, parameters, prior, NEAR_STEPS, known=expected(data), near=each)
+            near = solve(
+                replays,
+                each.truth,
+                parameters,
+                prior,
+                NEAR_STEPS,
+                known=expected(data),
+                near=each,
+                tempered=True,
+            )
             ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
         progress(0.9)
         best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
@@ -180,7 +189,8 @@ def _best_of(
     """
 
     def led(start: Truth, steps: int, near: Fitted | None = None) -> Fitted:
-        return solve(replays, start, parameters, prior, steps, known=expected(replays.data), near=near)
+        noise = expected(replays.data)
+        return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
 
     def cost(fitted: Fitted) -> float:
         return fitted.cost

@@ -123,11 +123,13 @@ def solve(
     most: Scales | None = None,
     near: Fitted | None = None,
     loops: Loops | None = None,
+    tempered: bool = False,
 ) -> Fitted:
     """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
 
     ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
     what each step leaves, ``most`` at most: a channel that has become worse does not count for less.
+    ``tempered``: known scales grow with what a place leaves on the way to the minimum.
     Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
     directions the first differences are made along, ``loops`` what a drive's loops do otherwise.
     """
@@ -151,13 +153,16 @@ def solve(
     moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
     idle = done = 0
     while True:
+        last = done == steps or idle == SETTLED
+        if known is not None and tempered:
+            scale = known if last else _tempered(known, found, rows)
         now = scale.scaled(found)[rows]
         ends = _ends(place, moves, low, high)
         changes = np.stack([scale.scaled(each)[rows] for each in led(ends)]) - now
         slopes: FloatArray = (np.linalg.pinv(np.stack(ends) - place) @ changes).T
         left, weights = counting(now, scale, rows)
         slopes *= weights[:, None]
-        if done == steps or idle == SETTLED:
+        if last:
             break
         moves = _moves(slopes, spread)
         damped = _damped_steps(slopes, left, place, prior, spread, (low, high))
@@ -218,6 +223,17 @@ def _capped(found: Scales, most: Scales | None) -> Scales:
     if most is None:
         return found
     return replace(found, deviation={n: min(s, most.deviation[n]) for n, s in found.deviation.items()})
+
+
+def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
+    """Scales that are larger by what a simulation leaves of the residuals as a whole, where that is more.
+
+    Far from the minimum no residual is worth what the noise makes it worth, and the prior would have no say.
+    One factor for all channels: the one that is furthest off still leads the way.
+    """
+    left = told(found, known, rows)
+    factor = max(1.0, float(np.sqrt(np.mean(np.square(left)))))
+    return replace(known, deviation={name: factor * each for name, each in known.deviation.items()})
 
 
 @dataclass(frozen=True, eq=False)
