@@ -149,10 +149,11 @@ def _rates(
     speed, acceleration = _slope(smooth, time, window), _curvature(_smooth(angle, bent), time, bent)
     reach = 2 * max(1, window // 2)
     if len(time) > 3 * reach:
+        acceleration[reach:-reach] = _unsmoothed(acceleration[reach:-reach], bent)
         for rows, inner in ((slice(0, reach), reach), (slice(-reach, None), -reach - 1)):
             acceleration[rows] = acceleration[inner]
             speed[rows] = speed[inner] + acceleration[inner] * (time[rows] - time[inner])
-    return speed, _unsmoothed(acceleration, bent)
+    return speed, acceleration
 
 
 def _unsmoothed(means: FloatArray, window: int) -> FloatArray:

@@ -71,3 +71,14 @@ def test_what_follows_the_acceleration_is_as_large_as_it_is_at_any_sampling_rate
     told = np.round(command / count) * count
     acceleration = kinematics(told, told, time, reading_of(told))[2]
     assert true @ acceleration / (acceleration @ acceleration) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0])
+def test_a_record_that_begins_and_ends_in_motion_has_the_acceleration_that_is_seen_of_it(
+    rate_hz: float,
+) -> None:
+    """It grows in proportion to time, and so needs no correction, neither inside nor at the ends."""
+    time = np.arange(0.0, 1.0, 1.0 / rate_hz)
+    command = 200.0 * time + 300.0 * time**3
+    acceleration = kinematics(command, command, time, reading_of(command))[2]
+    assert acceleration[2:-2] == pytest.approx(1800.0 * time[2:-2], rel=1e-3)
