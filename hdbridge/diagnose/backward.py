@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from hdbridge.diagnose.search import Search, Trail
+from hdbridge.effects import Effect
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 
 
@@ -42,13 +43,27 @@ def pruned(search: Search, trail: Trail) -> Trail:
 
 
 def _swapped(search: Search, fitted: Fitted) -> Fitted:
-    """With the best one in the place of each finding that is taken out, and the law chosen anew."""
+    """With the best one in the place of each finding that is taken out, and the law chosen anew.
+
+    What a finding has gained with further pieces cost an entry for each when they were added, and does so
+    here: what takes its place has entered only once.
+    """
     for place in range(search.base, len(fitted.hypothesis.effects)):
+        if place >= len(fitted.hypothesis.effects):
+            break  # what took another's place has become part of one that was there
+        further = _additions(search, fitted.hypothesis.effects[place]) - 1
+        most = search.cost(fitted) + search.scales.enter * further
         without, _ = search.with_best_law(search.estimator.fit(fitted.hypothesis.without(place)))
-        other = search.best_addition(without, search.cost(fitted))
-        if other is not None and search.cost(other) < search.cost(fitted):
+        other = search.best_addition(without, most)
+        if other is not None and search.cost(other) < most:
             fitted = other
     return fitted
+
+
+def _additions(search: Search, effect: Effect) -> int:
+    """How often a search has added to a finding: orders come one by one, or those of one cause together."""
+    offered = next(iter(type(effect).proposals(search.estimator.data, ())), effect)
+    return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
 
 
 def eliminated(
