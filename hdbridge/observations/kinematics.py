@@ -68,8 +68,8 @@ def kinematics(position: FloatArray, target: FloatArray | None, time: FloatArray
         window = 1
     count = reading.resolution_deg if target is not None else reading.unaided_deg
     bent = window if window * period_s <= LONGEST_S else max(1, window - 2)
-    driving = _driving(position, target, time, window, bent, reading)
-    speed, acceleration = _rates(_smooth(driving, window), driving, time, window, bent)
+    driving = _driving(position, target, time, window, reading)
+    speed, acceleration = _rates(_smooth(driving, window), driving, time, window, bent, exact=True)
     resting = _resting(driving if target is None else target, window)
     if count and target is None:
         # Counts that come and go are no motion: less than half a count over eight windows is rest.
@@ -95,7 +95,6 @@ def _driving(
     target: FloatArray | None,
     time: FloatArray,
     window: int,
-    bent: int,
     reading: Reading,
 ) -> FloatArray:
     """The command and a smooth line for the lag behind it, within the cell that the encoder was read in;
@@ -105,7 +104,8 @@ def _driving(
         return steadied(position, position, CHATTER_COUNTS * reading.unaided_deg)
     count = reading.count_deg
     lag = position - target
-    speed, acceleration = _rates(target, target, time, window, bent)
+    # How large the acceleration is does not matter here: its part of the lag is fitted.
+    speed, acceleration = _rates(target, target, time, window, window, exact=False)
     speed[_resting(target, window)] = 0.0
     columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
@@ -139,7 +139,7 @@ def _resting(angle: FloatArray, window: int) -> BoolArray:
 
 
 def _rates(
-    smooth: FloatArray, angle: FloatArray, time: FloatArray, window: int, bent: int
+    smooth: FloatArray, angle: FloatArray, time: FloatArray, window: int, bent: int, *, exact: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Speed of ``smooth`` over one window, and acceleration of ``angle`` over the other.
 
@@ -149,7 +149,8 @@ def _rates(
     speed, acceleration = _slope(smooth, time, window), _curvature(_smooth(angle, bent), time, bent)
     reach = 2 * max(1, window // 2)
     if len(time) > 3 * reach:
-        acceleration[reach:-reach] = _unsmoothed(acceleration[reach:-reach], bent)
+        if exact:
+            acceleration[reach:-reach] = _unsmoothed(acceleration[reach:-reach], bent)
         for rows, inner in ((slice(0, reach), reach), (slice(-reach, None), -reach - 1)):
             acceleration[rows] = acceleration[inner]
             speed[rows] = speed[inner] + acceleration[inner] * (time[rows] - time[inner])
