@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -103,16 +104,7 @@ def fit(
             progress(0.2 + 0.7 * number / len(first))
             # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
             # that tells it from the right one.
-            near = solve(
-                replays,
-                each.truth,
-                parameters,
-                prior,
-                NEAR_STEPS,
-                known=expected(data),
-                near=each,
-                tempered=True,
-            )
+            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
             ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
         progress(0.9)
         best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
@@ -179,6 +171,19 @@ def exchanged(truth: Truth) -> Truth:
     )
 
 
+def _led(
+    replays: Replays,
+    parameters: tuple[Parameter, ...],
+    prior: FloatArray,
+    start: Truth,
+    steps: int,
+    near: Fitted | None = None,
+) -> Fitted:
+    """So many steps from a place towards the minimum, by the noise that is expected."""
+    noise = expected(replays.data)
+    return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
+
+
 def _best_of(
     replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
 ) -> tuple[Fitted, ...]:
@@ -187,10 +192,7 @@ def _best_of(
     The first is where the simulation stands: what motion does not show keeps its value, unless another place
     is better beyond doubt in the end. Of the others those that fall behind are given up.
     """
-
-    def led(start: Truth, steps: int, near: Fitted | None = None) -> Fitted:
-        noise = expected(replays.data)
-        return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
+    led = partial(_led, replays, parameters, prior)
 
     def cost(fitted: Fitted) -> float:
         return fitted.cost
