@@ -91,11 +91,7 @@ def _rested(
 
 
 def _driving(
-    position: FloatArray,
-    target: FloatArray | None,
-    time: FloatArray,
-    window: int,
-    reading: Reading,
+    position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
 ) -> FloatArray:
     """The command and a smooth line for the lag behind it, within the cell that the encoder was read in;
     without a command the angle freed of chatter.
@@ -164,9 +160,8 @@ def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
     slows down in a third of a second and is seen fifty times in one.
     """
     result = means.copy()
-    moment = (
-        max(1, window // 2) ** 2 / 6.0 + (window**2 - 1) / 12.0
-    )  # a triangle's and a rectangle's, samples
+    # In samples: that of the differences, a triangle, and that of the smoothing, a rectangle.
+    moment = max(1, window // 2) ** 2 / 6.0 + (window**2 - 1) / 12.0
     bend = means[2 * window :] - 2.0 * means[window:-window] + means[: -2 * window]
     result[window:-window] -= 0.5 * moment / window**2 * bend
     return result
