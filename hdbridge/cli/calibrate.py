@@ -60,19 +60,13 @@ def command(
     """
     from hdbridge.calibration import calibrate
     from hdbridge.calibration.validation import validation_s
-    from hdbridge.cli.booted import booted
-    from hdbridge.cli.measuring import Measurement, kept_in, phases
-    from hdbridge.model.store import measuring
+    from hdbridge.cli.measuring import Measurement, phases
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
     work = Measurement.asked(axis, plan, out, resume)
     work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
-    with (
-        kept_in(work.folder),
-        measuring(files.axis),
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
-    ):
+    with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         journal = work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = calibrate(

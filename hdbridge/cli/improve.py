@@ -85,11 +85,9 @@ def command(
     Where nothing is found, or nothing that can be compensated, or where the axis does not point better
     with the extended model, nothing is proposed. The model is used after `hdbridge model commit PROFILE`.
     """
-    from hdbridge.cli.booted import booted
-    from hdbridge.cli.measuring import Measurement, kept_in, phases
+    from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.improvement import Source, improve
     from hdbridge.improvement.trial import trial_s
-    from hdbridge.model.store import measuring
     from hdbridge.records.recording import Recording
 
     files = Profile.find(profile)
@@ -106,11 +104,7 @@ def command(
         notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
     else:
         work.announce(trial)
-    with (
-        kept_in(work.folder),
-        measuring(files.axis),
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
-    ):
+    with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         journal = None if recordings else work.begun(drive, seed if simulate else None)
         with phases() as progress:
             result = improve(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import Journal
     from hdbridge.drive.drive import Drive
+    from hdbridge.files.profile import Profile
     from hdbridge.procedures.plan import Plan
 
 PlanOption = Annotated[
@@ -95,9 +96,24 @@ class Measurement:
         about = {} if simulated_seed is None else {"simulated": True, "seed": simulated_seed}
         return start_journal(self.folder, self.axis, self.plan, self.date, drive.identity, about)
 
+    @contextmanager
+    def booted(
+        self, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
+    ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
+        """The drive, as of `hdbridge.cli.booted`, while nobody else measures this axis."""
+        from hdbridge.cli.booted import booted
+        from hdbridge.model.store import measuring
+
+        with (
+            _kept_in(self.folder),
+            measuring(profile.axis),
+            booted(self.axis, profile, simulate=simulate, truth=truth, seed=seed, force=force) as ready,
+        ):
+            yield ready
+
 
 @contextmanager
-def kept_in(folder: Path) -> Iterator[None]:
+def _kept_in(folder: Path) -> Iterator[None]:
     """Say where the record is when the measurement does not come to its end; a folder left empty goes."""
     try:
         yield
