@@ -14,7 +14,6 @@ from hdbridge.effects import (
     CATALOGUE,
     MEASURED,
     Channel,
-    Effect,
     Moment,
     Motion,
     Start,
@@ -37,50 +36,52 @@ def law(test):
     return pytest.mark.parametrize("name", NAMES)(settings(max_examples=12, deadline=None)(test))
 
 
-def track(effect: Effect, motion: Motion, start: Start = Start.VIRGIN) -> np.ndarray:
-    tracker = effect.tracker(start)
-    return np.array(
-        [
-            tracker.advance(float(angle), now)
-            for angle, now in zip(motion.motor_deg, moments(motion), strict=True)
-        ]
-    )
-
-
 def test_every_effect_of_the_catalogue_is_held_to_these_laws():
     assert set(EXAMPLES) == set(CATALOGUE)
 
 
 @law
-@given(data=st.data(), motion=motions, start=starts)
-def test_batch_equals_on_line(name, data, motion, start):
+@given(
+    data=st.data(),
+    motion=motions,
+    start=starts,
+    factor=st.floats(0.25, 4),
+    away=st.floats(-40, 40),
+    probes=st.lists(st.floats(-3000, 3000), max_size=4),
+)
+def test_an_effect_on_any_path_obeys_the_laws(name, data, motion, start, factor, away, probes):
+    """One draw for all: to draw an effect and a path takes far longer than to try a law on them."""
     effect = data.draw(EXAMPLES[name])
-    np.testing.assert_allclose(effect.predict(motion, start), track(effect, motion, start), **CLOSE)
+    parameters_go_out_and_come_back(effect)
+    prediction_is_columns_times_coefficients(effect, motion, start)
+    fitted_takes_back_its_own_coefficients(effect, motion, start)
+    error_scales_with_its_coefficients(effect, motion, start, factor)
+    error_stays_within_its_bound(effect, motion, start)
+    batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, probes)
+    error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away)
+    a_missing_channel_is_named_before_and_when_it_is_needed(effect, motion)
+    nothing_moved_and_nothing_recorded_is_no_trouble(effect)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts)
-def test_prediction_is_columns_times_coefficients(name, data, motion, start):
-    effect = data.draw(EXAMPLES[name])
+def parameters_go_out_and_come_back(effect):
+    assert type(effect).model_validate(effect.parameters()) == effect
+    assert effect.violations() == []
+
+
+def prediction_is_columns_times_coefficients(effect, motion, start):
     columns = effect.columns(motion, start)
     assert columns.shape == (len(motion), len(effect.coefficients()))
     np.testing.assert_allclose(columns @ effect.coefficients(), effect.predict(motion, start), **CLOSE)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts)
-def test_fitted_takes_back_its_own_coefficients(name, data, motion, start):
-    effect = data.draw(EXAMPLES[name])
+def fitted_takes_back_its_own_coefficients(effect, motion, start):
     again = effect.fitted(effect.coefficients())
     np.testing.assert_allclose(again.predict(motion, start), effect.predict(motion, start), **CLOSE)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts, factor=st.floats(0.25, 4))
-def test_error_scales_with_its_coefficients(name, data, motion, start, factor):
-    effect = data.draw(EXAMPLES[name])
+def error_scales_with_its_coefficients(effect, motion, start, factor):
     scaled = effect.fitted(factor * effect.coefficients())
-    if name == "direction_phase":  # linear at the present shift only
+    if effect.name == "direction_phase":  # linear at the present shift only
         columns = effect.columns(motion, start)
         np.testing.assert_allclose(
             columns @ scaled.coefficients(), factor * effect.predict(motion, start), **CLOSE
@@ -89,18 +90,24 @@ def test_error_scales_with_its_coefficients(name, data, motion, start, factor):
     np.testing.assert_allclose(scaled.predict(motion, start), factor * effect.predict(motion, start), **CLOSE)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts)
-def test_error_stays_within_its_bound(name, data, motion, start):
-    effect = data.draw(EXAMPLES[name])
+def error_stays_within_its_bound(effect, motion, start):
     assert np.all(np.abs(effect.predict(motion, start)) <= effect.bound_arcsec() * (1 + 1e-9) + 1e-7)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts, away=st.floats(-40, 40))
-def test_error_falls_no_steeper_than_its_slope_bound(name, data, motion, start, away):
+def batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, probes):
+    tracker, twin = effect.tracker(start), effect.tracker(start)
+    told = []
+    for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
+        for probe in probes:
+            tracker.peek(probe, now)
+        asked = tracker.peek(float(angle), now)
+        told.append(tracker.advance(float(angle), now))
+        assert told[-1] == asked == twin.advance(float(angle), now)
+    np.testing.assert_allclose(effect.predict(motion, start), np.array(told), **CLOSE)
+
+
+def error_falls_no_steeper_than_its_slope_bound(effect, motion, start, away):
     """Seen from one state, as the inverse sees it: between any two angles that it may try."""
-    effect = data.draw(EXAMPLES[name])
     bound = effect.slope_bound_arcsec_per_deg()
     tracker = effect.tracker(start)
     for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
@@ -111,46 +118,20 @@ def test_error_falls_no_steeper_than_its_slope_bound(name, data, motion, start, 
         assert np.all(np.diff(errors) >= -bound * np.diff(tried) * (1 + 1e-6) - 1e-7)
 
 
-@law
-@given(data=st.data(), motion=motions, start=starts, probes=st.lists(st.floats(-3000, 3000), max_size=4))
-def test_peeking_changes_nothing(name, data, motion, start, probes):
-    effect = data.draw(EXAMPLES[name])
-    tracker, twin = effect.tracker(start), effect.tracker(start)
-    for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
-        for probe in probes:
-            tracker.peek(probe, now)
-        asked = tracker.peek(float(angle), now)
-        assert tracker.advance(float(angle), now) == asked == twin.advance(float(angle), now)
-
-
-@law
-@given(data=st.data())
-def test_parameters_go_out_and_come_back(name, data):
-    effect = data.draw(EXAMPLES[name])
-    assert type(effect).model_validate(effect.parameters()) == effect
-    assert effect.violations() == []
-
-
-@law
-@given(data=st.data(), motion=motions)
-def test_a_missing_channel_is_named_before_and_when_it_is_needed(name, data, motion):
-    effect = data.draw(EXAMPLES[name])
+def a_missing_channel_is_named_before_and_when_it_is_needed(effect, motion):
     bare = Motion(motion.motor_deg)
     lacking = unmet([effect], bare.available())
     assert unmet([effect], motion.available()) == {}
     if not lacking:
         effect.predict(bare)
         return
-    assert lacking == {name: effect.needs() - {Channel.DIRECTION}}
-    with pytest.raises(InputError, match=f"'{name}' needs the channel") as caught:
+    assert lacking == {effect.name: effect.needs() - {Channel.DIRECTION}}
+    with pytest.raises(InputError, match=f"'{effect.name}' needs the channel") as caught:
         effect.predict(bare)
     assert any(each.value in str(caught.value) for each in effect.needs())
 
 
-@law
-@given(data=st.data())
-def test_nothing_moved_and_nothing_recorded_is_no_trouble(name, data):
-    effect = data.draw(EXAMPLES[name])
+def nothing_moved_and_nothing_recorded_is_no_trouble(effect):
     for count in (0, 1):
         zeros = np.zeros(count)
         motion = Motion(zeros, zeros, dict.fromkeys(MEASURED, zeros), load_deg=zeros)
