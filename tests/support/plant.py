@@ -136,6 +136,12 @@ def rise(xi: np.ndarray | float, n: float) -> Any:
     return (xi ** (n - 1) - (n - 1) * xi) / (2 - n)
 
 
+def kept(direction: np.ndarray) -> np.ndarray:
+    """The sense of the last motion where there is none; forward before the first."""
+    last = np.maximum.accumulate(np.where(direction != 0, np.arange(len(direction)), -1))
+    return np.where(last < 0, 1.0, direction[last])
+
+
 def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> np.ndarray:
     """The elastic part, from a saturated start forwards; carried through the whole motion."""
     if offset < 0.0:  # the load lags
@@ -143,10 +149,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
     step = np.sign(np.diff(motor, prepend=motor[0] - 1e-9))
     if law == "plain":
         out = np.empty(len(motor))
-        held = step.copy()
-        for i in range(1, len(held)):
-            if held[i] == 0:
-                held[i] = held[i - 1]
+        held = kept(step)
         turns = np.flatnonzero(np.diff(held)) + 1
         edges = [0, *turns.tolist(), len(motor)]
         value = offset
@@ -208,6 +211,16 @@ def stop(motor: np.ndarray, width: float) -> np.ndarray:
     return out
 
 
+def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: float) -> np.ndarray:
+    """Builds up with the sense of motion, faster than it relaxes at rest."""
+    up, down = math.exp(-dt / (build * tau)), math.exp(-dt / tau)
+    y, out = 0.0, np.empty(len(going))
+    for i, sense in enumerate(going.tolist()):
+        y = sense + (y - sense) * up if sense else y * down
+        out[i] = y
+    return out
+
+
 @dataclass
 class Truth:
     """What the axis is like."""
@@ -232,16 +245,27 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
     v = np.gradient(motor, dt)
     v[np.abs(v) < 1e-9] = 0.0
     a = np.gradient(v, dt)
-    d = np.sign(v)
-    for i in np.flatnonzero(d == 0):
-        d[i] = d[i - 1] if i else 1.0
-    load = motor / RATIO
-    elastic = loop(motor, truth.law, truth.offset, truth.width, truth.n)
+    d = kept(np.sign(v))
     e = truth.effects
+    end_s = t[-1]
+    carried = {"loop": loop(motor, truth.law, truth.offset, truth.width, truth.n)}
+    if "backlash" in e:
+        carried["play"] = stop(motor, e["backlash"]["gap"] * RATIO / 3600)
+    if "wear" in e:
+        run = np.cumsum(np.abs(np.diff(motor, prepend=motor[0])))
+        carried["worn"] = run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
+    if "creep" in e:
+        carried["creep"] = crept(np.sign(v), dt, **e["creep"])
+    # All that is not carried through the motion is only needed where it is read.
+    pick = slice(None, None, 10)
+    at = slice(None) if "channel_skew" in e else pick
+    t, motor, v, a, d = (np.ascontiguousarray(each[at]) for each in (t, motor, v, a, d))
+    elastic = carried["loop"][at]
+    load = motor / RATIO
     torque = truth.torque_nm * np.sin(np.deg2rad(load + 33.0)) if truth.torque_nm else np.zeros(len(t))
     shift = e.get("direction_phase", {}).get("shift", 0.0)
     growth = 1 + e.get("torque_modulation", {}).get("growth", 0.0) * np.abs(torque)
-    warm = truth.temperature_rise_k * (1 - np.exp(-t / (0.35 * t[-1])))
+    warm = truth.temperature_rise_k * (1 - np.exp(-t / (0.35 * end_s)))
     amplitude = e.get("amplitude_drift", {})
     ripple = sum(A * np.cos(np.deg2rad(k * (motor + d * shift) + p)) for k, A, p in truth.orders)
     te = ripple * growth * (1 + amplitude.get("ripple", 0.0) * warm)
@@ -265,31 +289,22 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
         w = e["velocity_windup"]
         te = te - d * (v != 0) * w["coulomb"] - w["viscous"] * v / (1 + (np.abs(v) / w["shear"]) ** 0.8)
     if "backlash" in e:  # play operator on the load side: the load lags by half the gap
-        gap = e["backlash"]["gap"]
-        te = te - 0.5 * gap * stop(motor, gap * RATIO / 3600)
+        te = te - 0.5 * e["backlash"]["gap"] * carried["play"][at]
     if "subdivisional_error" in e:
         s = e["subdivisional_error"]
         actual = load + te / 3600
         for k, A, p in s["orders"]:
             te = te + A * np.cos(np.deg2rad(k * s["lines"] * actual + p))
     if "zero_drift" in e:
-        te = te + e["zero_drift"]["size"] * (1 - np.exp(-t / (e["zero_drift"]["tau"] * t[-1])))
+        te = te + e["zero_drift"]["size"] * (1 - np.exp(-t / (e["zero_drift"]["tau"] * end_s)))
     if "wear" in e:
-        run = np.cumsum(np.abs(np.diff(motor, prepend=motor[0])))
-        te = te - 0.5 * e["wear"]["growth"] * run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
+        te = te - 0.5 * e["wear"]["growth"] * carried["worn"][at]
     if "creep" in e:
-        c = e["creep"]
-        y, out = 0.0, np.empty(len(t))
-        going = np.sign(v)
-        up, down = math.exp(-dt / (c.get("build", 0.1) * c["tau"])), math.exp(-dt / c["tau"])
-        for i in range(len(t)):
-            y = going[i] + (y - going[i]) * up if going[i] else y * down
-            out[i] = y
-        te = te + c["size"] * out
+        te = te + e["creep"]["size"] * carried["creep"][at]
     if "ratio_error" in e:
         te = te + e["ratio_error"]["ramp"] * motor / 360
     if "count_loss" in e:
-        te = te + e["count_loss"]["size"] * (t > e["count_loss"]["at"] * t[-1])
+        te = te + e["count_loss"]["size"] * (t > e["count_loss"]["at"] * end_s)
     if "vibration" in e:
         te = te + e["vibration"]["size"] * np.cos(2 * np.pi * e["vibration"]["hz"] * t + 1.0)
     if "local_defect" in e:
@@ -300,26 +315,23 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
     measured_load = load + te / 3600
     if "channel_skew" in e:
         measured_load = np.interp(t - e["channel_skew"]["ms"] * -1e-3, t, measured_load)
-    pick = slice(None, None, 10)
-    ts = t[pick]
-    decay = math.exp(-(ts[1] - ts[0]) / 5.0)
-    slow = lfilter([math.sqrt(1 - decay**2)], [1, -decay], rng.normal(size=len(ts)))
-    noisy = measured_load[pick] + (truth.noise * rng.normal(size=len(ts)) + truth.slow_noise * slow) / 3600
-    follow = 2e-4 * v[pick]
+        t, motor, v, torque, measured_load = (each[pick] for each in (t, motor, v, torque, measured_load))
+    decay = math.exp(-(t[1] - t[0]) / 5.0)
+    slow = lfilter([math.sqrt(1 - decay**2)], [1, -decay], rng.normal(size=len(t)))
+    noisy = measured_load + (truth.noise * rng.normal(size=len(t)) + truth.slow_noise * slow) / 3600
+    follow = 2e-4 * v
     columns = {
-        "time_s": ts,
-        "motor_position_deg": np.round((motor[pick]) * 8000 / 360) * 360 / 8000,
+        "time_s": t,
+        "motor_position_deg": np.round(motor * 8000 / 360) * 360 / 8000,
         "load_position_deg": np.round(noisy * 8000) / 8000 + 17.3,
     }
     if command:
-        columns["motor_target_deg"] = motor[pick] + follow
+        columns["motor_target_deg"] = motor + follow
     if truth.torque_nm:
-        columns["load_torque_nm"] = torque[pick] + 0.01 * rng.normal(size=len(ts))
+        columns["load_torque_nm"] = torque + 0.01 * rng.normal(size=len(t))
     if truth.temperature_rise_k:
         columns["temperature_c"] = (
-            20
-            + truth.temperature_rise_k * (1 - np.exp(-ts / (0.3 * ts[-1])))
-            + 0.02 * rng.normal(size=len(ts))
+            20 + truth.temperature_rise_k * (1 - np.exp(-t / (0.3 * t[-1]))) + 0.02 * rng.normal(size=len(t))
         )
     return columns
 
