@@ -21,6 +21,7 @@ from support.hidden_bench import (
     ACCELERATION_DEG_S2,
     CYCLE_MS,
     FAST_MS,
+    MORE_MS,
     REACH_DEG,
     SPEED_DEG_S,
     STEPPING,
@@ -117,7 +118,7 @@ class Bench:
     highest_deg_s2: float = ACCELERATION_DEG_S2
     truth: Truth | None = None
     stepping: Stepping = STEPPING
-    cycle_ms: float = CYCLE_MS
+    cycle_ms: int = CYCLE_MS
 
     @contextmanager
     def run(self, folder: Path, seed: int) -> Iterator[Cell]:
@@ -144,7 +145,7 @@ SINGLE = dict(
         single("load_order", TURN),
         single("flexspline_order", TURN),
         single("direction_phase", FAST),
-        single("torque_modulation", TORQUES),
+        single("torque_modulation", TORQUES, cycle_ms=MORE_MS),
         single("compliance", TURN),
         single("inertial_windup", SWINGS, highest_deg_s2=39.0, stepping=AT_REST, cycle_ms=FAST_MS),
         single("velocity_windup", SPEEDS, truth=greased(), cycle_ms=FAST_MS),
@@ -157,7 +158,7 @@ SINGLE = dict(
         single("zero_drift", AGAIN),
         single("amplitude_drift", AGAIN),
         single("wear", AGAIN),
-        single("creep", RESTS),
+        single("creep", RESTS, cycle_ms=MORE_MS),
         single("ratio_error", TURN),
         single("count_loss", FAST),
         single("vibration", FAST),
@@ -174,7 +175,7 @@ PAIRS = dict(
 )
 QUICK = ("motor_order and channel_skew",)
 """Pairs that are part of every run; `make test-slow` has all of them, and all causes with more seeds."""
-UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",))}
+UNKNOWN = {"a roller": Bench(TURN, ("unexplained:roller",), cycle_ms=MORE_MS)}
 OTHER_LAW = {"Bouc-Wen": Bench(FAST, (), truth=bouc_wen())}
 LAGGING = {"zero_drift behind its sensor": Bench(AGAIN, ("zero_drift",), truth=lagging())}
 NONE = {"nothing": Bench((*FAST, *TURN), ())}

@@ -33,8 +33,10 @@ from hdbridge.sim.truth import Truth
 from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
-CYCLE_MS = 20
-"""Half as many samples as at `FAST_MS` show the same of most causes."""
+CYCLE_MS = 40
+"""A quarter of the samples of `FAST_MS` shows the same of most causes."""
+MORE_MS = 20
+"""For what is small in each sample, or shows in a part of the record only."""
 FAST_MS = 10
 """For what depends on speed or acceleration, and for play, which the axis crosses within some samples."""
 MOTOR_COUNTS = 32_768
@@ -85,10 +87,14 @@ STEPPING = Stepping(count=20, step_deg=403.56)
 """At every phase of the motor, over most of a load turn."""
 
 
-def axis_config(folder: Path, cycle_ms: float) -> AxisConfig:
+def axis_config(folder: Path, cycle_ms: int) -> AxisConfig:
     """The axis file, written into a folder."""
     text = (DEMO / "axis.yaml").read_text() + SENSORS
-    for old, new in (("cycle_ms: 4", f"cycle_ms: {cycle_ms}"), ("turn: 8000", f"turn: {MOTOR_COUNTS}")):
+    for old, new in (
+        ("cycle_ms: 4", f"cycle_ms: {cycle_ms}"),
+        ("heartbeat_ms: 50", f"heartbeat_ms: {max(50, 2 * cycle_ms)}"),
+        ("turn: 8000", f"turn: {MOTOR_COUNTS}"),
+    ):
         assert old in text
         text = text.replace(old, new)
     path = folder / "axis.yaml"
@@ -201,7 +207,7 @@ def hidden_bench(
     parts: Sequence[Procedure[Any]],
     highest_deg_s2: float = ACCELERATION_DEG_S2,
     truth: Truth | None = None,
-    cycle_ms: float = CYCLE_MS,
+    cycle_ms: int = CYCLE_MS,
 ) -> Iterator[Cell]:
     """An axis with causes of given sizes in it, measured."""
     rng = random.Random(f"hidden {seed} {causes}")
