@@ -45,7 +45,7 @@ validation: {count: 20, step_deg: 403.56, cycles: 0}
 NARROW = PLAN.replace("name: small", "name: narrow").replace(
     "  - {procedure: sweep, load_turns: 1.05, motor_turns_per_s: 0.85}\n", ""
 )
-COARSE = (("cycle_ms: 4", "cycle_ms: 10"), ("counts_per_turn: 8000", "counts_per_turn: 32768"))
+COARSE = (("cycle_ms: 4", "cycle_ms: 20"), ("counts_per_turn: 8000", "counts_per_turn: 32768"))
 """A command in whole counts is followed at a fixed part of one; many small ones leave no bias in a sweep."""
 
 
