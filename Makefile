@@ -12,15 +12,17 @@ export PYTHONDONTWRITEBYTECODE :=
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
 
-# uv takes a third of pip's time and writes the bytecode on all processors; where it cannot be had, or does not
-# get at the packages, pip does it. uv reads no settings of pip: it is told the index.
-PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-INDEX := $${UV_DEFAULT_INDEX:-$${PIP_INDEX_URL:-https://pypi.org/simple}}
+# uv takes a third of pip's time; where it cannot be had, or does not get at the packages, pip does it. uv reads no
+# settings of pip: it is told the index. The bytecode that is left out belongs to modules that nothing here imports.
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+INDEX  := $${UV_DEFAULT_INDEX:-$${PIP_INDEX_URL:-https://pypi.org/simple}}
+UNUSED := /(tests|mypyc?|lexers|pip|setuptools)/
 $(READY): pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	@{ $(PIP) uv && UV_DEFAULT_INDEX="$(INDEX)" \
-		$(BIN)/uv pip install --quiet --python $(BIN)/python --compile-bytecode --editable '.[dev]'; } 2>/dev/null || \
-		$(PIP) --editable '.[dev]'
+	$(PYTHON) -m venv --without-pip $(VENV)
+	@{ $(PYTHON) -m pip --python $(BIN)/python install --quiet --disable-pip-version-check uv && \
+		UV_DEFAULT_INDEX="$(INDEX)" $(BIN)/uv pip install --quiet --python $(BIN)/python pip --editable '.[dev]'; } \
+		2>/dev/null || { $(PYTHON) -m venv --clear $(VENV) && $(PIP) --editable '.[dev]'; }
+	@$(BIN)/python -m compileall -q -j 0 -x '$(UNUSED)' $(VENV)/lib hdbridge || true
 	@touch $@
 
 demo: $(READY)   ## the main job: step a simulated axis under four compensation schemes
