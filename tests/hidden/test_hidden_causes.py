@@ -157,7 +157,7 @@ SINGLE = dict(
         single("subdivisional_error", FAST),
         single("zero_drift", AGAIN),
         single("amplitude_drift", AGAIN),
-        single("wear", AGAIN),
+        single("wear", AGAIN, cycle_ms=MORE_MS),
         single("creep", RESTS, cycle_ms=MORE_MS),
         single("ratio_error", TURN),
         single("count_loss", FAST),
