@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from support.command import run_here
 from support.running import gone, running
 
 
@@ -99,8 +100,15 @@ def test_without_room_on_the_disk_and_then_without_its_keeper(tmp_path: Path) ->
         (("article", "--interface", "socketcan", "--channel", "can99"), 3, "can99"),
     ],
 )
-def test_what_it_refuses(tmp_path: Path, arguments: tuple[str, ...], status: int, said: str) -> None:
-    done = run_to_its_end(tmp_path, *arguments)
+def test_what_it_refuses(
+    tmp_path: Path, arguments: tuple[str, ...], status: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if status == 2:  # before it begins any process, and so in this one
+        for each in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+            monkeypatch.setenv(each, str(tmp_path))
+        done = run_here(tmp_path, "run", *arguments)
+    else:
+        done = run_to_its_end(tmp_path, *arguments)
     assert done.returncode == status, done.stderr
     assert said in done.stderr
     assert not list(tmp_path.glob("hdbridge/*.sock"))
