@@ -34,6 +34,7 @@ class Cell:
         self.axis.mkdir(parents=True)
         for name in ("axis.yaml", "truth.yaml"):
             shutil.copy(DEMO / name, self.axis)
+        self.edit("axis.yaml", "cycle_ms: 4", "cycle_ms: 10")  # enough samples for a short plan
         (folder / "short.yaml").write_text(SHORT)
 
     def edit(self, name: str, old: str, new: str) -> None:
