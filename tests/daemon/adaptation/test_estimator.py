@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.daemon.adaptation.estimator import Estimator
@@ -77,6 +77,7 @@ def test_what_is_held_keeps_its_value_and_its_variance(seed, keep):
     assert np.all(estimator.estimate[~held] != 0.0)
 
 
+@settings(max_examples=20)
 @given(seed=seeds, keep=st.floats(0.05, 0.99), shown=st.integers(1, 5))
 def test_forgetting_for_ever_winds_no_variance_up(seed, keep, shown):
     estimator = fresh(5, seed)
