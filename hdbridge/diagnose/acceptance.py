@@ -1,7 +1,6 @@
 """Gates that a finding has to pass before it is named: block-robust evidence, where it has to show.
 
-Observed in chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a
-finding's
+Chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a finding's
 score is summed over blocks of time, and its variance is taken from those sums: whatever is correlated
 within a block no longer counts as many.
 """
@@ -18,8 +17,8 @@ from hdbridge.estimation.linear import side_by_side, solve_symmetric
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.stretches import of_length, sandwich
 
-BLOCKS_S = (1.0, 5.0)
-"""Noise that wanders is correlated over less than one or the other."""
+BLOCKS_S = (1.0, 5.0, 20.0)
+"""Noise that wanders, or warms up, is correlated over less than one of them."""
 LEAST_BLOCKS = 30
 """A short record is cut into so many, whatever their length: fewer tell no variance."""
 LEAST_POINTS = 20
@@ -129,15 +128,19 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
 
 def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
     """Whether what has to be the same everywhere is another one along the way; see `Effect.changing`."""
-    changing = fitted.hypothesis.effects[place].changing(estimator.motion)
-    if changing is None:
-        return False
-    own = fitted.places(place)
-    columns = np.hstack([fitted.tangent[:, own[:1]], estimator.weighted(changing[estimator.index])])
-    others = np.setdiff1d(np.arange(fitted.count()), own)
-    gram, moment = fitted.linearised.of(others).left(columns)
-    step = np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
-    along = float(fitted.hypothesis.effects[place].coefficients()[0]) + np.cumsum(step)
-    scales = estimator.scales
-    differs = float(np.ptp(along)) > scales.bend * float(np.max(np.abs(along)))
-    return differs and float(moment @ step) > scales.robust
+    effect, own = fitted.hypothesis.effects[place], fitted.places(place)
+    for number, piece in enumerate(effect.pieces()):
+        changing = piece.changing(estimator.motion)
+        if changing is None:
+            return False
+        refitted = [i for i in own if i == own[number] or fitted.parameters[i].shape]
+        columns = np.hstack([fitted.tangent[:, own[[number]]], estimator.weighted(changing[estimator.index])])
+        others = np.setdiff1d(np.arange(fitted.count()), refitted)
+        gram, moment = fitted.linearised.of(others).left(columns)
+        step = np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
+        along = float(effect.coefficients()[number]) + np.cumsum(step)
+        scales = estimator.scales
+        differs = float(np.ptp(along)) > scales.bend * float(np.max(np.abs(along)))
+        if differs and float(moment @ step) > scales.robust:
+            return True
+    return False

@@ -59,7 +59,7 @@ def _another_law(
     if trail.law_gain < scales.enter + scales.penalty or not causes:
         return None
     old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
-    peak = float(np.quantile(np.abs(old.residual - fitted.residual) / estimator.weight, 0.998))
+    peak = float(np.quantile(np.abs(old.residual - fitted.residual) / estimator.weight, 1.0 - estimator.rare))
     if peak < scales.plain_arcsec:
         return None
     name, parameters = causes[0].name, parameters_of(estimator, precise, place, spread)
@@ -103,7 +103,9 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     if free is None:
         return 0.0
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
-    apart = float(np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 0.998))
+    apart = float(
+        np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 1.0 - estimator.rare)
+    )
     gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * len(free.names)
     return apart if gained and apart > scales.plain_arcsec else 0.0
 

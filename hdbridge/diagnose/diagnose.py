@@ -31,10 +31,11 @@ from hdbridge.diagnose.unexplained import (
     LESS,
     Rest,
     does_more,
+    doubtful_loops,
     is_unexplained,
     many_of_one,
+    of_the_loop,
     rest,
-    without_doubtful_loops,
 )
 from hdbridge.diagnose.unfitted import unfitted
 from hdbridge.effects import Channel, Effect, FloatArray, Part, Start, unmet
@@ -259,14 +260,24 @@ class _Judge:
         fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
-        words: list[str] = []
-        if unknown:
-            findings, words = without_doubtful_loops(findings, left, estimator.scales)
+        doubtful = doubtful_loops(findings, left, estimator.scales) if unknown else []
+        if doubtful:  # what they do is left, too
+            findings = [each for each in findings if each not in doubtful]
+            left = rest(estimator, self._with_given_loop(fitted))
+        words = [f"{each.cause}: {LESS}" for each in doubtful]
         findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
         if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
             most = estimator.scales.one_way
             findings = [replace(each, probability=min(each.probability, most)) for each in findings]
         return _Judged(fitted, findings, left), words
+
+    def _with_given_loop(self, fitted: Fitted) -> Fitted:
+        given = self.model.effects
+        hypothesis, loops = fitted.hypothesis, {i for i, each in enumerate(given) if each.part is Part.LOOP}
+        for place in loops:
+            hypothesis = hypothesis.instead(place, given[place])
+        with self.search.held(loops):
+            return self.estimator.fit(hypothesis)
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
         effect = fitted.hypothesis.effects[place]
@@ -322,7 +333,7 @@ class _Judge:
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
-        if many is None and loops and "last reversal" in lives and left.foretold(scales):
+        if many is None and loops and of_the_loop(left, scales):
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)

@@ -39,8 +39,9 @@ def identifiability(
     basis = orthonormal(fitted.linearised.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
-        columns = estimator.columns(candidate, fitted.hypothesis.start)[::stride]
-        span = np.quantile(columns, 0.998, axis=0) - np.quantile(columns, 0.002, axis=0)
+        columns = estimator.columns(candidate, fitted.hypothesis.start)
+        low, high = np.quantile(columns, [estimator.rare, 1.0 - estimator.rare], axis=0)
+        columns, span = columns[::stride], high - low
         seen = span > 1e-12
         if not np.any(seen):
             continue

@@ -56,7 +56,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
         grow = np.maximum(larger, 1.0)
         return np.asarray(best * np.outer(grow, grow))
 
-    for length in (*BLOCKS_S, 20.0):
+    for length in BLOCKS_S:
         number = of_length(estimator.time_s, length)
         if int(number[-1]) + 1 >= 20:
             best = at_least(number, normal=True)

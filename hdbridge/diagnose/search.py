@@ -7,7 +7,8 @@ the first picks. What was picked is looked at again in `backward.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,9 +22,6 @@ from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 MOST = 6
 BEST = 3
 """So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
-RARE, RARE_SHARE = 20, 0.002
-"""Samples, and no more than this share of them, in which an effect may be larger than it is said to be. A
-damaged tooth is passed in a few hundred samples of the longest record."""
 ANEW = 3
 """So often the law of the loop is chosen anew after a pick."""
 
@@ -221,10 +219,9 @@ class Search:
         return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
 
     def peak(self, fitted: Fitted, place: int) -> float:
-        """Half the span of what an effect does in this record, arcsec, but for `RARE` at either end."""
+        """Half the span of what an effect does in this record, arcsec, but for what is rare at either end."""
         values = self.estimator.does(fitted.hypothesis.effects[place], fitted.hypothesis.start)
-        share = min(RARE_SHARE, RARE / len(values))
-        low, high = np.quantile(values, [share, 1.0 - share])
+        low, high = np.quantile(values, [self.estimator.rare, 1.0 - self.estimator.rare])
         return 0.5 * float(high - low)
 
     def _shortlist(
@@ -275,12 +272,17 @@ class Search:
         """Other causes that explain as well what a changed part of the model explains, with that part as
         ``given``.
         """
+        with self.held({place}):
+            without = self.estimator.fit(fitted.hypothesis.instead(place, given))
+            return self.as_well(fitted, without, given.name)
+
+    @contextmanager
+    def held(self, places: Set[int]) -> Iterator[None]:
+        """Some parts of the model as they were given, whatever the data say of them."""
         known = self.estimator.calibrated
-        self.estimator.calibrated = tuple(each.as_given() if each.place == place else each for each in known)
+        self.estimator.calibrated = tuple(each.as_given() if each.place in places else each for each in known)
         try:
-            return self.as_well(
-                fitted, self.estimator.fit(fitted.hypothesis.instead(place, given)), given.name
-            )
+            yield
         finally:
             self.estimator.calibrated = known
 

@@ -102,24 +102,24 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
     return None
 
 
-def without_doubtful_loops(
-    findings: list[Finding], left: Rest, scales: Scales
-) -> tuple[list[Finding], list[str]]:
-    """Without a change of the loop's parameters that does less than what is left, unless that is the loop's
-    too.
-    """
-    doubtful = [
+def of_the_loop(left: Rest, scales: Scales) -> bool:
+    """Whether what is left is the loop's: it depends on what has passed since the last reversal."""
+    return "last reversal" in left.lives_in and left.foretold(scales)
+
+
+def doubtful_loops(findings: Sequence[Finding], left: Rest, scales: Scales) -> list[Finding]:
+    """Changes of the loop's parameters that do less than what is left, unless that is the loop's too."""
+    if of_the_loop(left, scales):
+        return []
+    return [
         each
         for each in findings
         if each.within
         and each.effect is not None
         and each.effect.changes is Part.LOOP
         and each.effect.part is not Part.LOOP
-        and "last reversal" not in left.lives_in
         and each.taken_arcsec**2 < scales.shadow * left.arcsec**2
     ]
-    words = [f"{each.cause}: {LESS}" for each in doubtful]
-    return [each for each in findings if each not in doubtful], words
 
 
 def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
@@ -133,7 +133,7 @@ def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
     residual = fitted.residual / weight
     values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
     values = np.abs(values - np.median(values))
-    rows = values > scales.acts * float(np.quantile(values, 0.998))
+    rows = values > scales.acts * float(np.quantile(values, 1.0 - estimator.rare))
     if estimator.data.reversals >= 2:
         number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
         most = np.argsort(np.bincount(number, fitted.residual**2))[

@@ -27,7 +27,8 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     share = 1.0 - loose.chi_square / max(plain.chi_square, 1e-300)
     if share < MOST:
         return ""
-    low, high = np.quantile((plain.residual - loose.residual) / estimator.weight, [0.002, 0.998])
+    does = (plain.residual - loose.residual) / estimator.weight
+    low, high = np.quantile(does, [estimator.rare, 1.0 - estimator.rare])
     return (
         f"the model has no elastic loop, and one of {0.5 * (high - low):.3g} arcsec to either side makes up "
         f"{100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), then "

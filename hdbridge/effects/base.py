@@ -249,8 +249,8 @@ class Effect(BaseModel, ABC):
         return None
 
     def changing(self, motion: Motion) -> FloatArray | None:
-        """What it would add if its first coefficient changed by one along the way, a column per place of
-        change, shape (n, k); None where that is no contradiction to it.
+        """What it would add if its coefficient changed by one along the way or next to it, a column per place
+        of change, shape (n, k), of an effect of one piece; None where that is no contradiction to it.
         """
         return None
 

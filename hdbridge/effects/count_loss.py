@@ -28,6 +28,9 @@ from hdbridge.effects.base import (
 )
 from hdbridge.effects.path import away_from_reversals
 
+NEAR_S, LEAST_NEAR = 1.0, 5
+"""Next to a step: so long, and so many samples at least."""
+
 
 class Step(BaseModel):
     """One loss: from this time on the error is larger by its size."""
@@ -87,6 +90,14 @@ class CountLoss(Effect):
     def shows(self, motion: Motion) -> Stretch | None:
         """Away from reversals, where a loop of another shape leaves steps."""
         return away_from_reversals(motion)
+
+    def changing(self, motion: Motion) -> FloatArray:
+        """Steps before and after it, within the time in which nothing slow goes far: it is there at once."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        first = int(np.searchsorted(time_s, self.steps[0].time_s))
+        near = max(LEAST_NEAR, round(NEAR_S / float(np.median(np.diff(time_s)))))
+        number = np.arange(len(time_s))
+        return np.column_stack([number >= first - near, number >= first + near]).astype(np.float64)
 
     def pieces(self) -> tuple[Self, ...]:
         """One step each."""

@@ -114,6 +114,12 @@ class LocalDefect(Linear):
         """Away from reversals, where a loop of another shape leaves bumps that lie at one angle too."""
         return away_from_reversals(motion)
 
+    def changing(self, motion: Motion) -> FloatArray:
+        """The bumps next to it: a damaged tooth has none, and a wave has one to either side."""
+        apart = 2.0 * self.half_width_deg
+        beside = [self.model_copy(update={"centre_deg": self.centre_deg + each}) for each in (-apart, apart)]
+        return np.hstack([each.columns(motion) for each in beside])
+
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         """The load's angle."""
         return replace(over.load_angle(motion, ratio), bins=120)

@@ -37,6 +37,8 @@ SMOOTH = 15
 """Samples about whose parabola a reading of such a channel is noise,"""
 WHITE = 1.17
 """... of which that shows five sixths; less 3 %, as well as it is known."""
+SHORT = 10_000
+"""Samples: what is rare in a shorter record is rarer in proportion."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -154,6 +156,13 @@ class Estimator:
     def motion(self) -> Motion:
         """What drove the axis, point by point (all points, the elastic state passes through each)."""
         return self.data.points.motion
+
+    @property
+    def rare(self) -> float:
+        """Share of the record in which a quantity may be larger, and in which smaller, than it is said to
+        be.
+        """
+        return self.scales.rare / max(len(self.data.full), SHORT)
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""

@@ -30,6 +30,12 @@ class Scales:
         30.0, "chi square per cause", 0.0, "2 log of 3e6 places, shapes and kinds that are looked at"
     )
     floor_arcsec: float = _scale(0.5, "arcsec at its peak", 0.0, "smaller ones are of no use to an axis")
+    rare: float = _scale(
+        20.0,
+        "samples of 10,000 or more in which an effect is larger than said",
+        0.0,
+        "a tooth is passed in hundreds, jumps and peaks of a channel are fewer",
+    )
     robust: float = _scale(
         25.0, "chi square of block sums", 0.0, "five standard deviations in independent stretches"
     )

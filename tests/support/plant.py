@@ -353,6 +353,12 @@ def unknown(
         return size * np.sin(2 * np.pi * t / 47.0) * np.cos(np.deg2rad(motor * 0.5))
     if kind["kind"] == "bursts":
         return size * (np.sin(2 * np.pi * t / 61.0) > 0.8) * np.sin(2 * np.pi * t / 1.7)
+    if kind["kind"] == "packet":  # a roller that presses on near one load angle
+        return size * np.exp(-(((load - 90.0) / kind["width"]) ** 2)) * np.cos(np.deg2rad(motor * 1.9))
+    if kind["kind"] == "heated":  # by the square of the speed, with a time constant
+        nearer = -math.expm1(-float(np.median(np.diff(t))) / kind["tau"])
+        heat = lfilter([nearer], [1.0, nearer - 1.0], v**2)
+        return size * heat / np.max(heat)
     raise ValueError(kind["kind"])
 
 
