@@ -82,6 +82,7 @@ class Firmware:
         self._error_code = 0
         self._mode = self._modes[0]
         self.motion.limited = False
+        self.motion.take_parameters()
         self.motion.take_actual_as_demand()
         self._limit_torque(self._dictionary.value(0x6072))
         self._set_state(State.SWITCH_ON_DISABLED)
@@ -94,9 +95,9 @@ class Firmware:
             0x603F: lambda: self._error_code,
             0x6041: self.statusword,
             0x6061: lambda: self._mode.number,
-            0x6062: lambda: wrap_int32(motion.user(motion.demand_counts)),
+            0x6062: motion.demand_position,
             0x6063: lambda: wrap_int32(motion.motor_counts),
-            0x6064: self._position_actual,
+            0x6064: motion.actual_position,
             0x606B: lambda: self._velocity_sign() * round(motion.velocity_counts_s),
             0x606C: lambda: self._velocity_sign() * round(motion.machine.velocity_counts_s),
             0x6077: lambda: motion.machine.torque_permille,
@@ -106,7 +107,7 @@ class Firmware:
             0x2101: lambda: round(1000.0 * motion.machine.load_torque_nm),
         }.items():
             entry[key, 0].bind(read)
-        entry[0x60E4, 1].bind(lambda: wrap_int32(motion.load_counts))
+        entry[0x60E4, 1].bind(motion.load_position)
         entry[0x60E5, 1].bind(lambda: round(motion.load_velocity_counts_s))
         entry[0x6040, 0].follower = self.control
         entry[0x6072, 0].follower = self._limit_torque
@@ -114,10 +115,6 @@ class Firmware:
         entry[0x6060, 0].follower = self._change_mode
         for index, sub in ((0x60C2, 1), (0x60C2, 2), (0x607E, 0)):
             entry[index, sub].guard = self._refuse_while_powered
-
-    def _position_actual(self) -> int:
-        motion = self.motion
-        return wrap_int32(motion.sign * motion.motor_counts + motion.home_counts)
 
     def _limit_torque(self, permille: int) -> None:
         self.motion.machine.torque_limit_permille = permille

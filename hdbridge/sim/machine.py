@@ -68,6 +68,7 @@ class Machine:
         self._motor_losses = Losses(motor.losses) if motor.losses else None
         self._load_losses = Losses(load.losses) if load.losses else None
         self._see(loops.seen())
+        self._sample()
 
     def follow(self, start_counts: float, end_counts: float, substeps: int, outer_nm: float = 0.0) -> None:
         """Closed loop: the demand moves evenly from start to end, in motor counts (may be fractional).
@@ -156,6 +157,7 @@ class Machine:
             noise = np.array([self._noise.gauss(0.0, self._noise_deg) for _ in steps])
         self._see(tuple(seen[-1].tolist()))
         self._noise_now_deg = float(noise[-1])
+        self._sample()
         _, motor_deg, _, load_deg, body_deg, _, _, weight_nm, torque_nm, _, _ = seen.T
         told.motor_reading[:] = motor_deg * self._motor_counts_per_deg + self._motor_zero
         told.load_reading[:] = (load_deg + body_deg + noise) * self._load_counts_per_deg + self._load_zero
@@ -171,32 +173,6 @@ class Machine:
         self._finish(substeps * self.dt_s)
 
     @property
-    def motor_counts(self) -> int:
-        """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
-        return math.floor(self._motor_reading(self._sampled_motor_deg) + 0.5)
-
-    @property
-    def load_counts(self) -> int:
-        """Load encoder: whole counts, multi-turn, never wrapped; with the noise of this instant."""
-        return math.floor(self.load_reading + 0.5)
-
-    @property
-    def motor_reading(self) -> float:
-        """The motor encoder in counts, before it is rounded."""
-        return self._motor_reading(self._sampled_motor_deg)
-
-    @property
-    def load_reading(self) -> float:
-        """The load encoder in counts, before it is rounded."""
-        deg = self._sampled_load_deg
-        if self._load_errors:
-            deg += sum(each.error_deg(deg) for each in self._load_errors)
-        deg += self._body_deg
-        deg += self._noise_now_deg
-        counts = deg * self._load_counts_per_deg + self._load_zero
-        return counts if self._load_losses is None else counts + self._load_losses.counts(self._heat.since_s)
-
-    @property
     def velocity_counts_s(self) -> float:
         """The motor's speed as the drive measures it."""
         return self._measured_deg_s * self._motor_counts_per_deg
@@ -205,11 +181,6 @@ class Machine:
     def torque_nm(self) -> float:
         """The motor's torque, not rounded, in the sense of the motor encoder."""
         return self.truth.motor.encoder.direction * self._torque_nm
-
-    @property
-    def torque_permille(self) -> int:
-        """The motor's torque, in thousandths of the rated one, in the sense of the motor encoder."""
-        return self._torque_permille
 
     @property
     def torque_limit_permille(self) -> float:
@@ -274,7 +245,27 @@ class Machine:
             self._torque_squares,
             self._friction_j,
         ) = seen
-        self._torque_permille = round(self._sense_permille * self._torque_nm / self._rated_nm)
+
+    def _sample(self) -> None:
+        """What the drive measures at the end of a cycle; asked more often than it changes."""
+        self.motor_reading = self._motor_reading(self._sampled_motor_deg)
+        """The motor encoder in counts, before it is rounded."""
+        self.motor_counts = math.floor(self.motor_reading + 0.5)
+        """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
+        deg = self._sampled_load_deg
+        if self._load_errors:
+            deg += sum(each.error_deg(deg) for each in self._load_errors)
+        deg += self._body_deg
+        deg += self._noise_now_deg
+        reading = deg * self._load_counts_per_deg + self._load_zero
+        if self._load_losses is not None:
+            reading += self._load_losses.counts(self._heat.since_s)
+        self.load_reading = reading
+        """The load encoder in counts, before it is rounded."""
+        self.load_counts = math.floor(reading + 0.5)
+        """Load encoder: whole counts, multi-turn, never wrapped; with the noise of this instant."""
+        self.torque_permille = round(self._sense_permille * self._torque_nm / self._rated_nm)
+        """The motor's torque, in thousandths of the rated one, in the sense of the motor encoder."""
 
     def _lost_deg(self) -> float:
         """What the motor encoder has lost."""
@@ -296,3 +287,4 @@ class Machine:
             self._noise_now_deg = self._noise.gauss(0.0, self._noise_deg)
         if elapsed_s:
             self._heat.warm(self._torque_squares, self._friction_j, elapsed_s)
+        self._sample()

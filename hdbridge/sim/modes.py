@@ -69,7 +69,7 @@ class CyclicSynchronousPosition(Mode):
         target = self._target.value + self._offset.value
         goal = motion.goal(target)
         step = goal - motion.demand_counts
-        longest = motion.max_speed_counts_s() * period_s
+        longest = motion.max_speed_counts_s * period_s
         if abs(step) > longest:
             motion.limited = True
             step = longest if step > 0.0 else -longest
@@ -139,7 +139,7 @@ class ProfilePosition(Mode):
             motion.demand_counts,
             motion.velocity_counts_s,
             goal,
-            min(value(0x6081), value(0x607F), motion.max_speed_counts_s()),
+            min(value(0x6081), value(0x607F), motion.max_speed_counts_s),
             min(value(0x6083), value(0x60C5)),
             min(value(0x6084), value(0x60C6)),
         )

@@ -69,17 +69,20 @@ class Motion:
         self.load_jump_counts = 0
         self.load_reading: Callable[[int], int] | None = None
         self._owed_s = 0.0
-        self._polarity = dictionary[0x607E, 0]
         self._min = dictionary[0x607D, 1]
         self._max = dictionary[0x607D, 2]
-        self._motor_resolution = dictionary[0x608F, 1]
-        self._max_speed = dictionary[0x6080, 0]
         self._target = dictionary[0x607A, 0]
+        for index in (0x607E, 0x6080):
+            dictionary[index, 0].follower = lambda _: self.take_parameters()
+        self.take_parameters()
 
-    @property
-    def sign(self) -> int:
+    def take_parameters(self) -> None:
+        """Work out what depends on objects that only SDO writes, so that no period has to."""
+        value = self.dictionary.value
+        self.sign = -1 if value(0x607E) & 0x80 else 1
         """-1 where object 607Eh reverses positions, else 1."""
-        return -1 if self._polarity.value & 0x80 else 1
+        self.max_speed_counts_s: float = value(0x6080) * value(0x608F, 1) / 60.0
+        """Object 6080h in counts/s."""
 
     def user(self, counts: float) -> int:
         """The user's (unbounded) position of a plant position."""
@@ -105,10 +108,17 @@ class Motion:
                     distance = allowed - here32
         return sign * (here + distance - self.home_counts)
 
-    def max_speed_counts_s(self) -> float:
-        """Object 6080h in counts/s."""
-        speed: float = self._max_speed.value * self._motor_resolution.value / 60.0
-        return speed
+    def actual_position(self) -> int:
+        """Object 6064h."""
+        return ((self.sign * self.motor_counts + self.home_counts + _HALF) & _MASK) - _HALF
+
+    def demand_position(self) -> int:
+        """Object 6062h."""
+        return ((self.sign * round(self.demand_counts) + self.home_counts + _HALF) & _MASK) - _HALF
+
+    def load_position(self) -> int:
+        """Object 60E4h:01, to which neither homing nor polarity applies."""
+        return ((self.load_counts + _HALF) & _MASK) - _HALF
 
     def preload_target(self) -> None:
         """Make the demand the target, so that a mode that begins does not move."""

@@ -38,16 +38,13 @@ class Pdo:
         self.valid = False
         self.can_id = 0
         self.transmission_type = 0
+        self.is_synchronous = True
+        """Whether SYNC drives it."""
         self.event_timer_s = 0.0
         self.inhibit_s = 0.0
         self._codec = struct.Struct("<")
         self._install()
         self.compile()
-
-    @property
-    def is_synchronous(self) -> bool:
-        """Whether SYNC drives it."""
-        return self.transmission_type <= SYNC_LAST
 
     def _install(self) -> None:
         entry = self._dictionary
@@ -72,6 +69,7 @@ class Pdo:
         self.valid = not can_id & INVALID
         self.can_id = can_id & 0x7FF
         self.transmission_type = value(self._communication, 2)
+        self.is_synchronous = self.transmission_type <= SYNC_LAST
         self.inhibit_s = value(self._communication, 3) * 1e-4
         self.event_timer_s = value(self._communication, 5) * 1e-3
         entries = [self._mapped(value(self._mapping, sub)) for sub in range(1, value(self._mapping, 0) + 1)]

@@ -26,20 +26,17 @@ compiled = pytest.importorskip("hdbridge.sim.compiled")
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 DATA = Truth.load(ARTICLE).model_dump(by_alias=True)
-PLACES: dict[str, Any] = {
-    name: getattr(Machine, name)
-    for name in (
-        "motor_counts",
-        "load_counts",
-        "velocity_counts_s",
-        "torque_nm",
-        "temperature_c",
-        "load_torque_nm",
-        "true_motor_deg",
-        "true_load_deg",
-        "true_output_deg",
-    )
-}
+PLACES = (
+    "motor_counts",
+    "load_counts",
+    "velocity_counts_s",
+    "torque_nm",
+    "temperature_c",
+    "load_torque_nm",
+    "true_motor_deg",
+    "true_load_deg",
+    "true_output_deg",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -196,7 +193,7 @@ def led(machine: Machine, seed: int, cycles: int = 150) -> list[tuple[Any, ...]]
         machine.torque_limit_permille = lot.choice((3000.0, 800.0))
         machine.follow(place, place + speed, lot.choice((8, 8, 3)))
         place += speed
-        rows.append(tuple(each.fget(machine) for each in PLACES.values()))
+        rows.append(tuple(getattr(machine, each) for each in PLACES))
     return rows
 
 
@@ -294,6 +291,4 @@ def test_many_cycles_at_once_are_the_same_as_one_after_the_other() -> None:
             assert getattr(told, name)[cycle] == getattr(each, name), (name, cycle)
     each.follow(counts[-1], counts[-1] + 90.0, 4)
     at_once.follow(counts[-1], counts[-1] + 90.0, 4)
-    assert {name: place.fget(each) for name, place in PLACES.items()} == {
-        name: place.fget(at_once) for name, place in PLACES.items()
-    }
+    assert {name: getattr(each, name) for name in PLACES} == {name: getattr(at_once, name) for name in PLACES}
