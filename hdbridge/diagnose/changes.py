@@ -17,7 +17,7 @@ from hdbridge.diagnose.holdout import held_out, held_out_change
 from hdbridge.diagnose.lookalikes import together
 from hdbridge.diagnose.parameters import named_parameters, parameters_of
 from hdbridge.diagnose.result import UNWEIGHED, Finding, Parameter
-from hdbridge.diagnose.search import Search, Trail
+from hdbridge.diagnose.search import Search
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Part, Start
 from hdbridge.estimation.calibration import CalibratedPart, calibrated, variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -26,7 +26,7 @@ from hdbridge.model import TransmissionModel
 
 
 def findings(
-    search: Search, model: TransmissionModel, trail: Trail, precise: Fitted, spread: FloatArray
+    search: Search, model: TransmissionModel, fitted: Fitted, precise: Fitted, spread: FloatArray
 ) -> list[Finding]:
     """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
     estimator = search.estimator
@@ -40,32 +40,30 @@ def findings(
         if given.part is Part.LOOP:
             if estimator.data.reversals >= 2:  # a loop shows only where the axis reverses
                 same = type(given) is type(precise.hypothesis.effects[place])
-                law = _loop(estimator, trail.fitted, precise, usual[0], given, spread) if same else None
-                result.append(law if same else _another_law(estimator, trail, precise, place, given, spread))
+                law = _loop(estimator, fitted, precise, usual[0], given, spread) if same else None
+                result.append(law if same else _another_law(estimator, fitted, precise, place, given, spread))
         elif given.part is Part.ORDERS:
             result.append(_orders(estimator, precise, usual, given, spread) if usual else None)
         else:
-            result.append(_freed(search, trail.fitted, precise, place, given, spread))
+            result.append(_freed(search, fitted, precise, place, given, spread))
     return [each for each in result if each is not None]
 
 
 def _another_law(
-    estimator: Estimator, trail: Trail, precise: Fitted, place: int, given: Effect, spread: FloatArray
+    estimator: Estimator, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> Finding | None:
     """Where another elastic law does better than the ``given`` one."""
-    fitted, scales = trail.fitted, estimator.scales
-    now = precise.hypothesis.effects[place]
+    scales, now = estimator.scales, precise.hypothesis.effects[place]
     causes = causes_of(given, now)
-    if trail.law_gain < scales.enter + scales.penalty or not causes:
-        return None
     old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
     peak = float(np.quantile(np.abs(old.residual - fitted.residual) / estimator.weight, 1.0 - estimator.rare))
-    if peak < scales.plain_arcsec:
+    gain = old.chi_square - fitted.chi_square
+    if gain < scales.enter + scales.penalty or peak < scales.plain_arcsec or not causes:
         return None
     name, parameters = causes[0].name, parameters_of(estimator, precise, place, spread)
     return Finding(
         name, UNWEIGHED, (), parameters, held_out(estimator, fitted, old), next_experiment(name, ()), peak,
-        robust=trail.law_gain, effect=causes[0],
+        robust=gain, effect=causes[0],
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from hdbridge.diagnose import changes
 from hdbridge.diagnose.acceptance import gate
-from hdbridge.diagnose.backward import eliminated, pruned
 from hdbridge.diagnose.experiment import for_unexplained, next_experiment
 from hdbridge.diagnose.extend import as_named, extended_model, supported
 from hdbridge.diagnose.holdout import held_out
@@ -17,7 +16,6 @@ from hdbridge.diagnose.identifiability import identifiability
 from hdbridge.diagnose.lookalikes import (
     as_calibrated,
     lookalikes,
-    plausible_only,
     waves_alike,
     with_measured,
 )
@@ -25,7 +23,7 @@ from hdbridge.diagnose.parameters import covariance, parameters_of
 from hdbridge.diagnose.precise import precisely
 from hdbridge.diagnose.probability import Context, weighed
 from hdbridge.diagnose.result import UNWEIGHED, Diagnosis, Figures, Finding, Traces
-from hdbridge.diagnose.search import Search, Trail
+from hdbridge.diagnose.search import Search
 from hdbridge.diagnose.systematic import confounded
 from hdbridge.diagnose.unexplained import (
     LESS,
@@ -102,10 +100,10 @@ def diagnose(
     data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
     estimator.data = data
     progress("searching for causes")
-    trail = pruned(search, search.run())
+    found = search.run()
     progress("judging what was found")
-    found = _Judge(estimator, search, trail, model, bool(first)).diagnosis()
-    return replace(found, remarks=(*remarks, *found.remarks))
+    diagnosis = _Judge(search, model, bool(first)).of(found)
+    return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
@@ -129,21 +127,23 @@ class _Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judge:
-    estimator: Estimator
     search: Search
-    trail: Trail
     model: TransmissionModel
     unfitted: bool
     """Whether the model lacks most of what the axis has."""
     considered: list[str] = field(default_factory=list)
     """What is not named, with the reason."""
 
-    def diagnosis(self) -> Diagnosis:
+    @property
+    def estimator(self) -> Estimator:
+        return self.search.estimator
+
+    def of(self, fitted: Fitted) -> Diagnosis:
+        """The diagnosis, from where the search has ended."""
         estimator, given = self.estimator, self.model.effects
         base = len(given)
-        fitted = eliminated(estimator, self.trail.fitted, base, self._stopped, self.considered)
-        fitted = eliminated(estimator, fitted, base, self._shadow, self.considered)
-        fitted = plausible_only(self.search, fitted)
+        fitted = self.search.eliminated(fitted, self._stopped, self.considered)
+        fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
@@ -192,12 +192,19 @@ class _Judge:
         )
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Of what a gate stops the weakest."""
-        effects = range(len(self.model.effects), len(fitted.hypothesis.effects))
-        gates = {place: gate(self.estimator, fitted, place) for place in effects}
+        """Of what a gate stops the weakest; without any, what cannot be as it has come out."""
+        places = range(len(self.model.effects), len(fitted.hypothesis.effects))
+        gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
-        place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed, default=-1)
-        return None if place < 0 else (place, gates[place].reason)
+        if stopped:
+            place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed)
+            return place, gates[place].reason
+        data = self.estimator.data
+        for place in places:
+            effect = fitted.hypothesis.effects[place]
+            if reason := effect.implausible(data) or effect.unidentifiable(data):
+                return place, reason
+        return None
 
     def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
         """Of names that do less than what is left unexplained in addition, and may be a shadow of that, the
@@ -252,8 +259,7 @@ class _Judge:
             replace(self._finding(fitted, place), parameters=parameters_of(estimator, precise, place, spread))
             for place in range(base, len(fitted.hypothesis.effects))
         ]
-        trail = replace(self.trail, fitted=fitted)
-        findings += changes.findings(self.search, self.model, trail, precise, spread)
+        findings += changes.findings(self.search, self.model, fitted, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
         # A model cannot hold a free-form loop: figures are without it.

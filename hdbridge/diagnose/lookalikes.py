@@ -1,5 +1,5 @@
-"""Second looks at a name whose look-alike is the better one: what cannot be, what follows a measured channel,
-and what another convention tells without a change of the model.
+"""Second looks at a name whose look-alike is the better one: what follows a measured channel, and what
+another convention tells without a change of the model.
 """
 
 from __future__ import annotations
@@ -14,27 +14,6 @@ from hdbridge.effects import CATALOGUE, Effect, Part, Start, aliases_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
 from hdbridge.estimation.linear import orthonormal
 from hdbridge.estimation.screening import proposed
-
-
-def plausible_only(search: Search, fitted: Fitted) -> Fitted:
-    """With the best addition in the place of what is refused as it has come out, or with nothing."""
-    data = search.estimator.data
-    gone: set[str] = set()
-    for _ in range(len(CATALOGUE)):
-        reasons = {
-            place: reason
-            for place, each in enumerate(fitted.hypothesis.effects)
-            if place >= search.base and (reason := each.implausible(data) or each.unidentifiable(data))
-        }
-        if not reasons:
-            break
-        place = min(reasons)
-        name = fitted.hypothesis.effects[place].name
-        search.refusals[name] = reasons[place]
-        gone.add(name)
-        without = search.estimator.fit(fitted.hypothesis.without(place))
-        fitted = search.best_addition(without, left_out=gone) or without
-    return fitted
 
 
 def with_measured(search: Search, fitted: Fitted) -> Fitted:

@@ -1,22 +1,21 @@
 """The search for causes: screen everything, fit the best few with everything, take the best, look again.
 
 What a cause has to earn stands in `Scales`; the elastic law is chosen again after each of
-the first picks. What was picked is looked at again in `backward.py`.
+the first picks. What was picked and no longer earns its keep among the others goes.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from hdbridge.diagnose import matched_filters
 from hdbridge.diagnose.acceptance import all_pieces_seen, gate
 from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
-from hdbridge.estimation.hypothesis import ENOUGH, Estimator, Fitted, Hypothesis
+from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.screening import Score, Screen, candidates, score_of
 
 MOST = 6
@@ -24,15 +23,6 @@ BEST = 3
 """So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
 ANEW = 3
 """So often the law of the loop is chosen anew after a pick."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trail:
-    """Where a search ended."""
-
-    fitted: Fitted
-    law_gain: float
-    """Chi square by which the chosen elastic law is better than the other; 0 without one."""
 
 
 class Search:
@@ -64,34 +54,20 @@ class Search:
         self.estimator.loop_sign *= -1.0
         other = self._begin()
         self.estimator.loop_sign *= -1.0
-        rival = self.best_addition(known) or known
+        rival = self._best_addition(known, set()) or known
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
 
-    def run(self) -> Trail:
-        """Find causes, best first; where more than the floor is left, again without the first of them.
-
-        The best of one cause may be one that does a little of the work of each of two.
-        """
-        trail = self._greedily()
-        names = [each.name for each in trail.fitted.hypothesis.effects[self.base :]]
-        left = np.mean((trail.fitted.residual**2 - 1.0) / self.estimator.weight**2)
-        if not names or left < self.scales.floor_arcsec**2:
-            return trail
-        other = self._greedily({names[0]})
-        if self.cost(other.fitted) + self.scales.enter < self.cost(trail.fitted):
-            return other
-        return trail
-
-    def _greedily(self, left_out: Set[str] = frozenset()) -> Trail:
-        fitted, law_gain = self.with_best_law(self._begin())
+    def run(self) -> Fitted:
+        """Find causes, best first, and keep those that earn their keep among the others."""
+        fitted = self._with_best_law(self._begin())
         refused: set[object] = set()
         for number in range(MOST):
-            found = self.best_addition(fitted, left_out=left_out, refused=refused)
+            found = self._best_addition(fitted, refused)
             if number < ANEW and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
-                    fitted, law_gain = self.with_best_law(loose)
+                    fitted = self._with_best_law(loose)
                     continue
             if found is None:
                 break
@@ -101,23 +77,23 @@ class Search:
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
                 break  # piece by piece at something that is none of them
             if number < ANEW:
-                fitted, law_gain = self.with_best_law(fitted)
-        return Trail(fitted, law_gain)
+                fitted = self._with_best_law(fitted)
+        if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
+            fitted = self._swapped(fitted)
+        return self._with_best_law(self.eliminated(fitted, self._least, []))
 
     def _begin(self) -> Fitted:
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
-    def with_best_law(self, fitted: Fitted) -> tuple[Fitted, float]:
+    def _with_best_law(self, fitted: Fitted) -> Fitted:
         """The model's law of the loop or one that can stand in its place, whichever fits better."""
         for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
             laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
             if laws:
                 trials = [self.estimator.fit(fitted.hypothesis.instead(place, law)) for law in laws]
-                rival = min(trials, key=lambda each: each.chi_square)
-                gain = rival.chi_square - fitted.chi_square
-                return (fitted, gain) if gain >= 0.0 else (rival, -gain)
-        return fitted, 0.0
+                return min((fitted, *trials), key=lambda each: each.chi_square)
+        return fitted
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
         """With a hysteresis of any shape added to the law, where that does more than the best cause."""
@@ -128,25 +104,71 @@ class Search:
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
         return loose if gain > max(rival, 0.0) else None
 
+    # --- another look
+
+    def _swapped(self, fitted: Fitted) -> Fitted:
+        """With the best one in the place of each finding that is taken out, and the law chosen anew.
+
+        What a finding has gained with further pieces cost an entry for each when they were added, and does so
+        here: what takes its place has entered only once.
+        """
+        for place in range(self.base, len(fitted.hypothesis.effects)):
+            if place >= len(fitted.hypothesis.effects):
+                break  # what took another's place has become part of one that was there
+            further = self._additions(fitted.hypothesis.effects[place]) - 1
+            most = self.cost(fitted) + self.scales.enter * further
+            without = self._with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
+            other = self._best_addition(without, set())
+            if other is not None and self.cost(other) < most:
+                fitted = other
+        return fitted
+
+    def _additions(self, effect: Effect) -> int:
+        """How often a search has added to a finding: orders come one by one, or those of a cause together."""
+        offered = next(iter(type(effect).proposals(self.estimator.data, ())), effect)
+        return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
+
+    def eliminated(
+        self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], told: list[str]
+    ) -> Fitted:
+        """Without the cause that is ``worst`` (its place, and why it goes), one after the other; the others
+        fitted again.
+
+        What went is appended to ``told`` in words.
+        """
+        while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
+            place, why = found
+            told.append(f"{fitted.hypothesis.effects[place].name}: {why}")
+            fitted = self.estimator.fit(fitted.hypothesis.without(place))
+        return fitted
+
+    def _least(self, fitted: Fitted) -> tuple[int, str] | None:
+        """What no longer earns its keep among the others."""
+        effects = fitted.hypothesis.effects
+        gains = {
+            place: self.estimator.fit(fitted.hypothesis.without(place)).chi_square - fitted.chi_square
+            for place in range(self.base, len(effects))
+        }
+        toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
+        place = min(gains, key=lambda each: gains[each] - toll[each])
+        small = self.peak(fitted, place) < self.scales.floor_arcsec
+        # What the law of a large one gets wrong looks like a small one of its kind.
+        alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
+        share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
+        needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
+        return None if gains[place] > needed and not small else (place, "")
+
     # --- one more cause
 
-    def best_addition(
-        self,
-        fitted: Fitted,
-        most: float = math.inf,
-        left_out: Set[str] = frozenset(),
-        refused: set[object] | None = None,
-    ) -> Fitted | None:
-        """With the best cause more, none of those ``left_out``, refitted; None where none earns its keep.
+    def _best_addition(self, fitted: Fitted, refused: set[object]) -> Fitted | None:
+        """With the best cause more, refitted; None where none earns its keep.
 
-        One that costs more than ``most`` is of no use, and need not be the best that there is. Candidates
-        that were ``refused`` are passed over, and further ones noted there.
+        Candidates that were ``refused`` are passed over, and further ones noted there.
         """
-        refused = set() if refused is None else refused
         best: tuple[float, Fitted] | None = None
-        for score in self._shortlist(fitted, left_out, refused):
+        for score in self._shortlist(fitted, refused=refused):
             cause = score.effect.name
-            trial = self._restated(self._with(fitted, score, most), cause)
+            trial = self._with(fitted, score)
             toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
             net = fitted.chi_square - trial.chi_square - toll
             none = net <= 0.0 or self._too_small(trial, cause)
@@ -158,17 +180,6 @@ class Search:
             elif best is None or net > best[0]:
                 best = (net, trial)
         return None if best is None else best[1]
-
-    def _restated(self, trial: Fitted, cause: str) -> Fitted:
-        """What was added by another of its conventions, where it makes no sense by the one it has."""
-        place = _last(trial, cause)
-        effect = trial.hypothesis.effects[place]
-        if effect.violations():
-            for other in effect.restated(self.estimator.data):
-                again = self.estimator.fit(trial.hypothesis.instead(place, other))
-                if not again.hypothesis.effects[place].violations():
-                    return again
-        return trial
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Whether what was added is of no use to an axis."""
@@ -225,13 +236,13 @@ class Search:
         return 0.5 * float(high - low)
 
     def _shortlist(
-        self, fitted: Fitted, left_out: Set[str], refused: Set[object] = frozenset()
+        self, fitted: Fitted, left_out: str = "", refused: Set[object] = frozenset()
     ) -> list[Score]:
         """The best candidate of each of the best causes, and of each number of parameters that it may have.
 
         One of more parameters gains more only once its shapes are fitted.
         """
-        passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | left_out
+        passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
         scores = [
             each
             for each in self._scores(fitted)
@@ -295,19 +306,18 @@ class Search:
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
         best: dict[str, Fitted] = {}
-        for score in self._shortlist(without, {cause}):
+        for score in self._shortlist(without, cause):
             name = score.effect.name
-            trial = self._with(without, score, most)
+            trial = self._with(without, score)
             if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
                 continue
             if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
                 best[name] = trial
         return sorted(best, key=lambda each: best[each].chi_square)
 
-    def _with(self, fitted: Fitted, score: Score, most: float) -> Fitted:
-        """With one of the candidates more; roughly where it costs more than ``most``."""
-        hypothesis = joined(fitted.hypothesis, score.effect, self.base)
-        return self.estimator.fit(hypothesis, effort=replace(ENOUGH, most=most))
+    def _with(self, fitted: Fitted, score: Score) -> Fitted:
+        """With one of the candidates more."""
+        return self.estimator.fit(joined(fitted.hypothesis, score.effect, self.base))
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -96,16 +96,6 @@ class AmplitudeDrift(Linear, Warmed):
         if abs(self.ripple_percent_per_k) * ripple <= friction:
             return Part.LOOP, self.loop.law()
         return Part.ORDERS, MotorOrders(orders=self.orders)
-
-    def restated(self, observations: Observations) -> Iterator[Self]:
-        """Counted from temperatures of the record.
-
-        At a reference that is far away the line may have no amplitude left of which to tell a share.
-        """
-        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
-        if temperature is not None:
-            for each in (float(np.max(temperature)), float(np.min(temperature))):
-                yield self.model_copy(update={"reference_c": round(each, 1)})
 
     def retold(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations

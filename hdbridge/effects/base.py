@@ -294,10 +294,6 @@ class Effect(BaseModel, ABC):
         """What it looks like where its channel was not measured; None where that is nothing in particular."""
         return None
 
-    def restated(self, observations: Observations) -> Iterator[Self]:
-        """The same law with other values of what is only a convention, where the given ones lead nowhere."""
-        return iter(())
-
     def retold(
         self,
         now: Sequence[Effect],

@@ -5,8 +5,7 @@ The baseline is refitted with every candidate, so what the baseline can take ove
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -28,9 +27,6 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
 """A search compares hypotheses whose chi squares are tens and more apart."""
-KEPT_FITS = 8
-"""What is asked for again and again is kept; so many, for they are large. Of older fits only where
-they ended is."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
 """Measured channels of which each reading has its own noise that goes into a column as it is."""
 SMOOTH = 15
@@ -81,11 +77,6 @@ class Fitted:
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
 
-    @property
-    def origin(self) -> tuple[Effect, ...]:
-        """The effects whose columns it is of."""
-        return self._solution.origin
-
     @cached_property
     def linearised(self) -> Linearised:
         """In units of the noise."""
@@ -115,16 +106,6 @@ class Fitted:
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Origin:
-    """Where a fit begins, or what one that has ended is made of again in a single step."""
-
-    hypothesis: Hypothesis
-    prior: Mapping[tuple[int, str], Prior]
-    costs: float
-    """Of the parts that are taken for changed."""
-
-
 class Estimator:
     """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
 
@@ -138,11 +119,7 @@ class Estimator:
         self.observed: FloatArray = points.error_arcsec[self.index]
         self.time_s: FloatArray = points.time_s[self.index]
         self.zero: IntArray = points.zero[self.index]
-        self.load_angles = 0
-        """How often the predicted load angle was exchanged."""
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
-        self._fits: OrderedDict[object, Fitted] = OrderedDict()
-        self._origins: dict[object, _Origin] = {}
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
         # About the level that they have in common: an encoder's zero is no part of the physics.
@@ -212,39 +189,17 @@ class Estimator:
         return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
-        """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says."""
-        counted = any(Channel.LOAD_ANGLE in each.channels for each in hypothesis.effects)
-        key = (
-            hypothesis, moves, effort,
-            self.load_angles if counted else 0, self.loop_sign, tuple(each.fixed for each in self.calibrated),
-        )  # fmt: skip
-        if key in self._fits:
-            self._fits.move_to_end(key)
-            return self._fits[key]
-        origin = self._origins.get(key)
-        if origin is None:
-            fitted, origin = self._as_calibrated_or_changed(hypothesis, effort, moves)
-            self._origins[key] = origin
-        else:
-            fitted = self._at(origin, moves, Effort(steps=1))
-        self._fits[key] = fitted
-        if len(self._fits) > KEPT_FITS:
-            self._fits.popitem(last=False)
-        return fitted
+        """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says.
 
-    def _as_calibrated_or_changed(
-        self, hypothesis: Hypothesis, effort: Effort, moves: frozenset[Moves]
-    ) -> tuple[Fitted, _Origin]:
-        """Every part as calibrated at first; one after the other those that cost less as changed ones."""
+        Every part is as calibrated at first; those that cost less as changed ones become free one by one.
+        """
         parts, costs = list(self.calibrated), 0.0
         while True:
-            prior, offset = self._prior(hypothesis, parts)
-            fitted = self._at(_Origin(hypothesis, prior, offset + costs), moves, effort)
+            fitted = self._with_parts(hypothesis, parts, costs, moves, effort)
             effects = fitted.hypothesis.effects
             most = max(parts, key=lambda each: each.strain(effects) - each.change_cost, default=None)
             if most is None or most.strain(effects) <= most.change_cost:
-                origin = replace(hypothesis, effects=fitted.origin)
-                return fitted, _Origin(origin, prior, offset + costs)
+                return fitted
             parts.remove(most)
             costs += most.change_cost
             hypothesis = fitted.hypothesis
@@ -282,26 +237,34 @@ class Estimator:
             self._noise[key] = np.asarray(WHITE * np.sum(apart**2, axis=0))
         return self._noise[key]
 
-    def _at(self, origin: _Origin, moves: frozenset[Moves], effort: Effort) -> Fitted:
-        """Solved from there."""
-        hypothesis, start = origin.hypothesis, origin.hypothesis.start
+    def _with_parts(
+        self,
+        hypothesis: Hypothesis,
+        parts: Sequence[CalibratedPart],
+        costs: float,
+        moves: frozenset[Moves],
+        effort: Effort,
+    ) -> Fitted:
+        """The minimum where these ``parts`` are as calibrated, and changes of others have their ``costs``."""
+        start = hypothesis.start
+        prior, offset = self._prior(hypothesis, parts)
+        costs += offset
         terms = Terms(
             self.observed - self.level,
             lambda effect: self.columns(effect, start),
             White(self.weight),
             self._nuisances(hypothesis),
-            origin.prior,
+            prior,
             self._sign,
             moves,
         )
-        effort = replace(effort, most=effort.most - origin.costs)
         found = Separable(terms).fit(hypothesis.effects, effort)
         return Fitted(
             replace(hypothesis, effects=found.effects),
             found.nuisances[: self.data.full.zeros],
             found.residual * self.weight,
             found.columns,
-            found.chi_square + origin.costs,
+            found.chi_square + costs,
             found,
             self.weight,
         )
@@ -333,7 +296,6 @@ class Estimator:
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
         self.data = replace(data, full=full, points=points)
         self._regressors.along([full.motion])
-        self.load_angles += 1
 
 
 def _smooth(values: FloatArray) -> FloatArray:

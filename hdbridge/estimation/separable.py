@@ -29,9 +29,6 @@ from hdbridge.estimation.terms import FREE, Column, Effort, Terms
 DAMPING = 1e-4
 TRIES = 6
 """So often a step that does not help is shortened."""
-HOPELESS = 30.0
-"""A fit is given up where it lacks more than so many times what its next step promises. Measured after the
-first step, where more than a hundredth was still to be gained: 99 in 100 gained less than 26 times that."""
 EXCHANGES = 3
 """So often what effects carry of each other is exchanged though that makes the fit worse at first."""
 
@@ -85,11 +82,6 @@ class Solution:
     """Shapes that ended on the edge of their range: effect, name."""
     _fit: Separable
     _point: _Point
-
-    @property
-    def origin(self) -> tuple[Effect, ...]:
-        """The effects whose columns it is of: a fit of one step from there is the same again."""
-        return self._point.given
 
     @cached_property
     def jacobian(self) -> FloatArray:
@@ -146,15 +138,13 @@ class Separable:
         effort = effort or Effort()
         here = best = self._at(refreshed(effects))
         damping, exchanged = DAMPING, 0
-        for number in range(effort.steps - 1):
+        for _ in range(effort.steps - 1):
             enough = effort.enough(here.chi_square)
             where, tangents = self.tangents(here.effects)
             system = self._system(here, where, tangents)
             step, promised = self._step(here, where, system, damping)
             small = promised < enough
             if small and self._stands(here, refreshed(here.effects)):
-                break
-            if number and damping < 1.0 and here.chi_square - effort.most > HOPELESS * promised:
                 break
             for _ in range(TRIES):
                 there = self._at(refreshed(moved(here.effects, where, step)))

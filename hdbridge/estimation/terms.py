@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
@@ -62,9 +61,6 @@ class Effort:
     """A step that promises, or gains, less than this in chi square is the last."""
     roughly: float = 0.0
     """... or less than this share of chi square: where much is left, exactness is of no use."""
-
-    most: float = math.inf
-    """Chi square from which on the fit is of no use: one that will not come below is given up on its way."""
 
     def enough(self, chi_square: float) -> float:
         """Gain in chi square below which the fit stands."""
