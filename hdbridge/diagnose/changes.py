@@ -56,7 +56,7 @@ def _another_law(
     scales, now = estimator.scales, precise.hypothesis.effects[place]
     causes = causes_of(given, now)
     old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
-    peak = float(np.quantile(np.abs(old.residual - fitted.residual) / estimator.weight, 1.0 - estimator.rare))
+    peak = _apart_arcsec(estimator, old, fitted)
     gain = old.chi_square - fitted.chi_square
     if gain < scales.enter + scales.penalty or peak < scales.plain_arcsec or not causes:
         return None
@@ -95,15 +95,19 @@ def _loop(
     )  # fmt: skip
 
 
+def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
+    """How far apart two fits are at their peak, but for what is rare."""
+    apart = np.abs(one.residual - other.residual) / estimator.weight
+    return float(np.quantile(apart, 1.0 - estimator.rare))
+
+
 def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
     """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
     scales, free = estimator.scales, fitted.hypothesis.nuisances
     if free is None:
         return 0.0
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
-    apart = float(
-        np.quantile(np.abs(plain.residual - fitted.residual) / estimator.weight, 1.0 - estimator.rare)
-    )
+    apart = _apart_arcsec(estimator, plain, fitted)
     gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * len(free.names)
     return apart if gained and apart > scales.plain_arcsec else 0.0
 

@@ -40,27 +40,10 @@ class Search:
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
-            self._choose_sign()
-
-    def _choose_sign(self) -> None:
-        """Let the load lag where the model has it lead, or the other way round, where that explains more than
-        a loop of the model's sign with the best cause added to it (play lags, too).
-        """
-        if self.estimator.data.reversals < 2:
-            return
-        known = self._begin()
-        if any(each.part is Part.LOOP and each.coefficients()[0] for each in known.hypothesis.effects):
-            return  # not held at zero: it has the model's sign
-        self.estimator.loop_sign *= -1.0
-        other = self._begin()
-        self.estimator.loop_sign *= -1.0
-        rival = self._best_addition(known, set()) or known
-        if self.cost(other) + self.scales.enter < self.cost(rival):
-            self.estimator.loop_sign *= -1.0
 
     def run(self) -> Fitted:
         """Find causes, best first, and keep those that earn their keep among the others."""
-        fitted = self._with_best_law(self._begin())
+        fitted = self._with_best_law(self._with_best_sign(self._begin()))
         refused: set[object] = set()
         for number in range(MOST):
             found = self._best_addition(fitted, refused)
@@ -85,6 +68,21 @@ class Search:
     def _begin(self) -> Fitted:
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
+
+    def _with_best_sign(self, known: Fitted) -> Fitted:
+        """Let the load lag where the model has it lead, or the other way round, where that explains more than
+        a loop of the model's sign with the best cause added to it (play lags, too).
+        """
+        loops = [each for each in known.hypothesis.effects if each.part is Part.LOOP]
+        if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
+            return known  # not held at zero: it has the model's sign
+        self.estimator.loop_sign *= -1.0
+        other = self._begin()
+        self.estimator.loop_sign *= -1.0
+        rival = self._best_addition(known, set()) or known
+        if self.cost(other) + self.scales.enter < self.cost(rival):
+            self.estimator.loop_sign *= -1.0
+        return self._begin()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
         """The model's law of the loop or one that can stand in its place, whichever fits better."""
