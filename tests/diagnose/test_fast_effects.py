@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
-from scipy.stats import binom
+from scipy.special import bdtr
+from support.filters import filtered
 
 from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.estimation.white_noise import between_lines, noise_arcsec
@@ -32,7 +32,7 @@ def names(found: Diagnosis) -> list[str]:
 
 def often_enough(right: int, of: int, rate: float) -> bool:
     """Whether so many right ones are no evidence against a rate, at 1 %."""
-    return float(binom.cdf(right, of, rate)) > 0.01
+    return float(bdtr(right, of, rate)) > 0.01
 
 
 @pytest.mark.parametrize("hz", [3.0, 8.0, 15.0, 22.0])
@@ -95,7 +95,7 @@ def test_more_than_an_arcsec_that_depends_on_nothing_is_unexplained(plant: Modul
     decay = float(np.exp(time_s[0] - time_s[1]))
     white = np.sqrt(1.0 - decay**2) * np.random.default_rng(7).standard_normal(len(time_s))
     moves = np.gradient(record["motor_target_deg"]) != 0.0
-    record["load_position_deg"] += 1.7 * moves * lfilter([1.0], [1.0, -decay], white) / 3600.0
+    record["load_position_deg"] += 1.7 * moves * filtered([1.0], [1.0, -decay], white) / 3600.0
     del record["motor_target_deg"]
     found = diagnose(Record(record), TransmissionModel.from_text(plant.model_text(76)))
     assert "unexplained" in names(found)
@@ -110,7 +110,7 @@ def one_way(seed: int) -> Record:
     for number in range(4):
         motor = 100.0 + 360.0 * turns * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
         error = 20.0 * np.cos(np.radians(2.0 * motor) + phase) - drag * np.gradient(motor, 0.01)
-        slow = lfilter([0.6], [1.0, -0.95], rng.standard_normal(300))[200:]
+        slow = filtered([0.6], [1.0, -0.95], rng.standard_normal(300))[200:]
         load = motor / 100.0 + (error + 40.0 * number + slow + rng.standard_normal(100)) / 3600.0
         moves.append(Record({"time_s": part, "motor_position_deg": motor, "load_position_deg": load}))
     return concatenate(moves)

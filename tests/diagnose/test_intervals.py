@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from support.filters import binomial_quantile
 
 from hdbridge.diagnose import diagnose
 from hdbridge.diagnose.parameters import covariance, named_parameters, parameters_of
@@ -89,7 +89,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
                     halves.append(0.5 * (parameter.high - parameter.low) / abs(true))
     assert len(inside) == 20 * len(SEEDS)
     # So few are inside by chance in one run of a thousand, were the share as low as LEAST.
-    assert sum(inside) >= binom.ppf(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+    assert sum(inside) >= binomial_quantile(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
     assert np.median(halves) < 0.02
 
 
@@ -116,7 +116,7 @@ def test_a_change_of_an_order_is_no_better_known_than_what_it_has_changed_from(
             truth = {f"order_{order}_amplitude_arcsec": size, f"order_{order}_phase_deg": phase}
             inside += [held(found.parameters[name], name, value) for name, value in truth.items()]
     # Without the calibration's own variance in them one in ten holds.
-    assert sum(inside) >= binom.ppf(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
+    assert sum(inside) >= binomial_quantile(1e-3, len(inside), LEAST), f"{sum(inside)} of {len(inside)}"
 
 
 def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[str, Any]:

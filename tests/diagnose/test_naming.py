@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from support.filters import filtered
 
 from hdbridge.diagnose import Diagnosis, Finding, diagnose
 from hdbridge.diagnose.acceptance import Gate
@@ -167,10 +167,10 @@ def test_a_loop_that_sticks_is_no_loss_of_counts_where_it_only_turns_round(
     time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
     shaken = rng.normal(size=len(time_s))
     for _ in range(3):
-        shaken = lfilter([0.03], [1.0, -0.97], shaken)
+        shaken = filtered([0.03], [1.0, -0.97], shaken)
     motor = 10.0 * shaken / np.std(shaken) * np.sin(np.pi * time_s / 28.0)
     sticks = 1.0 + 0.4 * np.exp(-np.abs(np.gradient(motor, time_s)) / 8.0)
-    error = lfilter([0.2], [1.0, -0.8], sticks * plant.loop(motor, "memory", 95.0, 32.0, 2.2))
+    error = filtered([0.2], [1.0, -0.8], sticks * plant.loop(motor, "memory", 95.0, 32.0, 2.2))
     error = error + 0.2 * rng.normal(size=len(motor))
     record = Record(
         {"time_s": time_s, "motor_position_deg": motor, "load_position_deg": motor / 50.0 + error / 3600.0}

@@ -14,7 +14,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
+
+from support.filters import filtered
 
 ORDERS = (
     (1, 4.9, -126.8),
@@ -317,7 +318,7 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
         measured_load = np.interp(t - e["channel_skew"]["ms"] * -1e-3, t, measured_load)
         t, motor, v, torque, measured_load = (each[pick] for each in (t, motor, v, torque, measured_load))
     decay = math.exp(-(t[1] - t[0]) / 5.0)
-    slow = lfilter([math.sqrt(1 - decay**2)], [1, -decay], rng.normal(size=len(t)))
+    slow = filtered([math.sqrt(1 - decay**2)], [1, -decay], rng.normal(size=len(t)))
     noisy = measured_load + (truth.noise * rng.normal(size=len(t)) + truth.slow_noise * slow) / 3600
     follow = 2e-4 * v
     columns = {
@@ -357,7 +358,7 @@ def unknown(
         return size * np.exp(-(((load - 90.0) / kind["width"]) ** 2)) * np.cos(np.deg2rad(motor * 1.9))
     if kind["kind"] == "heated":  # by the square of the speed, with a time constant
         nearer = -math.expm1(-float(np.median(np.diff(t))) / kind["tau"])
-        heat = lfilter([nearer], [1.0, nearer - 1.0], v**2)
+        heat = filtered([nearer], [1.0, nearer - 1.0], v**2)
         return size * heat / np.max(heat)
     raise ValueError(kind["kind"])
 

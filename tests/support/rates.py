@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scipy.stats import binom
+from support.filters import binomial_quantile
 
 CHANCE = 0.01
 """Of a right claim to be refused."""
@@ -10,4 +10,4 @@ CHANCE = 0.01
 
 def least(trials: int, rate: float) -> int:
     """So many successes at least: fewer have a probability below `CHANCE` where the rate is as claimed."""
-    return int(binom.ppf(CHANCE, trials, rate))
+    return binomial_quantile(CHANCE, trials, rate)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.special import ndtr
 from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
@@ -60,7 +60,7 @@ def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, stray: flo
         if half == 0.0:
             return np.asarray(0.5 * off**2)
         size = np.abs(off)
-        return -np.log(norm.sf(size - half) - norm.sf(size + half) + stray)
+        return -np.log(ndtr(half - size) - ndtr(-half - size) + stray)
 
     root, slope = rooted(off, halves, strays)
     assert 0.5 * root**2 == pytest.approx(loss(off) - loss(np.zeros(8)), rel=1e-6, abs=1e-9)
