@@ -3,9 +3,9 @@
  *     cc -O2 -shared -fPIC -o guest_clock.so guest_clock.c
  *     UML_CLOCK_SLOWED=50 UML_CLOCK_SLOWED_FROM=FILE LD_PRELOAD=./guest_clock.so linux.uml ...
  *
- * When all in the guest are idle its time jumps to the next timer at once, and as soon as FILE exists (when it has booted,
- * which contains loops of a second or two by the clock) it passes UML_CLOCK_SLOWED times as slowly as the machine's while the
- * guest computes. So a processor that is taken away for 100 ms is 2 ms to the guest, and no second is waited for. To the
+ * When all in the guest are idle its time jumps to the next timer at once, and as soon as FILE exists (when it has booted)
+ * it passes UML_CLOCK_SLOWED times as slowly as the machine's while the guest computes. Until then it passes eight times as
+ * fast: the kernel measures its RAID routines for a second and a half by the clock. So a processor that is taken away for 100 ms is 2 ms to the guest, and no second is waited for. To the
  * guest's kernel and to every process in it that is simply a fast machine. Without the variables time is the machine's.
  *
  * The kernel has one timer (timer_settime), one clock (CLOCK_MONOTONIC) and one place where it is idle (sigsuspend).
@@ -19,8 +19,10 @@
 #include <unistd.h>
 
 static const int64_t SECOND_NS = 1000000000;
+static const int64_t BOOTING = 8;
 
-static int64_t slowed; /* 0: the machine's own time */
+static int64_t slowed;        /* 0: the machine's own time */
+static int64_t quickened = 1; /* machine_ns / guest_ns is slowed / quickened */
 static int64_t slowed_later;
 static const char *slowed_from;
 static int64_t guest_base_ns, machine_base_ns; /* the same instant on both clocks */
@@ -42,7 +44,7 @@ static int64_t machine_ns(void)
     return ns_of(&now);
 }
 
-static int64_t guest_ns(void) { return guest_base_ns + (machine_ns() - machine_base_ns) / slowed; }
+static int64_t guest_ns(void) { return guest_base_ns + (machine_ns() - machine_base_ns) * quickened / slowed; }
 
 __attribute__((constructor)) static void begin(void)
 {
@@ -54,6 +56,7 @@ __attribute__((constructor)) static void begin(void)
     slowed_later = text ? atoi(text) : 0;
     slowed_from = getenv("UML_CLOCK_SLOWED_FROM");
     slowed = slowed_later > 0 && slowed_from;
+    quickened = slowed ? BOOTING : 1;
     guest_base_ns = machine_base_ns = machine_ns();
 }
 
@@ -70,11 +73,11 @@ static int arm(void)
 {
     int64_t left_ns = 0;
     if (expiry_ns) {
-        left_ns = (expiry_ns - guest_ns()) * slowed;
+        left_ns = (expiry_ns - guest_ns()) * slowed / quickened;
         if (left_ns < 1)
             left_ns = 1; /* zero would disarm */
     }
-    struct itimerspec each = {timespec_of(every_ns * slowed), timespec_of(left_ns)};
+    struct itimerspec each = {timespec_of(every_ns * slowed / quickened), timespec_of(left_ns)};
     return real_timer_settime(timer, 0, &each, NULL);
 }
 
@@ -112,9 +115,10 @@ int timer_gettime(timer_t which, struct itimerspec *left)
 static void slow_down(void)
 {
     int64_t now_ns = guest_ns();
-    machine_base_ns += (now_ns - guest_base_ns) * slowed;
+    machine_base_ns = machine_ns();
     guest_base_ns = now_ns;
     slowed = slowed_later;
+    quickened = 1;
     slowed_from = NULL;
 }
 

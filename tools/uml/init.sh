@@ -44,6 +44,7 @@ done
     source "$SOCKETCAN_WORK/environment"
     cd "$(cat "$SOCKETCAN_WORK/folder")" || exit 70
     export SOCKETCAN_KERNEL=user-mode-linux
+    [ ! -e "$SOCKETCAN_WORK/populate.so" ] || export LD_PRELOAD="$SOCKETCAN_WORK/populate.so${LD_PRELOAD:+:$LD_PRELOAD}"
     eval "set -- $(cat "$SOCKETCAN_WORK/command")"
     exec "$@"
 ) >/run/stdout 2>/run/stderr
