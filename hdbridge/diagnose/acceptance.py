@@ -54,7 +54,7 @@ def robust_chi_square(
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     effect = fitted.hypothesis.effects[place]
-    asked = _evident(effect) if only is None else [only]
+    asked = evident(effect) if only is None else [only]
     own, coefficients = [own[each] for each in asked], effect.coefficients()[asked]
     columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
     known = np.zeros((columns.shape[1], 2))
@@ -78,7 +78,7 @@ def robust_chi_square(
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
-    needed = estimator.scales.robust + estimator.scales.robust_more * (len(_evident(effect)) - 1)
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
     laws = _other_laws(estimator, fitted, place)
     robust = robust_chi_square(estimator, fitted, place, laws=laws)
     if robust < needed:
@@ -102,7 +102,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     return Gate(robust, needed, "not the same everywhere" if changes else "")
 
 
-def _evident(effect: Effect) -> list[int]:
+def evident(effect: Effect) -> list[int]:
     """The numbers of the coefficients that are evidence of an effect."""
     named = effect.named_coefficients()
     return [column for each in named if each.name not in effect.incidental for column in each.columns]

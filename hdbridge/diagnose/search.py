@@ -6,6 +6,7 @@ the first picks. What was picked and no longer earns its keep among the others g
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.diagnose import matched_filters
-from hdbridge.diagnose.acceptance import all_pieces_seen, gate
+from hdbridge.diagnose.acceptance import all_pieces_seen, evident, gate
 from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
 from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.screening import Score, Screen, candidates, score_of
+from hdbridge.estimation.terms import unknown
 
 MOST = 6
 BEST = 3
@@ -44,9 +46,8 @@ class Search:
     def run(self) -> Fitted:
         """Find causes, best first, and keep those that earn their keep among the others."""
         fitted = self._with_best_law(self._with_best_sign(self._begin()))
-        refused: set[object] = set()
         for number in range(MOST):
-            found = self._best_addition(fitted, refused)
+            found = self._best_addition(fitted)
             if number < ANEW and fitted.hypothesis.nuisances is None:
                 loose = self._with_free_loop(fitted, found)
                 if loose is not None:
@@ -79,7 +80,7 @@ class Search:
         self.estimator.loop_sign *= -1.0
         other = self._begin()
         self.estimator.loop_sign *= -1.0
-        rival = self._best_addition(known, set()) or known
+        rival = self._best_addition(known) or known
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
         return self._begin()
@@ -116,7 +117,7 @@ class Search:
             further = self._additions(fitted.hypothesis.effects[place]) - 1
             most = self.cost(fitted) + self.scales.enter * further
             without = self._with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
-            other = self._best_addition(without, set())
+            other = self._best_addition(without)
             if other is not None and self.cost(other) < most:
                 fitted = other
         return fitted
@@ -144,7 +145,7 @@ class Search:
         """What no longer earns its keep among the others."""
         effects = fitted.hypothesis.effects
         gains = {
-            place: self.estimator.fit(fitted.hypothesis.without(place)).chi_square - fitted.chi_square
+            place: self._lacking(fitted, place).chi_square - fitted.chi_square
             for place in range(self.base, len(effects))
         }
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
@@ -156,28 +157,50 @@ class Search:
         needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
+    def _lacking(self, fitted: Fitted, place: int) -> Fitted:
+        """A fit that lacks an effect, but for what is incidental to it and may be there without it."""
+        effect, hypothesis = fitted.hypothesis.effects[place], fitted.hypothesis.without(place)
+        columns = sorted(set(range(len(effect.coefficients()))) - set(evident(effect)))
+        if columns:
+            stays = self.estimator.columns(effect, hypothesis.start)[:, columns]
+            more = unknown(stays, [f"{effect.name} {each}" for each in columns])
+            known = hypothesis.nuisances
+            hypothesis = replace(hypothesis, nuisances=more if known is None else known.and_also(more))
+        return self.estimator.fit(hypothesis)
+
     # --- one more cause
 
-    def _best_addition(self, fitted: Fitted, refused: set[object]) -> Fitted | None:
+    def _best_addition(self, fitted: Fitted) -> Fitted | None:
         """With the best cause more, refitted; None where none earns its keep.
 
-        Candidates that were ``refused`` are passed over, and further ones noted there.
+        What is refused may be another beside what is found next, so nothing is refused for good.
         """
-        best: tuple[float, Fitted] | None = None
-        for score in self._shortlist(fitted, refused=refused):
-            cause = score.effect.name
-            trial = self._with(fitted, score)
-            toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
-            net = fitted.chi_square - trial.chi_square - toll
-            none = net <= 0.0 or self._too_small(trial, cause)
-            reason = "" if none else self._refusal(trial, cause)
-            if reason:
-                self.refusals[cause] = reason
-            if none or reason:
-                refused.add(_key(score))
-            elif best is None or net > best[0]:
-                best = (net, trial)
-        return None if best is None else best[1]
+        scores, refused = self._scores(fitted), set[object]()
+        while shortlist := self._shortlist(fitted, [each for each in scores if _key(each) not in refused]):
+            best: tuple[float, Fitted] | None = None
+            for score in shortlist:
+                cause = score.effect.name
+                trial = self._with(fitted, score)
+                toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
+                net = self._gain(fitted, trial, cause) - toll
+                none = net <= 0.0 or self._too_small(trial, cause)
+                reason = "" if none else self._refusal(trial, cause)
+                if reason:
+                    self.refusals[cause] = reason
+                if none or reason:
+                    refused.add(_key(score))
+                elif best is None or net > best[0]:
+                    best = (net, trial)
+            if best is not None:
+                return best[1]
+        return None
+
+    def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
+        """By how much what was added to a fit as the last of its name has lowered chi square."""
+        place = _last(trial, cause)
+        incidental = trial.hypothesis.effects[place].incidental
+        lacking = self._lacking(trial, place).chi_square if incidental else math.inf
+        return min(lacking, fitted.chi_square) - trial.chi_square
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Whether what was added is of no use to an axis."""
@@ -233,9 +256,7 @@ class Search:
         low, high = np.quantile(values, [self.estimator.rare, 1.0 - self.estimator.rare])
         return 0.5 * float(high - low)
 
-    def _shortlist(
-        self, fitted: Fitted, left_out: str = "", refused: Set[object] = frozenset()
-    ) -> list[Score]:
+    def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
         """The best candidate of each of the best causes, and of each number of parameters that it may have.
 
         One of more parameters gains more only once its shapes are fitted.
@@ -243,9 +264,8 @@ class Search:
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
         scores = [
             each
-            for each in self._scores(fitted)
-            if _key(each) not in refused
-            and each.effect.name not in passed
+            for each in scores
+            if each.effect.name not in passed
             and not (each.effect.waves() and each.share < self.scales.wave_share_left)
         ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
@@ -304,10 +324,12 @@ class Search:
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
         best: dict[str, Fitted] = {}
-        for score in self._shortlist(without, cause):
+        for score in self._shortlist(without, self._scores(without), cause):
             name = score.effect.name
             trial = self._with(without, score)
             if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
+                continue
+            if self._gain(without, trial, name) < self.scales.enter:
                 continue
             if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
                 best[name] = trial

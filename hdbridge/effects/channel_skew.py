@@ -27,10 +27,6 @@ from hdbridge.effects.kinematics import acceleration_of, speed_of
 from hdbridge.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
 
-OTHERS_MS2, LATE_SHARE = 30.0, 4.0
-"""A delayed sample has a part in acceleration of half its delay squared; with the load's own wind-up (30 Hz
-and more) it is at most so many ms^2 and so many times the delay squared."""
-
 
 class ChannelSkew(Linear):
     """delay omega_L + second alpha_L / 2: the load encoder, read later than the motor's, is farther on.
@@ -101,16 +97,6 @@ class ChannelSkew(Linear):
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
         """The one there is."""
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
-
-    def implausible(self, observations: Observations) -> str:
-        """Whether a part in speed and one in acceleration can be those of one delayed sample."""
-        if abs(self.second_order_ms2) > OTHERS_MS2 + LATE_SHARE * self.delay_ms**2:
-            return "too much of it follows the acceleration for a delay"
-        parts = np.abs(self.columns(observations.motion) * self.coefficients())
-        speed, acceleration = np.quantile(parts, 0.998, axis=0)
-        if speed < acceleration:
-            return "more of it follows the acceleration than the speed"
-        return ""
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """One millisecond, and one of its square, shape (n, 2)."""
