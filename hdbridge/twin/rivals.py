@@ -26,7 +26,7 @@ from hdbridge.twin.least_squares import (
     told,
 )
 from hdbridge.twin.misfit import counted
-from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value, with_values
+from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 
 FALSE_ALARM = 0.02
@@ -50,7 +50,7 @@ def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
 
 def put_back(start: Truth, truth: Truth, own: Sequence[Parameter]) -> Truth:
     """A truth with these parameters where they were."""
-    return with_values(truth, {each.name: free_value(start, each) for each in own})
+    return at_coordinates(truth, own, coordinates(start, own))
 
 
 def without(
@@ -72,8 +72,8 @@ def without(
     along = np.linalg.solve(information_of(slopes, spread), slopes.T @ (fitted.jacobian[:, back] @ off))
     low, high = np.array([each.bounds for each in others]).T
     led = at_coordinates(before, others, np.clip(fitted.place[free] - along, low, high).tolist())
-    kept = {each.name: free_value(fitted.truth if each in moved else start, each) for each in others}
-    begun = [led, with_values(before, kept)]
+    kept = [coordinates(fitted.truth if each in moved else start, [each])[0] for each in others]
+    begun = [led, at_coordinates(before, others, kept)]
     rows = fitted_rows(replays.data)
     costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)

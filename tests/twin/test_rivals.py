@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from hdbridge.twin.rivals import told_apart
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import BY_NAME, with_values
+from hdbridge.twin.rivals import put_back, told_apart
+
+DEMO = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 
 LEGS = np.repeat(np.arange(12.0), 100)
 CHANGE = np.sin(np.arange(len(LEGS)) / 7.0)
@@ -35,3 +41,11 @@ def test_residuals_that_go_together_within_a_leg_hide_a_change_that_white_noise_
 
 def test_a_rival_that_leaves_less_is_not_told_apart() -> None:
     assert not told_apart(CHANGE, -CHANGE, LEGS)
+
+
+def test_a_spring_that_is_put_back_is_no_stiffer_than_the_time_step_resolves() -> None:
+    """It was stiff with a larger inertia; with the twin's it would ring faster than the plant is stepped."""
+    light = with_values(DEMO, {"motor inertia": 1e-7, "load inertia": 1e-3, "gear stiffness": 100.0})
+    rival = put_back(DEMO, light, [BY_NAME["gear stiffness"]])
+    assert rival.load_.inertia_kg_m2 == pytest.approx(1e-3)
+    assert 100.0 < rival.gear.stiffness_nm_per_rad < DEMO.gear.stiffness_nm_per_rad
