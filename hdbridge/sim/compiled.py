@@ -111,6 +111,10 @@ class CompiledLoops:
         """See `Loops`."""
         self._methods.begin_demand(self._record, demand_deg)
 
+    def hold(self, torque_nm: float) -> None:
+        """See `Loops`."""
+        self._methods.hold(self._record, torque_nm)
+
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen:
         """See `Loops`."""
         return self._methods.follow(self._record, demand_deg, demand_deg_s, substeps, slow)
@@ -147,6 +151,7 @@ class CompiledLoops:
 class _Methods(NamedTuple):
     power_on: Callable[..., float]
     begin_demand: Callable[..., None]
+    hold: Callable[..., None]
     follow: Callable[..., Seen]
     follow_all: Callable[..., None]
     coast: Callable[..., Seen]
@@ -165,6 +170,10 @@ def _methods() -> _Methods:
     def begin_demand(loops: Any, demand_deg: float) -> None:
         assert version
         loops[0].begin_demand(demand_deg)
+
+    def hold(loops: Any, torque_nm: float) -> None:
+        assert version
+        loops[0].hold(torque_nm)
 
     def follow(loops: Any, demand_deg: float, demand_deg_s: float, substeps: int, slow: Any) -> Any:
         assert version
@@ -196,7 +205,7 @@ def _methods() -> _Methods:
         return loops[0].coast(brake_nm, substeps, slow)
 
     compiled = numba.njit(cache=True, fastmath=False)
-    return _Methods(*(compiled(each) for each in (power_on, begin_demand, follow, follow_all, coast)))
+    return _Methods(*(compiled(each) for each in (power_on, begin_demand, hold, follow, follow_all, coast)))
 
 
 def _version() -> int:

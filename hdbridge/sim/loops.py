@@ -80,6 +80,11 @@ class Loops:
         """The demand has always been this one."""
         self._late_demand.begin(demand_deg)
 
+    def hold(self, torque_nm: float) -> None:
+        """At rest: the integral has come to where the motor's torque is this one."""
+        self.servo.shift(torque_nm - self._torque_nm)
+        self._torque_nm = torque_nm
+
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen:
         """Closed loop over some substeps, in which the demand moves evenly."""
         lost_deg = self._take(slow)

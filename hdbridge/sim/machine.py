@@ -128,6 +128,11 @@ class Machine:
             done += 1
         return told
 
+    def hold(self, torque_nm: float) -> None:
+        """The axis stands, and the loops hold it by this torque, positive forward, whatever they came to."""
+        self._loops.hold(torque_nm)
+        self._torque_nm = torque_nm
+
     def _evenly(self, substeps: Sequence[int]) -> bool:
         """Whether the compiled loops can go on by themselves: nothing happens between the cycles."""
         if not self._powered or self._to_compile is not None:

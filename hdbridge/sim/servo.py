@@ -85,6 +85,10 @@ class Servo:
         self._direction = 0.0
         return self._measured
 
+    def shift(self, torque_nm: float) -> None:
+        """Let the integral be larger by so much."""
+        self._integral += torque_nm
+
     def answer_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
         """The torque for one substep, in which the demand moves evenly from ``demand_deg`` on."""
         dt = self._dt

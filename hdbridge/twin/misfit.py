@@ -293,6 +293,13 @@ def _piece(
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * 360.0 / counts_per_turn)
     torque = part.columns.get("motor_torque_nm")
+    if torque is not None:
+        leaves = np.flatnonzero((stuck & stands)[:-1] & (moved[1:] > 0.0))
+        known = leaves[0] if len(leaves) else len(loops)
+        loops[known:] = unknown[known:]
+        cycles = commands.lead + 1 + np.floor(commands.row_cycles[leaves]).astype(int)
+        held = tuple(zip(cycles.tolist(), torque[leaves].tolist(), strict=True))
+        commands = replace(commands, held=(*commands.held, *held))
     measured = {
         FOLLOWING: target - part.motor_position_deg,
         TORQUE: torque if torque is not None else np.zeros(len(part)),

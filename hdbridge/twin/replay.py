@@ -39,6 +39,8 @@ LATENCY_CYCLES = 4
 """A command shows as demand at most so many cycles after it was given."""
 STANDING_S = 0.3
 """The axis stands so long between the approach and a recording that begins at rest."""
+SETTLING_S = 1.5
+"""... and so long where the recording begins on a drive that holds it: loops of 4/s have come to rest too."""
 OFF_AFTER, ON_BEFORE = 2, 1
 """The bench switches a drive off so many cycles after the last row of a procedure, once it has come to rest,
 and on again so many before the first row of the next."""
@@ -63,6 +65,8 @@ class Commands:
     """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
     off: tuple[slice, ...] = ()
     """Cycles in which the drive is switched off."""
+    held: tuple[tuple[int, float], ...] = ()
+    """Cycles before which the loops are brought to hold the axis by a torque, and that torque in Nm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +200,12 @@ def _told(
     told: list[Cycles] = []
     done = 0
     for off in (*commands.off, slice(len(substeps), len(substeps))):
+        for cycle, torque_nm in commands.held:
+            if done < cycle <= off.start:
+                on = slice(done, cycle)
+                told.append(machine.follow_all(demand[done : cycle + 1], substeps[on], outer_nm[on]))
+                machine.hold(torque_nm)
+                done = cycle
         on = slice(done, off.start)
         told.append(machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on]))
         told.append(_coasted(machine, substeps[off], outer_nm[off]))
@@ -250,7 +260,8 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
         demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
     recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
-    approach = _approach(truth, axis, demand_deg, cycle_s)
+    holds = target[0] == target[1] and not just_on(part, 0)
+    approach = _approach(truth, axis, demand_deg, cycle_s, SETTLING_S if holds else STANDING_S)
     told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
     if told_nm is not None:
         told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
@@ -264,7 +275,11 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     if target[0] == target[1] and just_on(part, 0):
         off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
     off = [each for each in off if each.stop > each.start]
-    return Commands((*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off))
+    torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
+    held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    return Commands(
+        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held
+    )
 
 
 def _weightless(truth: Truth) -> Truth:
@@ -361,7 +376,9 @@ def _degrees(counts: Sequence[float], axis: AxisConfig) -> FloatArray:
     return encoder.direction * np.asarray(counts, dtype=np.float64) * 360.0 / encoder.counts_per_turn
 
 
-def _approach(truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float) -> list[int]:
+def _approach(
+    truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float, standing_s: float
+) -> list[int]:
     """From where the simulated drive is switched on to the first command, and its speed, at the limits."""
     ratio, limits = axis.gear.ratio, axis.limits
     start_counts = truth.motor.encoder.zero_counts
@@ -382,7 +399,7 @@ def _approach(truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: f
             f"recording begins, {demand_deg[0] / ratio:g} deg, within the limits of {axis.path}"
         )
     moving = math.ceil(trajectory.duration / cycle_s)
-    standing = math.ceil(STANDING_S / cycle_s)
+    standing = math.ceil(standing_s / cycle_s)
     per_load_deg = axis.motor_encoder.counts(1.0) * ratio
     # Backwards from its end, so that the last command before the recording has the recording's speed.
     times = [max(trajectory.duration - (moving - k) * cycle_s, 0.0) for k in range(moving)]

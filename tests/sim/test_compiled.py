@@ -206,6 +206,22 @@ def test_compiled_and_python_agree_bit_for_bit(known: Truth, seed: int) -> None:
     assert isinstance(theirs._loops, compiled.CompiledLoops)
 
 
+def test_a_motor_that_is_held_by_a_torque_sets_out_from_it_compiled_or_not() -> None:
+    known = truth({"motor__coulomb_nm": 0.05})
+    counts = [0.0] * 20 + [4.0 * cycle for cycle in range(60)]
+    found = []
+    for may_compile in (False, True):
+        machine = Machine(known, 1, may_compile=may_compile)
+        machine.follow_all(counts[:20], [8] * 19)
+        machine.hold(-0.04)
+        assert machine.torque_nm == -0.04
+        held = machine.follow_all([0.0, 0.0], [8]).torque_nm
+        assert held == pytest.approx(-0.04, abs=1e-9)
+        found.append(machine.follow_all(counts[19:], [8] * 60))
+    for ours, theirs in zip(*found, strict=True):
+        assert np.array_equal(ours, theirs)
+
+
 def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
     axis, known = AxisConfig.load(ARTICLE / "axis.yaml"), Truth.load(ARTICLE)
 

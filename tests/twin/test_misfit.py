@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -133,3 +135,30 @@ def test_a_torque_does_not_count_while_the_motor_stands() -> None:
     assert stands.any()
     assert not piece.counts[TORQUE][stands].any()
     assert piece.counts[TORQUE][~rest & (np.arange(len(record)) > 0.5 * last)].all()
+
+
+def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
+    """The replay has not been where friction holds the axis in the sense in which it came."""
+    stiff = with_values(TRUTH, {"Coulomb friction": 0.1})
+
+    def forward_and_on(bench: Exercise) -> None:
+        bench.move(300.0, 600.0, 6000.0)
+        bench.hold(0.6)
+        bench.move(300.0, 600.0, 6000.0)
+
+    record = record_of(stiff, forward_and_on)
+    target = record.motor_target_deg
+    assert target is not None
+    (rest,) = (row for row, after in pairwise(np.flatnonzero(np.diff(target) != 0.0)) if after - row > 100)
+    columns = {name: each[rest + 30 :] for name, each in record.columns.items()}
+    for name in ("motor_target_deg", "motor_position_deg"):
+        columns[name] = columns[name] - 360.0
+    columns["load_position_deg"] = columns["load_position_deg"] - 360.0 / 50.0
+    data = prepare(Recording(Record(columns), axis="demo", ratio=50.0), AXIS, stiff)
+    (piece,) = data.pieces
+    first = int(np.flatnonzero(piece.rest == 0.0)[0])
+    setting_out = slice(first, first + 8)
+    assert piece.counts[TORQUE][setting_out].all()
+    unheld = replace(data, pieces=(replace(piece, commands=replace(piece.commands, held=())),))
+    off, before = (residuals(each, stiff)[TORQUE][setting_out] for each in (data, unheld))
+    assert np.max(np.abs(off)) < 0.1 * np.max(np.abs(before))
