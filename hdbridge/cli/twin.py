@@ -98,8 +98,9 @@ def _compared(
     axis: AxisConfig, recording: Recording, begun: Translation, facts: list[tuple[str, str]]
 ) -> TwinReport:
     from hdbridge.report.twin import TwinReport
+    from hdbridge.twin.commands import legs_of
     from hdbridge.twin.comparison import compare
-    from hdbridge.twin.replay import legs_of, replay_directly
+    from hdbridge.twin.replay import replay_directly
 
     notes.print("the recording's commands run through the simulated drive ...")
     simulated = replay_directly(recording, axis, begun.truth)

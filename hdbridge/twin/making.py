@@ -8,6 +8,7 @@ from typing import Any
 from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.commands import legs_of
 from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.fitting import FIT_S, fit
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
@@ -15,7 +16,7 @@ from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
 from hdbridge.twin.noise import noise_in_motion, with_load_noise
 from hdbridge.twin.parameters import LOAD
-from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import HELD_OUT, Twin
 

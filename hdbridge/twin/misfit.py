@@ -19,8 +19,9 @@ from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.commands import Commands, commands_of, legs_of
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
-from hdbridge.twin.replay import Commands, commands_of, legs_of, run
+from hdbridge.twin.replay import run
 from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
 from hdbridge.units import ARCSEC_PER_DEG
 

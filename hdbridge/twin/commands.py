@@ -1,0 +1,165 @@
+"""What a part of a recording told the drive, on the grid of its own cycle, with the approach before it.
+
+Before a recording nothing is known of the axis, so the replay begins on a drive that is switched on at its
+angle zero and led to the first command at the axis's limits; so does each part that does not follow another
+one. Where it begins on a drive that holds the axis, the torque that it tells is where the loops have come to.
+Between parts that follow each other the drive is switched off, as the bench does, and the load rings on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from ruckig import InputParameter, Result, Ruckig, Trajectory
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import Channel, FloatArray
+from hdbridge.errors import InputError
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.stretches import just_on
+
+STANDING_S = 0.3
+"""The axis stands so long between the approach and a recording that begins at rest."""
+SETTLING_S = 1.5
+"""... and so long where the recording begins on a drive that holds it: loops of 4/s have come to rest too."""
+UNEVEN = 0.25
+"""Share of a cycle by which a sample's time may be off the cycle's grid without being interpolated."""
+OFF_AFTER, ON_BEFORE = 2, 1
+"""The bench switches a drive off so many cycles after the last row of a procedure, once it has come to rest,
+and on again so many before the first row of the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What one part of a recording told the drive, cycle by cycle, with the approach before it."""
+
+    counts: tuple[float, ...]
+    """Demand of the motor in counts at the end of each cycle; begins where the drive is switched on."""
+    lead: int
+    """How many of them are the approach."""
+    row_cycles: FloatArray
+    """Where each row of the part lies, in cycles since the approach's end (fractional where uneven)."""
+    time_s: FloatArray
+    """Time of each row."""
+    cycle_s: float
+    told_nm: FloatArray | None = None
+    """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
+    off: tuple[slice, ...] = ()
+    """Cycles in which the drive is switched off."""
+    held: tuple[tuple[int, float], ...] = ()
+    """Cycles before which the loops are brought to hold the axis by a torque, and that torque in Nm."""
+
+
+def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
+    """The commands of a record in one piece, on the grid of its own cycle, with the approach before them."""
+    target = part.motor_target_deg
+    name = f"{part.source}: " if part.source else ""
+    if target is None or np.isnan(target).any():
+        raise InputError(
+            f"{name}no commanded motor angle (motor_target_deg); expected one in each row: what the drive "
+            "was told is what a simulated one is told again"
+        )
+    if len(part) < 2:
+        raise InputError(f"{name}{len(part)} rows; expected at least two in each part of a recording")
+    time_s = part.time_s
+    cycle_s = cycle_of(part, axis)
+    cycles = (time_s - time_s[0]) / cycle_s
+    nearest = np.round(cycles)
+    if np.max(np.abs(cycles - nearest)) <= UNEVEN and np.all(np.diff(nearest) >= 1.0):
+        cycles = nearest
+    grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
+    gaps = [first for first in part.starts[1:] if just_on(part, first)]
+    nodes, values = cycles, target
+    for first in gaps:
+        # After its last row a procedure goes on as it slowed down, no further than where the next one begins.
+        later = np.arange(1.0, OFF_AFTER + 1.0)
+        earlier, before, last, rest = target[[max(first - 3, 0), first - 2, first - 1, first]]
+        slowing = last - 2.0 * before + earlier
+        goes_on = last + later * (last - before) + 0.5 * later * (later + 1.0) * slowing
+        nodes = np.append(nodes, cycles[first - 1] + later)
+        values = np.append(values, np.clip(goes_on, min(last, rest), max(last, rest)))
+    order = np.argsort(nodes, kind="stable")
+    demand_deg = np.interp(grid, nodes[order], values[order])
+    if grid[-1] > cycles[-1]:
+        # The motion goes on to the end of its cycle: the last row lies within that.
+        speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
+        demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
+    recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
+    holds = target[0] == target[1] and not just_on(part, 0)
+    approach = _approach(truth, axis, demand_deg, cycle_s, SETTLING_S if holds else STANDING_S)
+    told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
+    if told_nm is not None:
+        told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
+    lead = len(approach)
+    off = [
+        slice(
+            lead + math.floor(cycles[first - 1]) + 1 + OFF_AFTER, lead + math.floor(cycles[first]) - ON_BEFORE
+        )
+        for first in gaps
+    ]
+    if target[0] == target[1] and just_on(part, 0):
+        off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
+    off = [each for each in off if each.stop > each.start]
+    torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
+    held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    return Commands(
+        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held
+    )
+
+
+def cycle_of(part: Record, axis: AxisConfig) -> float:
+    """A record's own cycle in seconds, as 60C2h can express it; the axis's own where they agree."""
+    own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
+    if not own_ms > 0.0:
+        raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
+    if abs(own_ms / axis.drive.cycle_ms - 1.0) < 0.02:
+        return axis.drive.cycle_s
+    rounded = round(own_ms, 1) if own_ms < 25.5 else float(round(own_ms))
+    return min(max(rounded, 0.5), 255.0) / 1e3
+
+
+def _approach(
+    truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float, standing_s: float
+) -> list[int]:
+    """From where the simulated drive is switched on to the first command, and its speed, at the limits."""
+    ratio, limits = axis.gear.ratio, axis.limits
+    start_counts = truth.motor.encoder.zero_counts
+    start_deg = axis.motor_encoder.degrees(start_counts) / ratio
+    steps = np.diff(demand_deg[:4]) / ratio / cycle_s
+    speed = float(np.median(steps)) if len(steps) and np.all(steps != 0.0) else 0.0
+    demand = InputParameter(1)
+    demand.current_position = [start_deg]
+    demand.target_position = [float(demand_deg[0]) / ratio]
+    demand.target_velocity = [speed]
+    demand.max_velocity = [max(limits.velocity_deg_s, 1.01 * abs(speed))]
+    demand.max_acceleration = [limits.acceleration_deg_s2]
+    demand.max_jerk = [limits.jerk_deg_s3]
+    trajectory = Trajectory(1)
+    if Ruckig(1).calculate(demand, trajectory) not in {Result.Working, Result.Finished}:
+        raise InputError(
+            f"no way from where the simulated drive is switched on, {start_deg:g} deg, to where the "
+            f"recording begins, {demand_deg[0] / ratio:g} deg, within the limits of {axis.path}"
+        )
+    moving = math.ceil(trajectory.duration / cycle_s)
+    standing = math.ceil(standing_s / cycle_s)
+    per_load_deg = axis.motor_encoder.counts(1.0) * ratio
+    # Backwards from its end, so that the last command before the recording has the recording's speed.
+    times = [max(trajectory.duration - (moving - k) * cycle_s, 0.0) for k in range(moving)]
+    way = [round(per_load_deg * float(trajectory.at_time(each)[0][0])) for each in times]
+    here = round(per_load_deg * start_deg)
+    rest = [way[-1] if way else here] if speed else [round(axis.motor_encoder.counts(1.0) * demand_deg[0])]
+    return [here] * standing + way + (rest * standing if not speed else [])
+
+
+def legs_of(recording: Recording) -> tuple[Segment, ...]:
+    """The recording's legs; one for each of its parts where it says nothing of legs."""
+    if recording.segments:
+        return recording.segments
+    return tuple(
+        Segment(kind="motion", start_s=float(part.time_s[0]), end_s=float(part.time_s[-1]))
+        for part in recording.record.parts()
+    )
