@@ -26,8 +26,9 @@ SMOOTHED_S = 0.03
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is beyond doubt."""
 LEAST_ROWS = 50
-LEAST_SHARE = 0.03
-"""A coefficient that is known no better than this, relatively, is not used."""
+LEAST_SHARE = 0.15
+"""A coefficient that is known no better than this, relatively, is not used: a fifth of what the prior leaves
+open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,8 @@ def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
     """Load inertia, Coulomb and viscous friction."""
     tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
     table, torque = np.concatenate(tables), np.concatenate(torques)
+    if not table[:, -1].any():
+        table = table[:, :-1]
     if len(torque) <= LEAST_ROWS:
         return None, None, None
     columns = list(table.T)
@@ -89,7 +92,8 @@ def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
 def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
     """What the motor's torque is made of, shape (n, 5), and the torque, where it counts.
 
-    Accelerations of motor and load, the latter as the motor feels it, direction and speed, and one.
+    Accelerations of motor and load, the latter as the motor feels it, direction and speed, and the weight, as
+    large everywhere, of which nothing is known where nobody tells the torque on the load.
     """
     commands, truth = piece.commands, data.base
     cycle_s, ratio = commands.cycle_s, truth.gear.ratio
@@ -97,7 +101,9 @@ def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
     motor = np.radians(demand_deg(commands, data.axis) - piece.measured[FOLLOWING])
     load = np.radians(piece.measured[LOAD] / ARCSEC_PER_DEG)
     torque = piece.measured[TORQUE]
+    weighs = np.ones(len(motor))
     if commands.told_nm is not None:
+        weighs = np.zeros(len(motor))
         cycles = np.arange(len(commands.told_nm) - commands.lead)
         told = np.interp(commands.row_cycles, cycles, commands.told_nm[commands.lead :])
         torque = torque + truth.load_.torque_sense * told / ratio
@@ -109,7 +115,7 @@ def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
     ]
     columns = [
         accelerations[0], accelerations[1] / ratio, _smoothed(direction, width), _smoothed(speed, width),
-        np.ones(len(motor)),
+        weighs,
     ]  # fmt: skip
     counts = (piece.counts[TORQUE] > 0.0).astype(np.float64)
     counts[:width] = counts[-width:] = 0.0
