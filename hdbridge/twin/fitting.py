@@ -12,7 +12,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import Fitted, Progress, solve
+from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, prepare
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
@@ -104,8 +104,13 @@ def fit(
             progress(0.2 + 0.7 * number / len(first))
             # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
             # that tells it from the right one.
-            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
-            ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
+            if each.inflation < SOFT**2:
+                near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
+                ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
+        if not ends:
+            # This axis has what no simulation has, in the channel that led the way. By the noise, however
+            # tempered, the others had no say; by what each of them is left with they have.
+            ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
         progress(0.9)
         best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
         for name in LAST:
