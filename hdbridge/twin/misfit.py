@@ -31,7 +31,7 @@ a drive has, the least change of a parameter shakes the torque by as much as a c
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
 """Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
-recording."""
+recording, where nothing tells them: neither a gear without such a state nor the torque that held the axis."""
 UNKNOWN_S = 1.0
 """... and time after which a load that was ringing before is at rest, where that is not known."""
 LARGEST_UNKNOWN = 0.25
@@ -133,9 +133,8 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
         judged = np.arange(led, end) >= first
         unknown = _unknown(part, axis.motor_encoder.counts_per_turn)
-        pieces.append(
-            _piece(part, commands, numbers, kinds, out, judged, unknown, axis.motor_encoder.counts_per_turn)
-        )
+        forgets_deg = UNKNOWN_DEG if remembers(base) else 0.0
+        pieces.append(_piece(part, commands, numbers, kinds, out, judged, unknown, forgets_deg, axis))
         first = end
     return Data(axis, base, tuple(pieces))
 
@@ -280,7 +279,8 @@ def _piece(
     out: FloatArray,
     judged: NDArray[np.bool_],
     unknown: NDArray[np.bool_],
-    counts_per_turn: int,
+    forgets_deg: float,
+    axis: AxisConfig,
 ) -> Piece:
     target = part.motor_target_deg
     assert target is not None  # commands_of has refused it
@@ -289,13 +289,16 @@ def _piece(
     last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
-    elastic = unknown | (np.cumsum(travelled) <= UNKNOWN_DEG)
+    elastic = unknown | (np.cumsum(travelled) < forgets_deg)
     # Between two parts a drive's loops may have begun anew.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
-    stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * 360.0 / counts_per_turn)
+    count_deg = 360.0 / axis.motor_encoder.counts_per_turn
+    stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    rests = stuck & stands
     torque = part.columns.get("motor_torque_nm")
     if torque is not None:
-        leaves = np.flatnonzero((stuck & stands)[:-1] & (moved[1:] > 0.0))
+        # What the integral came to at rest is in the torque that held the axis.
+        leaves = np.flatnonzero(rests[:-1] & (moved[1:] > 0.0))
         known = leaves[0] if len(leaves) else len(loops)
         loops[known:] = unknown[known:]
         cycles = commands.lead + 1 + np.floor(commands.row_cycles[leaves]).astype(int)
@@ -306,13 +309,23 @@ def _piece(
         TORQUE: torque if torque is not None else np.zeros(len(part)),
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }
+    # Where a motor came to rest within its count is one reading, not one for each row; so with the load.
+    again = np.append(rests[:-1] & rests[1:], False)
     counts = {
-        # Where a motor came to rest within its count is one reading, not one for each row.
-        FOLLOWING: np.where(unknown | (stuck & stands), 0.0, everywhere),
+        FOLLOWING: np.where(unknown | rests, 0.0, everywhere),
         TORQUE: np.where(stuck | stands | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
-        LOAD: np.where(elastic, 0.0, everywhere),
+        LOAD: np.where(elastic | again, 0.0, everywhere),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
+
+
+def remembers(truth: Truth) -> bool:
+    """Whether the gear's angle hangs on where its motor has been, which a replay may not know."""
+    gear, load = truth.gear, truth.load_
+    return bool(
+        gear.hysteresis or gear.second_hysteresis or gear.backlash_arcsec or gear.flank or gear.wear
+        or gear.creep or gear.seat or load.presliding or load.coulomb_nm
+    )  # fmt: skip
 
 
 def _unknown(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:

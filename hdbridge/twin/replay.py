@@ -51,7 +51,8 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
     """The record of a simulated drive that got the recording's commands over real frames.
 
     One row for each of the recording's, with its time. InputError where the recording has no command, or
-    leaves what the axis file allows. SafetyStop where the simulated drive cannot follow the commands as closely as the axis file asks.
+    leaves what the axis file allows. SafetyStop where the simulated drive cannot follow the commands as
+    closely as the axis file asks.
     """
     records = []
     for rows in continuous(recording.record):

@@ -18,7 +18,7 @@ from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.least_squares import solve
-from hdbridge.twin.misfit import prepare, residuals
+from hdbridge.twin.misfit import prepare, remembers, residuals
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
@@ -124,7 +124,7 @@ def test_a_small_change_of_a_parameter_changes_the_residuals_by_as_little() -> N
     assert np.linalg.norm(moved[1] - 2.0 * moved[0]) < 0.05 * np.linalg.norm(moved[1])
 
 
-def test_a_torque_does_not_count_while_the_motor_stands() -> None:
+def test_a_motor_that_stands_says_no_torque_and_once_where_the_load_came_to_rest() -> None:
     (piece,) = prepare(recorded(), AXIS, TRUTH).pieces
     record = recorded().record
     target, motor = record.motor_target_deg, record.motor_position_deg
@@ -134,6 +134,8 @@ def test_a_torque_does_not_count_while_the_motor_stands() -> None:
     stands = rest & (np.abs(motor - motor[last]) < 0.05) & (record.time_s > record.time_s[last] - 0.9)
     assert stands.any()
     assert not piece.counts[TORQUE][stands].any()
+    assert not piece.counts[FOLLOWING][stands].any()
+    assert np.flatnonzero(piece.counts[LOAD][stands]).tolist() == [np.count_nonzero(stands) - 1]
     assert piece.counts[TORQUE][~rest & (np.arange(len(record)) > 0.5 * last)].all()
 
 
@@ -162,3 +164,14 @@ def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
     unheld = replace(data, pieces=(replace(piece, commands=replace(piece.commands, held=())),))
     off, before = (residuals(each, stiff)[TORQUE][setting_out] for each in (data, unheld))
     assert np.max(np.abs(off)) < 0.1 * np.max(np.abs(before))
+
+
+def test_the_load_counts_at_once_where_the_gear_does_not_remember() -> None:
+    plain = with_values(TRUTH, {})
+    gear = plain.gear.model_copy(update={"hysteresis": None, "second_hysteresis": None, "backlash_arcsec": 0})
+    for truth, at_once in ((TRUTH, False), (plain.model_copy(update={"gear": gear}), True)):
+        assert remembers(truth) is not at_once
+        (piece,) = prepare(recorded(), AXIS, truth).pieces
+        first = int(np.flatnonzero(piece.rest == 0.0)[0])
+        assert bool(piece.counts[LOAD][first]) is at_once
+        assert piece.counts[LOAD][-1]
