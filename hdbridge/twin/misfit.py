@@ -22,6 +22,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.commands import Commands, commands_of, legs_of
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.twin.replay import run
+from hdbridge.twin.rests import RINGING_S, STANDS_COUNTS, held_rows, stands, unknown_rows
 from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -32,15 +33,6 @@ CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
 """Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
 recording, where nothing tells them: neither a gear without such a state nor the torque that held the axis."""
-UNKNOWN_S = 1.0
-"""... and time after which a load that was ringing before is at rest, where that is not known."""
-LARGEST_UNKNOWN = 0.25
-"""Of a part of a recording, the largest share that is left out for that."""
-RINGING_S = 0.25
-"""So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
-STANDS_COUNTS = 1.5
-"""A motor that stays within so many counts of where it comes to rest stands. Its torque is what the integral
-stopped at, or creeps up while friction holds it: which of the two hangs on a thousandth of a count."""
 LONGEST_LEG_S = 2.0
 """A longer leg counts as several: residuals further apart than this have nothing to do with each other."""
 COARSE_S = 15.0
@@ -132,7 +124,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
         for each in held:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
         judged = np.arange(led, end) >= first
-        unknown = _unknown(part, axis.motor_encoder.counts_per_turn)
+        unknown = unknown_rows(part, axis.motor_encoder.counts_per_turn)
         forgets_deg = UNKNOWN_DEG if remembers(base) else 0.0
         pieces.append(_piece(part, commands, numbers, kinds, out, judged, unknown, forgets_deg, axis))
         first = end
@@ -293,17 +285,17 @@ def _piece(
     # Between two parts a drive's loops may have begun anew.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     count_deg = 360.0 / axis.motor_encoder.counts_per_turn
-    stands = _stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
-    rests = stuck & stands
+    still = stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    rests = stuck & still
     torque = part.columns.get("motor_torque_nm")
     if torque is not None:
         # What the integral came to at rest is in the torque that held the axis.
-        leaves = np.flatnonzero(rests[:-1] & (moved[1:] > 0.0))
-        known = leaves[0] if len(leaves) else len(loops)
+        held = held_rows(part, moved > 0.0, still)
+        known = held[0] if len(held) else len(loops)
         loops[known:] = unknown[known:]
-        cycles = commands.lead + 1 + np.floor(commands.row_cycles[leaves]).astype(int)
-        held = tuple(zip(cycles.tolist(), torque[leaves].tolist(), strict=True))
-        commands = replace(commands, held=(*commands.held, *held))
+        cycles = commands.lead + 1 + np.floor(commands.row_cycles[held]).astype(int)
+        told = tuple(zip(cycles.tolist(), torque[held].tolist(), strict=True))
+        commands = replace(commands, held=(*commands.held, *told))
     measured = {
         FOLLOWING: target - part.motor_position_deg,
         TORQUE: torque if torque is not None else np.zeros(len(part)),
@@ -313,7 +305,7 @@ def _piece(
     again = np.append(rests[:-1] & rests[1:], False)
     counts = {
         FOLLOWING: np.where(unknown | rests, 0.0, everywhere),
-        TORQUE: np.where(stuck | stands | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
+        TORQUE: np.where(stuck | still | loops, 0.0, everywhere) if torque is not None else 0.0 * everywhere,
         LOAD: np.where(elastic | again, 0.0, everywhere),
     }
     return Piece(commands, measured, counts, leg, kinds, out, np.where(stuck, 1.0, 0.0))
@@ -326,43 +318,6 @@ def remembers(truth: Truth) -> bool:
         gear.hysteresis or gear.second_hysteresis or gear.backlash_arcsec or gear.flank or gear.wear
         or gear.creep or gear.seat or load.presliding or load.coulomb_nm
     )  # fmt: skip
-
-
-def _unknown(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:
-    """For each row whether the load may still ring of what nobody knows.
-
-    Where a recording begins in motion that is what was before it; where a procedure ended in motion, the
-    cycles until the drive was switched off.
-    """
-    target, time_s = part.motor_target_deg, part.time_s
-    assert target is not None  # commands_of has refused it
-    begins = []
-    if np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0):
-        begins.append(0)
-    count_deg = 360.0 / counts_per_turn
-    begins += [
-        first
-        for first in part.starts[1:]
-        if abs(target[first] - target[first - 1]) > STANDS_COUNTS * count_deg
-    ]
-    unknown = np.zeros(len(part), dtype=np.bool_)
-    ends = (*part.starts[1:], len(part))
-    for begin in begins:
-        end = next(each for each in ends if each > begin)
-        length_s = min(UNKNOWN_S, LARGEST_UNKNOWN * float(time_s[end - 1] - time_s[begin]))
-        unknown[begin:end] = time_s[begin:end] - time_s[begin] < length_s
-    return unknown
-
-
-def _stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
-    """For each row whether command and motor stand where they stand until the command moves on."""
-    rest = np.cumsum(moved)
-    last = np.searchsorted(rest, rest, side="right") - 1
-    away = np.abs(motor_deg - motor_deg[last]) > within_deg
-    rows = np.arange(len(rest))
-    last_away = np.maximum.accumulate(np.where(away | moved, rows, -1))
-    given: NDArray[np.bool_] = last_away < rows
-    return given
 
 
 def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:
