@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -144,12 +146,13 @@ def browser() -> Iterator[Page]:
         [found.stdout.strip(), *flags, f"--user-data-dir={home}", "--remote-debugging-port=0", "about:blank"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        start_new_session=True,  # what Debian installs is a script that waits for the browser
     )
     try:
         with connect(_address(Path(home), process), max_size=None) as line:
             yield Page(line)
     finally:
-        process.kill()
+        os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         shutil.rmtree(home, ignore_errors=True)
 
