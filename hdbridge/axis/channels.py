@@ -15,7 +15,7 @@ from hdbridge.files.yamlfile import wrong
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 EveryCycles = Annotated[int, Field(ge=1, le=240, description="it comes with every n-th SYNC")]

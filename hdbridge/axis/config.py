@@ -27,7 +27,7 @@ Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 class _Part(BaseModel):
     """A mapping of the file: frozen, no unknown keys, finite numbers."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class BusConfig(_Part):

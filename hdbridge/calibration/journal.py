@@ -37,7 +37,7 @@ PAUSE_S = 1.0
 class TaskEntry(BaseModel):
     """A task of the plan as it was run, in the recording's notes."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     task: str = Field(description="its name in the plan")
     file: str = Field(description="file with its samples")
@@ -56,7 +56,7 @@ class TaskEntry(BaseModel):
 
 
 class _Notes(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="allow")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
 
     plan: dict[str, Any]
     tasks: tuple[TaskEntry, ...] = ()

@@ -15,7 +15,7 @@ PERIODS_SKIPPED = "a period was skipped"
 class Survived(BaseModel):
     """A kind of fault, and how often it was seen."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     what: str = Field(description="what was seen, in the words of the fault table")
     cycles: int = Field(ge=1, description="in how many cycles")

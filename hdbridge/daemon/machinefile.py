@@ -27,7 +27,7 @@ _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 class _Part(BaseModel):
     """A mapping of the file: frozen, no unknown keys, finite numbers."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class LoadLoopSettings(_Part):

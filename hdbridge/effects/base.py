@@ -93,7 +93,8 @@ GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 class Effect(BaseModel, ABC):
     """One cause of transmission error with its parameters."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    # A process reads few of the effects; what pydantic makes to read all of them takes a tenth of a second.
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: ClassVar[str]
     """The canonical name: in model files, findings and tests."""

@@ -24,7 +24,7 @@ from hdbridge.effects.torque import TorqueGrowth
 class Loop(BaseModel):
     """The elastic loop that is modulated: the parameters of `hysteresis`, and which law it follows."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     offset_arcsec: Annotated[
         float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")

@@ -35,7 +35,7 @@ NEAR_S, LEAST_NEAR = 1.0, 5
 class Step(BaseModel):
     """One loss: from this time on the error is larger by its size."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     time_s: Annotated[float, Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")]
     size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]

@@ -38,7 +38,7 @@ RESTS = 3.0
 class Relaxation(BaseModel):
     """One exponential."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     amplitude_arcsec: Annotated[
         float, Field(ge=-3600, le=3600, description="strain after a long move forward, at the load")

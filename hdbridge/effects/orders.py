@@ -35,7 +35,7 @@ _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 class MotorOrder(BaseModel):
     """One harmonic: amplitude * cos(order * angle + phase)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     order: Annotated[int, Field(ge=1, le=1000, description="periods per turn")]
     amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]

@@ -46,7 +46,7 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
 class TorqueGrowth(BaseModel):
     """A growth of amplitudes with torque, of which `torque_modulation` has the fields too."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     growth_percent_per_nm: Annotated[
         float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")

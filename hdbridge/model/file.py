@@ -19,7 +19,7 @@ _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.
 class GearOfModel(BaseModel):
     """The gear that a model was measured on."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     teeth: Teeth | None = Field(None, description="numbers of teeth")
@@ -28,7 +28,7 @@ class GearOfModel(BaseModel):
 class Provenance(BaseModel):
     """Where a model comes from and what it is bound to; further keys are kept as they are."""
 
-    model_config = ConfigDict(frozen=True, extra="allow")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
 
     axis: str | None = Field(None, description="name of the axis that it was measured on")
     drive: Identity | None = Field(None, description="identity of the drive that it was measured with")
@@ -40,7 +40,7 @@ class Provenance(BaseModel):
 class EffectEntry(BaseModel):
     """One effect of the model file."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     effect: str = Field(description="name of the effect in the catalogue")
     parameters: dict[str, Any] = Field(description="its parameters, with the unit in the name")
@@ -52,7 +52,7 @@ class EffectEntry(BaseModel):
 class ModelFile(BaseModel):
     """The model file as it stands; the parameters are checked by the effect that they belong to."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")

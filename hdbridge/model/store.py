@@ -44,7 +44,7 @@ Action = Literal["found", "commit", "activate", "rollback"]
 class Activation(BaseModel):
     """A line of the log."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     date: str = Field(description="when, ISO 8601")
     action: Action = Field(description="how it became active")
@@ -55,7 +55,7 @@ class Activation(BaseModel):
 class LogFile(BaseModel):
     """The content of ``history/log.yaml``."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
     schema_: Literal["hdbridge.history/1"] = Field(
         alias="schema", description="kind and version of this file"

@@ -39,7 +39,7 @@ SMALLEST_TRAVEL_DEG = 90.0
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class StandstillEntry(_Part):

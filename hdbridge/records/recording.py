@@ -30,7 +30,7 @@ HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md desc
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Segment(_Part):

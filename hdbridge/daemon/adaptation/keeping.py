@@ -29,7 +29,7 @@ SCHEMA = "hdbridge.adaptation/1"
 class StateFile(BaseModel):
     """``AXIS.json``."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     schema_: Literal["hdbridge.adaptation/1"] = Field(alias="schema")
     model: str

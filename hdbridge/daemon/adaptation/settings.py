@@ -25,7 +25,7 @@ class Standing(StrEnum):
 class Excitation(BaseModel):
     """What an axis must have done since the last update before the next one is made."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     turns: float = Field(
         2.0, ge=0.5, le=1000, description="motor turns (both directions) that show the orders of the motor"
@@ -41,7 +41,7 @@ class Excitation(BaseModel):
 class AdaptationSettings(BaseModel):
     """Rates are per hour of the axis's own time, bounds are about the committed model."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     mode: Mode = Field(
         "off", description="off, observe (only report what would change), or on (change the model in use)"

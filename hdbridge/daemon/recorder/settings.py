@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class RecorderSettings(BaseModel):
     """The ring on disk, and what is kept aside of it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     folder: str | None = Field(
         None,
