@@ -16,7 +16,7 @@ from hdbridge.daemon.memory.layout import (
 )
 from hdbridge.daemon.memory.mailbox import MailboxFullError
 from hdbridge.daemon.memory.memory import Memory
-from hdbridge.daemon.memory.samples import SampleArray, SampleReader
+from hdbridge.daemon.memory.samples import SampleArray, SampleReader, joined_samples
 from hdbridge.daemon.memory.status import Cell
 
 __all__ = [
@@ -37,5 +37,6 @@ __all__ = [
     "SampleArray",
     "SampleFlag",
     "SampleReader",
+    "joined_samples",
     "sample_dtype",
 ]

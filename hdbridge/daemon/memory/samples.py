@@ -27,6 +27,12 @@ SampleArray = npt.NDArray[np.void]
 _CHECK: Final = struct.Struct("@I")
 
 
+def joined_samples(batches: Sequence[SampleArray]) -> SampleArray:
+    """One after the other, as plain bytes: joining them field by field takes four times as long."""
+    plain = np.dtype((np.void, batches[0].dtype.itemsize))
+    return np.concatenate([each.view(plain) for each in batches]).view(batches[0].dtype)
+
+
 class SampleWriter:
     """The loop's end. Plain numbers in, no numpy: a third of the time."""
 

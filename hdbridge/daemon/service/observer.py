@@ -12,7 +12,7 @@ import numpy as np
 
 from hdbridge.client import messages
 from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Event, Memory, SampleArray, sample_dtype
+from hdbridge.daemon.memory import Event, Memory, SampleArray, joined_samples, sample_dtype
 from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.interface import Batch
 
@@ -141,7 +141,7 @@ class Subscription:
         self._came.clear()
         events, self._seen = self._events_since(self._seen)
         samples = list(self._samples)
-        batch = Batch(np.concatenate(samples) if samples else self._observer.none, events, self._lost)
+        batch = Batch(joined_samples(samples) if samples else self._observer.none, events, self._lost)
         self._samples.clear()
         self._waiting = self._lost = 0
         return batch

@@ -29,7 +29,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import SampleArray
+from hdbridge.daemon.memory import SampleArray, joined_samples
 from hdbridge.daemon.watch.residual import Residuals, any_of, joined, residuals
 from hdbridge.daemon.watch.signs import (
     SIDE,
@@ -193,7 +193,7 @@ class EncoderHealth:
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) >= LOOK_SAMPLES:
             waiting, self._waiting = self._waiting, []
-            self._look(waiting[0] if len(waiting) == 1 else np.concatenate(waiting))
+            self._look(joined_samples(waiting))
         return self.judgement
 
     def _look(self, samples: SampleArray) -> None:
@@ -203,7 +203,7 @@ class EncoderHealth:
         if tail is not None and samples["cycle"][0] <= tail["cycle"][-1]:
             self._forget_place()  # the loop has begun anew
             tail = None
-        together = samples if tail is None else np.concatenate([tail, samples])
+        together = samples if tail is None else joined_samples([tail, samples])
         self._tail = together[-TAIL:].copy()
         found = residuals(together, self._place, self._ratio, self._period_s)
         self._now_s = float(found.time_s[-1])

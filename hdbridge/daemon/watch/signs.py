@@ -6,10 +6,10 @@ motor turns, does not tremble more from one second to the next, and does not run
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from hdbridge.daemon.watch.residual import Residuals
 from hdbridge.effects import FloatArray
@@ -55,16 +55,17 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas
     span = 2 * SIDE
     if len(found) < span:
         return None
-    windows = sliding_window_view(found.residual_arcsec, span)
-    step = np.median(windows[:, SIDE:], axis=1) - np.median(windows[:, :SIDE], axis=1)
+    middle = _median(found.residual_arcsec)
+    step = middle[SIDE:] - middle[:-SIDE]
+    predicted, speed, turned = _spans(span, found.predicted_arcsec, found.velocity_deg_s, found.motor_deg)
     allowed = (
         sigmas * noise_arcsec * _MEDIAN * np.sqrt(2.0 / SIDE)
         + count_arcsec
-        + PREDICTED_SHARE * _span(found.predicted_arcsec, span)
-        + SHAKE_S * ARCSEC_PER_DEG * _span(found.velocity_deg_s, span)
-        + UNMODELLED_ARCSEC * np.minimum(_span(found.motor_deg, span) / UNMODELLED_DEG, 1.0)
+        + PREDICTED_SHARE * predicted
+        + SHAKE_S * ARCSEC_PER_DEG * speed
+        + UNMODELLED_ARCSEC * np.minimum(turned / UNMODELLED_DEG, 1.0)
     )
-    together = np.all(sliding_window_view(found.usable, span), axis=1)
+    together = np.all(_windows(found.usable, span), axis=0)
     together &= found.cycle[span - 1 :] - found.cycle[: len(together)] < 2 * span
     rows = np.flatnonzero(together & (np.abs(step) > allowed))
     if not len(rows):
@@ -79,20 +80,31 @@ def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: 
     """How many samples are elsewhere, and back with the next one or two."""
     if len(found) < SIDE:
         return 0
-    windows = sliding_window_view(found.residual_arcsec, SIDE)
-    middle = slice(SIDE // 2, SIDE // 2 + len(windows))
-    away = np.abs(found.residual_arcsec[middle] - np.median(windows, axis=1))
+    middle = slice(SIDE // 2, len(found) - SIDE // 2)
+    away = np.abs(found.residual_arcsec[middle] - _median(found.residual_arcsec))
+    predicted, speed = _spans(SIDE, found.predicted_arcsec, found.velocity_deg_s)
     allowed = (
-        sigmas * noise_arcsec
-        + count_arcsec
-        + PREDICTED_SHARE * _span(found.predicted_arcsec, SIDE)
-        + SHAKE_S * ARCSEC_PER_DEG * _span(found.velocity_deg_s, SIDE)
+        sigmas * noise_arcsec + count_arcsec + PREDICTED_SHARE * predicted + SHAKE_S * ARCSEC_PER_DEG * speed
     )
-    return int(np.count_nonzero((away > allowed) & np.all(sliding_window_view(found.usable, SIDE), axis=1)))
+    return int(np.count_nonzero((away > allowed) & np.all(_windows(found.usable, SIDE), axis=0)))
 
 
-def _span(values: FloatArray, width: int) -> FloatArray:
-    windows = sliding_window_view(values, width)
+_Any = TypeVar("_Any", np.bool_, np.float64)
+
+
+def _windows(values: NDArray[_Any], width: int) -> NDArray[_Any]:
+    """Shape (..., width, windows). A copy: on batches of a few dozen samples, a view takes longer to make."""
+    return values[..., np.arange(width)[:, None] + np.arange(values.shape[-1] - width + 1)]
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Of the `SIDE` samples from each one on."""
+    return np.asarray(np.sort(_windows(values, SIDE), axis=0)[SIDE // 2])
+
+
+def _spans(width: int, *columns: FloatArray) -> FloatArray:
+    """From the smallest to the largest of so many samples, one row for each column."""
+    windows = _windows(np.array(columns), width)
     return np.asarray(windows.max(axis=1) - windows.min(axis=1))
 
 

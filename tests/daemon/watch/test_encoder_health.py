@@ -83,7 +83,7 @@ def faulty(change, **options):
     ],
 )
 def test_a_fault_is_named_with_figures_and_not_before_it_is_there(fault, change, within_s):
-    seen = judged(faulty(change))
+    seen = judged(faulty(change)[: FAULT + int((within_s + 1.0) / PERIOD_S)])
     assert [each.fault for _, each in seen][:2] == [None, fault]
     at_s, judgement = seen[1]
     assert FAULT_S - 0.2 <= at_s <= FAULT_S + within_s
