@@ -74,11 +74,12 @@ class Daemon:
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
         """Wait for something that is asked for again and again; what it gave."""
-        end = time.monotonic() + PATIENCE_S
+        end, pause_s = time.monotonic() + PATIENCE_S, 0.05
         while not (found := met()):
             assert time.monotonic() < end, f"{what}: {self._last_words()}"
             assert self.process.poll() is None, f"{what}: it ended: {self._last_words()}"
-            time.sleep(0.05)
+            time.sleep(pause_s)  # a request takes more of a processor than the daemon does meanwhile
+            pause_s = min(1.2 * pause_s, 0.25)
         return found
 
     def _last_words(self) -> str:
