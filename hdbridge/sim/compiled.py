@@ -127,16 +127,27 @@ class CompiledLoops:
         heat: Heat,
         limit_nm: float,
         outer_nm: FloatArray,
+        held_nm: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Closed loop over many cycles: for each what `Loops.follow` says, and the temperature after it.
 
-        ``heat`` is led through them; ``outer_nm`` is the torque on the load from outside in each.
+        ``heat`` is led through them; ``outer_nm`` is the torque on the load from outside in each,
+        ``held_nm`` the one by which the loops hold the axis before it, or NaN.
         """
         seen, body_c = np.empty((len(substeps), 11)), np.empty(len(substeps))
         record = np.zeros(1, _layout_of(Plant, LEAST_ROOM, Heat))
         _fill(record[0], heat)
         self._methods.follow_all(
-            self._record, record, demand_deg, demand_deg_s, substeps, limit_nm, outer_nm, seen, body_c
+            self._record,
+            record,
+            demand_deg,
+            demand_deg_s,
+            substeps,
+            limit_nm,
+            outer_nm,
+            held_nm,
+            seen,
+            body_c,
         )
         for name, hint in _attributes(Heat).items():
             if hint in _NUMBERS:
@@ -187,12 +198,15 @@ def _methods() -> _Methods:
         substeps: Any,
         limit_nm: float,
         outer_nm: Any,
+        held_nm: Any,
         seen: Any,
         body_c: Any,
     ) -> None:
         assert version
         dt_s = loops[0].dt_s
         for cycle in range(len(substeps)):
+            if not math.isnan(held_nm[cycle]):
+                loops[0].hold(held_nm[cycle])
             slow = (heat[0].body_c, heat[0].rub, limit_nm, 0.0, outer_nm[cycle])
             told = loops[0].follow(demand_deg[cycle], demand_deg_s[cycle], substeps[cycle], slow)
             for place in range(11):

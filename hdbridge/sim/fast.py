@@ -54,6 +54,7 @@ class EvenLoops(AnyLoops, Protocol):
         heat: Heat,
         limit_nm: float,
         outer_nm: FloatArray,
+        held_nm: FloatArray,
     ) -> tuple[FloatArray, FloatArray]: ...
 
 

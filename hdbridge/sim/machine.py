@@ -103,21 +103,29 @@ class Machine:
         self._finish(elapsed_s)
 
     def follow_all(
-        self, counts: Sequence[float], substeps: Sequence[int], outer_nm: FloatArray | None = None
+        self,
+        counts: Sequence[float],
+        substeps: Sequence[int],
+        outer_nm: FloatArray | None = None,
+        held_nm: FloatArray | None = None,
     ) -> Cycles:
         """Closed loop over many cycles, each from the demand before it; the same numbers as by `follow`.
 
         ``counts`` has the demand at the begin and at the end of each cycle, ``substeps`` how many each has,
-        ``outer_nm`` the torque on the load from outside in each, in addition to its weight.
+        ``outer_nm`` the torque on the load from outside in each, in addition to its weight, ``held_nm`` the
+        torque by which the loops hold the axis before each, positive forward; NaN where they go on.
         """
         outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
+        held_nm = np.full(len(substeps), np.nan) if held_nm is None else held_nm
         told = Cycles(*(np.empty(len(substeps)) for _ in Cycles._fields))
         done = 0
         while done < len(substeps):
             if self._evenly(substeps):
                 rest = Cycles(*(each[done:] for each in told))
-                self._follow_compiled(counts[done:], substeps[done:], outer_nm[done:], rest)
+                self._follow_compiled(counts[done:], substeps[done:], outer_nm[done:], held_nm[done:], rest)
                 break
+            if not math.isnan(held_nm[done]):
+                self._loops.hold(float(held_nm[done]))
             self.follow(counts[done], counts[done + 1], substeps[done], float(outer_nm[done]))
             told.motor_reading[done] = self.motor_reading
             told.load_reading[done] = self.load_reading
@@ -128,11 +136,6 @@ class Machine:
             done += 1
         return told
 
-    def hold(self, torque_nm: float) -> None:
-        """The axis stands, and the loops hold it by this torque, positive forward, whatever they came to."""
-        self._loops.hold(torque_nm)
-        self._torque_nm = torque_nm
-
     def _evenly(self, substeps: Sequence[int]) -> bool:
         """Whether the compiled loops can go on by themselves: nothing happens between the cycles."""
         if not self._powered or self._to_compile is not None:
@@ -142,7 +145,12 @@ class Machine:
         return isinstance(self._loops, fast.EvenLoops) and min(substeps) > 0
 
     def _follow_compiled(
-        self, counts: Sequence[float], substeps: Sequence[int], outer_nm: FloatArray, told: Cycles
+        self,
+        counts: Sequence[float],
+        substeps: Sequence[int],
+        outer_nm: FloatArray,
+        held_nm: FloatArray,
+        told: Cycles,
     ) -> None:
         per_deg, steps = self._motor_counts_per_deg, np.array(substeps, dtype=np.int64)
         demand = np.array(counts, dtype=np.float64)
@@ -155,7 +163,7 @@ class Machine:
         speed_deg_s = (demand[1:] - demand[:-1]) / per_deg / (steps * self.dt_s)
         assert isinstance(self._loops, fast.EvenLoops)
         seen, told.temperature_c[:] = self._loops.follow_all(
-            start_deg, speed_deg_s, steps, self._heat, self._limit_nm, outer_nm
+            start_deg, speed_deg_s, steps, self._heat, self._limit_nm, outer_nm, held_nm
         )
         noise = np.zeros(len(steps))
         if self._noise_deg:

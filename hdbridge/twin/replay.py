@@ -164,16 +164,13 @@ def _told(
 ) -> Cycles:
     """What the machine tells of each cycle after the approach."""
     told: list[Cycles] = []
+    held_nm = np.full(len(substeps), np.nan)
+    for cycle, torque_nm in commands.held:
+        held_nm[cycle : cycle + 1] = torque_nm
     done = 0
     for off in (*commands.off, slice(len(substeps), len(substeps))):
-        for cycle, torque_nm in commands.held:
-            if done < cycle <= off.start:
-                on = slice(done, cycle)
-                told.append(machine.follow_all(demand[done : cycle + 1], substeps[on], outer_nm[on]))
-                machine.hold(torque_nm)
-                done = cycle
         on = slice(done, off.start)
-        told.append(machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on]))
+        told.append(machine.follow_all(demand[done : off.start + 1], substeps[on], outer_nm[on], held_nm[on]))
         told.append(_coasted(machine, substeps[off], outer_nm[off]))
         demand[off.stop] = demand[min(off.stop + 1, len(demand) - 1)]  # where the drive is on again
         done = off.stop

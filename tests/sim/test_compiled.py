@@ -209,15 +209,14 @@ def test_compiled_and_python_agree_bit_for_bit(known: Truth, seed: int) -> None:
 def test_a_motor_that_is_held_by_a_torque_sets_out_from_it_compiled_or_not() -> None:
     known = truth({"motor__coulomb_nm": 0.05})
     counts = [0.0] * 20 + [4.0 * cycle for cycle in range(60)]
+    held_nm = np.full(len(counts) - 1, np.nan)
+    held_nm[15] = -0.04
     found = []
     for may_compile in (False, True):
         machine = Machine(known, 1, may_compile=may_compile)
-        machine.follow_all(counts[:20], [8] * 19)
-        machine.hold(-0.04)
-        assert machine.torque_nm == -0.04
-        held = machine.follow_all([0.0, 0.0], [8]).torque_nm
-        assert held == pytest.approx(-0.04, abs=1e-9)
-        found.append(machine.follow_all(counts[19:], [8] * 60))
+        found.append(machine.follow_all(counts, [8] * len(held_nm), held_nm=held_nm))
+        assert found[-1].torque_nm[14] == 0.0
+        assert found[-1].torque_nm[15:19] == pytest.approx(-0.04, abs=1e-9)
     for ours, theirs in zip(*found, strict=True):
         assert np.array_equal(ours, theirs)
 
