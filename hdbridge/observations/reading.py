@@ -70,8 +70,10 @@ def jitter_deg(angle_deg: FloatArray) -> float:
     """
     if len(angle_deg) < 8:
         return 0.0
-    third = np.abs(np.diff(angle_deg, 3))
-    changed = np.diff(angle_deg) != 0.0
+    first = angle_deg[1:] - angle_deg[:-1]
+    second = first[1:] - first[:-1]
+    third = np.abs(second[1:] - second[:-1])
+    changed = first != 0.0
     third = third[changed[:-2] | changed[1:-1] | changed[2:]]
     if not len(third):
         return 0.0

@@ -110,7 +110,7 @@ def _spans(width: int, *columns: FloatArray) -> FloatArray:
 
 def local_noise_arcsec(found: Residuals) -> float:
     """Standard deviation of one reading, by the median change from one to the next: a jump is one of many."""
-    steps = np.abs(np.diff(found.residual_arcsec))
+    steps = np.abs(found.residual_arcsec[1:] - found.residual_arcsec[:-1])
     return float(_DIFFERENCES * np.median(steps)) if len(steps) else 0.0
 
 
