@@ -1,0 +1,35 @@
+"""Rewrite the assertions of all tests once, and keep them: else each worker of pytest-xdist rewrites all.
+
+    python tools/compile_tests.py [FOLDER]
+
+What pytest does when it imports a test, without importing it. It has no interface for that: where another
+version of it does not have these parts, nothing is done here, and the workers do it.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from _pytest.assertion import rewrite
+from _pytest.config import get_config
+
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+
+
+def main(tests: Path) -> None:
+    """Write what pytest would write into the folders ``__pycache__``."""
+    config = get_config()
+    config.parse(["--disable-plugin-autoload"])
+    for path in sorted((*tests.rglob("test_*.py"), *tests.rglob("conftest.py"))):
+        kept = rewrite.get_cache_dir(path) / f"{path.stem}{rewrite.PYC_TAIL}"
+        if rewrite._read_pyc(path, kept) is None:
+            source_hash, code = rewrite._rewrite_test(path, config)
+            kept.parent.mkdir(exist_ok=True)
+            rewrite._write_pyc(config.stash[rewrite.assertstate_key], code, source_hash, kept)
+
+
+if __name__ == "__main__":
+    with suppress(AttributeError, TypeError, ValueError):
+        main(Path(sys.argv[1]) if len(sys.argv) > 1 else TESTS)
