@@ -29,7 +29,7 @@ demo: $(READY)   ## the main job: step a simulated axis under four compensation 
 	$(BIN)/hdbridge demo
 
 # In user-mode-linux, which the check installs, nothing that else runs matters to the tests: it has a processor to
-# itself for three minutes, and the workers have the others.
+# itself for two minutes, and the workers have the others.
 test: $(READY)   ## everything that CI runs
 	@if [ $(PROCESSORS) -gt 1 ] && tools/socketcan.sh --slowed 50 --check 2>&1 | grep -q 'vcan0: user-mode-linux'; \
 	then $(MAKE) --no-print-directory --jobs=3 --output-sync=target check test-socketcan unit-as-it-goes; \
