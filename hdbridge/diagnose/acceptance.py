@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdbridge.effects import BoolArray, Effect, FloatArray
-from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.estimation.linear import side_by_side, solve_symmetric
 from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.stretches import of_length, sandwich
@@ -59,14 +59,27 @@ def robust_chi_square(
     columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
     known = np.zeros((columns.shape[1], 2))
     known[: fitted.count()] = fitted.linearised.known
-    fit, time_s = Linearised(columns[rows], fitted.residual[rows], known), estimator.time_s[rows]
+    fit = Linearised(columns[rows], fitted.residual[rows], known)
+    return block_robust(estimator, fit, own, coefficients, rows, laws)
+
+
+def block_robust(
+    estimator: Estimator,
+    fit: Linearised,
+    own: list[int],
+    coefficients: FloatArray,
+    rows: BoolArray | slice = slice(None),
+    laws: FloatArray | None = None,
+) -> float:
+    """The same of the columns ``own`` of any fit to some rows, which stands at these ``coefficients``."""
+    time_s = estimator.time_s[rows]
     if len(time_s) < LEAST_POINTS:
         return 0.0
     inverse = fit.directions @ fit.directions[own].T
     coefficients = coefficients + fit.directions[own] @ fit.slack
     influence = (fit.columns @ inverse) * (fit.residual - fit.basis @ fit.slack)[:, np.newaxis]
     # The noise itself is a floor: a residual may be quieter than it by luck.
-    least = 0.25 * inverse[own] + inverse.T @ (np.maximum(known[:, :1], 0.0) * inverse)
+    least = 0.25 * inverse[own] + inverse.T @ (np.maximum(fit.known[:, :1], 0.0) * inverse)
     longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
     if laws is not None:
         shift = fit.taken_over(laws[rows])[own]
@@ -79,7 +92,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Judge one finding."""
     effect = fitted.hypothesis.effects[place]
     needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
-    laws = _other_laws(estimator, fitted, place)
+    laws = law_discrepancies(estimator, fitted.hypothesis.without(place))
     robust = robust_chi_square(estimator, fitted, place, laws=laws)
     if robust < needed:
         if robust_chi_square(estimator, fitted, place) < needed:
@@ -108,12 +121,10 @@ def evident(effect: Effect) -> list[int]:
     return [column for each in named if each.name not in effect.incidental for column in each.columns]
 
 
-def _other_laws(estimator: Estimator, fitted: Fitted, place: int) -> FloatArray:
-    """What the laws of all effects but one may be wrong by, weighted columns (m, k)."""
-    hypothesis = fitted.hypothesis
-    others = hypothesis.without(place).effects
-    forms = [estimator.law_discrepancy(each, hypothesis.start) for each in others]
-    return side_by_side(forms, len(fitted.residual))
+def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArray:
+    """What the laws of all effects of a hypothesis may be wrong by, weighted columns (m, k)."""
+    forms = [estimator.law_discrepancy(each, hypothesis.start) for each in hypothesis.effects]
+    return side_by_side(forms, len(estimator.index))
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:

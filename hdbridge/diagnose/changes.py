@@ -18,6 +18,7 @@ from hdbridge.diagnose.lookalikes import together
 from hdbridge.diagnose.parameters import named_parameters, parameters_of
 from hdbridge.diagnose.result import UNWEIGHED, Finding, Parameter
 from hdbridge.diagnose.search import Search
+from hdbridge.diagnose.unexplained import near_reversals
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Part, Start
 from hdbridge.estimation.calibration import CalibratedPart, calibrated, variances
 from hdbridge.estimation.hypothesis import Estimator, Fitted
@@ -86,8 +87,8 @@ def _loop(
         return None
     # A loop that obeys no law may follow another one in part.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
-    residual = fitted.residual / estimator.weight
-    taken = float(np.mean((residual + change - np.mean(change)) ** 2 - residual**2))
+    residual, near = fitted.residual / estimator.weight, near_reversals(estimator, fitted)
+    taken = float(np.mean(((residual + change - np.mean(change)) ** 2 - residual**2)[near]))
     return _finding(
         estimator, precise, precise.places(place), change, causes[0],
         parameters_of(estimator, precise, place, spread), max(peak, lawless), tuple(laws) if lawless else (),

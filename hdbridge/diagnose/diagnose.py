@@ -266,7 +266,7 @@ class _Judge:
         fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
-        doubtful = doubtful_loops(findings, left, estimator.scales) if unknown else []
+        doubtful = doubtful_loops(estimator, findings, left) if unknown else []
         if doubtful:  # what they do is left, too
             findings = [each for each in findings if each not in doubtful]
             left = rest(estimator, self._with_given_loop(fitted))
@@ -319,7 +319,7 @@ class _Judge:
         many = many_of_one(findings, scales)
         if many is None and not is_unexplained(self.estimator, left):
             return findings
-        size, lives = left.arcsec, left.lives_in
+        size, lives = left.peak_arcsec, left.lives_in
         if many is not None:
             size = max(each.peak_arcsec for each in many)
             effect = many[0].effect
@@ -339,13 +339,13 @@ class _Judge:
             note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
-        if many is None and loops and of_the_loop(left, scales):
+        if many is None and loops and of_the_loop(self.estimator, left):
             # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
         largest = max((each.peak_arcsec for each in findings), default=0.0)
-        return [*findings, unknown] if largest > scales.leads * size else [unknown, *findings]
+        return [*findings, unknown] if largest > size else [unknown, *findings]
 
     def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """What a prediction for the usable points leaves of them, about the zeros that suit it best."""

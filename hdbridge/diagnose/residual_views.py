@@ -1,8 +1,8 @@
 """What a model gets wrong, over every coordinate that a cause may depend on.
 
 A residual is looked at over motor angle, load angle, direction, speed, acceleration, torque, temperature,
-time and what has passed since the last reversal: means over bins on every other stretch of time, and how much
-of the residual they foretell on the rest.
+time and what has passed since the last reversal: means over bins, and how much of the residual they foretell
+on stretches of time that had no part in them.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.effects import MEASURED, BoolArray, FloatArray, IntArray, Motion
+from hdbridge.diagnose.holdout import FOLDS, STRETCHES
+from hdbridge.effects import MEASURED, FloatArray, IntArray, Motion
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import Coordinate
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.stretches import of_number
 
-STRETCHES: Final = 64
-"""Of time, every other one is held out in turn."""
 COARSE: Final = 16
-"""Bins of time: wide enough that each has stretches of either half."""
+"""Bins of time: wide enough that each has several stretches."""
 SHRUNK: Final = 2.0
 """Points with a mean of zero that each bin has in addition: a mean of few points foretells nothing."""
 
@@ -45,12 +44,12 @@ class ResidualViews:
 
         Noise has a share of zero.
         """
-        odd = every_other(self.time_s)
+        fold = folds(self.time_s)
 
         def share(each: Coordinate, values: FloatArray) -> float:
             coarse = replace(each, bins=COARSE) if each.name == "time" else each
-            gain = foretold(coarse, values, self.direction, odd)
-            return max(gain / max(float(np.mean(values**2)), 1e-300), 0.0)
+            left = values - predicted(coarse, values, self.direction, fold)
+            return max(1.0 - float(left @ left) / max(float(values @ values), 1e-300), 0.0)
 
         return {
             name: (share(each, self.given_arcsec), share(each, self.left_arcsec))
@@ -77,22 +76,21 @@ def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coord
     return {each.name: each for each in kept if each.varies()}
 
 
-def every_other(time_s: FloatArray) -> BoolArray:
-    """The points in every other stretch of time, shape (m,)."""
-    return np.asarray(of_number(time_s, STRETCHES) % 2 == 1)
+def folds(time_s: FloatArray) -> IntArray:
+    """Which of `FOLDS` parts of the record each point is in, shape (m,): every so many-th stretch of time."""
+    return np.asarray(of_number(time_s, STRETCHES) % FOLDS)
 
 
-def foretold(coordinate: Coordinate, values: FloatArray, direction: FloatArray, odd: BoolArray) -> float:
-    """Mean square of ``values`` (m,) that bin means of one half of the points take away in the other."""
+def predicted(
+    coordinate: Coordinate, values: FloatArray, direction: FloatArray, fold: IntArray
+) -> FloatArray:
+    """What the bin means of all other folds say of the points of each, shape (m,)."""
     number = coordinate.numbers()
-    bins = int(np.max(number)) + 1
     if coordinate.both_ways:
-        number = number + bins * (direction < 0.0)
-        bins *= 2
-    gained = 0.0
-    for train in (odd, ~odd):
-        count = np.bincount(number[train], minlength=bins)
-        mean = np.bincount(number[train], values[train], bins) / (count + SHRUNK)
-        test = values[~train]
-        gained += float(np.sum(test**2) - np.sum((test - mean[number[~train]]) ** 2))
-    return gained / len(values)
+        number = 2 * number + (direction < 0.0)
+    bins = int(np.max(number)) + 1
+    at = fold * bins + number
+    total = np.bincount(at, values, FOLDS * bins).reshape(FOLDS, bins)
+    count = np.bincount(at, minlength=FOLDS * bins).reshape(FOLDS, bins)
+    mean = (np.sum(total, axis=0) - total) / (np.sum(count, axis=0) - count + SHRUNK)
+    return np.asarray(mean.ravel()[at])

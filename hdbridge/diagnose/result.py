@@ -71,7 +71,7 @@ class Finding:
     left_arcsec: float = 0.0
     """Of something unexplained: root mean square that is left beyond the noise."""
     taken_arcsec: float = 0.0
-    """Of a change within the model: root mean square that it takes away in the fit itself."""
+    """Of a changed loop: root mean square that it takes away in the fit itself, near the reversals."""
     left_alone: bool = False
     """Whether it may be a change of a part of the model or another cause: the model keeps its own."""
     lives_in: str = ""

@@ -1,30 +1,40 @@
 """What is left when no cause fits: how much, and what it depends on.
 
 Non-parametric rivals that know nothing of causes (bins over all that a residual can be looked at over, see
-`residual_views`) are fitted on every other stretch of time and judged on the rest. Where the best of them
-takes a good deal away, there something is that the catalogue does not have.
+`residual_views`) are judged on stretches of time that they were not fitted to, by what causes are judged by.
+Where one of them is seen, or more moves than noise does, there something is that the catalogue does not have.
+What is left near the reversals only may be the loop's, whose law nobody knows exactly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from hdbridge.diagnose.residual_views import coordinates, every_other, foretold
+from hdbridge.diagnose.acceptance import block_robust, law_discrepancies
+from hdbridge.diagnose.residual_views import coordinates, folds, predicted
 from hdbridge.diagnose.result import Finding
 from hdbridge.effects import BoolArray, FloatArray, Part
+from hdbridge.effects.coordinate import since_reversal
 from hdbridge.effects.kinematics import direction_of
 from hdbridge.estimation.hypothesis import Estimator, Fitted
+from hdbridge.estimation.linearised import Linearised
 from hdbridge.estimation.scales import Scales
 from hdbridge.estimation.stretches import of_length
 
-BINS = {"load angle": 360, "position": 400, "time": 25}
-"""Of angles as many as a narrow bump or a wave of the motor's orders asks for; of time no more than there are
-stretches of either half for."""
+BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
+"""Of angles as many as a wide bump, a narrow one or a wave of the motor's orders asks for; of time no more
+than have several stretches each."""
 BLOCK_S = 0.2
+FEW = 50
+"""Points that tell nothing of a record."""
+TAIL = 3.0
+"""Times the width of a loop after which one that forgets by and by has forgotten, too."""
 LESS = "does less than what is left unexplained"
 EPISODES = 30
 """Stretches that a record is cut into, to see whether what is left is left everywhere."""
@@ -36,51 +46,62 @@ class Rest:
 
     arcsec: float
     """Root mean square beyond the noise, over short blocks."""
+    near_arcsec: float
+    """The same where a loop may remember the last reversal."""
+    apart_arcsec: float
+    """The same where the axis moves and none does."""
+    peak_arcsec: float
+    """Half the span of what is left beyond the noise, but for what is rare."""
     fast_arcsec: float
-    """The same over all points: what is too fast for short blocks as well."""
+    """Root mean square over all points: what is too fast for short blocks as well."""
     standing_arcsec: float
-    """The same at rest only; 0 where it never rests."""
+    """What moves at rest only; 0 where it never rests."""
     lives_in: str
     """Where most of it is; time where nothing in particular."""
-    explained_arcsec: float
-    """Root mean square of what the best rival takes away on data it has not seen."""
+    seen: bool
+    """Whether it is seen there as a cause has to be, apart from the reversals."""
 
-    def foretold(self, scales: Scales) -> bool:
-        """Whether a good part of it depends on what it was looked at over."""
-        return self.explained_arcsec**2 > scales.foretold * self.arcsec**2
+
+class _View(NamedTuple):
+    """A residual over one coordinate."""
+
+    gain: float
+    """Chi square that ``predicted_arcsec`` takes away."""
+    name: str
+    predicted_arcsec: FloatArray
+    """What all other stretches of time say of each, shape (m,)."""
 
 
 def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     """Look at a residual."""
     residual = fitted.residual / estimator.weight
-    arcsec = beyond_noise(estimator, residual)
-    motion, index = estimator.motion, estimator.index
-    smooth, odd = _smoothed(estimator, residual), every_other(estimator.time_s)
-    direction = direction_of(motion)[index]
-    best = ("time", 0.0)
-    for name, each in coordinates(motion, index, estimator.data.ratio).items():
-        for both in (False, True)[: 1 + each.both_ways]:
-            bins = BINS.get(name, each.bins)
-            gain = foretold(replace(each, both_ways=both, bins=bins), smooth, direction, odd)
-            best = max(best, (f"{name} and direction" if both else name, gain), key=lambda one: one[1])
+    near = near_reversals(estimator, fitted)
+    apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
+    if np.count_nonzero(apart) < FEW:
+        apart[:] = True
+    seen = [each for each in _views(estimator, residual, apart) if _is_seen(estimator, fitted, apart, each)]
+    views = seen or _views(estimator, residual, np.ones_like(apart))
+    best = max((_View(0.0, "time", np.zeros(1)), *views), key=lambda each: each.gain)
     return Rest(
-        arcsec,
+        beyond_noise(estimator, residual),
+        beyond_noise(estimator, residual, near),
+        beyond_noise(estimator, residual, apart),
+        max(_peak(estimator, residual), _half_span(estimator, best.predicted_arcsec) if seen else 0.0),
         float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
         _standing(estimator, residual),
-        best[0],
-        float(np.sqrt(best[1])),
+        best.name,
+        bool(seen),
     )
 
 
 def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     """Whether more is left than nobody need explain."""
+    if not of_the_loop(estimator, left):
+        return True
     data, scales = estimator.data, estimator.scales
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
     # that.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    limit = float(np.hypot(scales.floor_arcsec, 0.0 if data.full.commanded else counts))
-    if left.arcsec > limit and left.foretold(scales):
-        return True
     # Where command and standstill distinguish noise and following error from the gear, fast things count.
     if data.full.commanded and data.standstill:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
@@ -102,14 +123,20 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
     return None
 
 
-def of_the_loop(left: Rest, scales: Scales) -> bool:
-    """Whether what is left is the loop's: it depends on what has passed since the last reversal."""
-    return "last reversal" in left.lives_in and left.foretold(scales)
+def of_the_loop(estimator: Estimator, left: Rest) -> bool:
+    """Whether all that is left may be the loop's: no more than nobody need explain where the axis moves
+    beyond the memory of any loop.
+    """
+    counts = _angle_step_arcsec(estimator) / np.sqrt(12.0)
+    most = np.linalg.norm((estimator.scales.floor_arcsec, counts, left.standing_arcsec))
+    return not left.seen and bool(left.apart_arcsec <= most)
 
 
-def doubtful_loops(findings: Sequence[Finding], left: Rest, scales: Scales) -> list[Finding]:
-    """Changes of the loop's parameters that do less than what is left, unless that is the loop's too."""
-    if of_the_loop(left, scales):
+def doubtful_loops(estimator: Estimator, findings: Sequence[Finding], left: Rest) -> list[Finding]:
+    """Changes of the loop's parameters that do less near the reversals than what is left there, unless that
+    is the loop's too. What follows the direction alone looks like a changed loop everywhere else.
+    """
+    if of_the_loop(estimator, left):
         return []
     return [
         each
@@ -118,7 +145,7 @@ def doubtful_loops(findings: Sequence[Finding], left: Rest, scales: Scales) -> l
         and each.effect is not None
         and each.effect.changes is Part.LOOP
         and each.effect.part is not Part.LOOP
-        and each.taken_arcsec**2 < scales.shadow * left.arcsec**2
+        and each.taken_arcsec**2 < estimator.scales.shadow * left.near_arcsec**2
     ]
 
 
@@ -149,12 +176,81 @@ def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
 
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:
     """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
-    time_s, residual, weight = estimator.time_s[rows], residual[rows], estimator.weight[rows]
-    number = of_length(time_s, BLOCK_S)
-    count = np.bincount(number)
-    mean = np.bincount(number, residual) / count
-    white = np.bincount(number, 1.0 / weight**2) / count**2
+    mean, white = _blocks(estimator, residual, rows)
     return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
+
+
+def _peak(estimator: Estimator, residual: FloatArray) -> float:
+    """Half the span of the means over such blocks, less what white noise puts there, arcsec."""
+    mean, white = _blocks(estimator, residual, slice(None))
+    mean, white = (each[white <= np.median(white)] for each in (mean, white))  # whole ones
+    noise = NormalDist().inv_cdf(1.0 - estimator.rare) ** 2 * float(np.mean(white))
+    return float(np.sqrt(max(_half_span(estimator, mean) ** 2 - noise, 0.0)))
+
+
+def _blocks(
+    estimator: Estimator, residual: FloatArray, rows: BoolArray | slice
+) -> tuple[FloatArray, FloatArray]:
+    """Means of some rows over blocks of `BLOCK_S`, and the variances that white noise gives them."""
+    number = of_length(estimator.time_s[rows], BLOCK_S)
+    count = np.bincount(number)
+    variance = np.bincount(number, 1.0 / estimator.weight[rows] ** 2) / count**2
+    return np.bincount(number, residual[rows]) / count, variance
+
+
+def _angle_step_arcsec(estimator: Estimator) -> float:
+    """A step of the angle that drives the effects in motion: a count of the motor's, or none."""
+    return 0.0 if estimator.data.full.commanded else estimator.data.motor_count_arcsec
+
+
+def _half_span(estimator: Estimator, values: FloatArray) -> float:
+    """Of values, but for what is rare at either end."""
+    low, high = np.quantile(values, [estimator.rare, 1.0 - estimator.rare])
+    return 0.5 * float(high - low)
+
+
+def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
+    """The points at which a loop may still remember the last reversal, shape (m,); all without any."""
+    memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
+    near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
+    return np.asarray(near if np.any(near) else np.ones_like(near))
+
+
+def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Iterator[_View]:
+    """Some rows of a residual over everything that they can be looked at over."""
+    motion, index = estimator.motion, estimator.index[rows]
+    values, weight = residual[rows], estimator.weight[rows]
+    fold, direction = folds(estimator.time_s[rows]), direction_of(motion)[index]
+    for name, each in coordinates(motion, index, estimator.data.ratio).items():
+        for both in (False, True)[: 1 + each.both_ways]:
+            for bins in BINS.get(name, (each.bins,)):
+                told = predicted(replace(each, both_ways=both, bins=bins), values, direction, fold)
+                gain = float(np.sum(weight**2 * (values**2 - (values - told) ** 2)))
+                yield _View(gain, f"{name} and direction" if both else name, told)
+
+
+def _is_seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, view: _View) -> bool:
+    """Whether a view of some rows is held to be there by what a cause is held to be there by, and is so large
+    that it needs no name.
+    """
+    scales = estimator.scales
+    weight, step_arcsec = estimator.weight[rows], 0.5 * _angle_step_arcsec(estimator)
+    gain, peak = scales.enter + scales.penalty, float(np.hypot(scales.plain_arcsec, step_arcsec))
+    laws = [each for each in fitted.hypothesis.effects if each.part is None]
+    for law in laws:  # the more it does, the more a real one differs from its formula
+        does = estimator.columns(law, fitted.hypothesis.start)[rows] @ law.coefficients()
+        gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
+        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * _half_span(estimator, does))
+    if view.gain < gain or _half_span(estimator, view.predicted_arcsec) < peak:
+        return False
+    column = weight * view.predicted_arcsec
+    fit = Linearised(
+        np.column_stack([fitted.tangent[rows], column]),
+        fitted.residual[rows],
+        np.vstack([fitted.linearised.known, np.zeros(2)]),
+    )
+    known = law_discrepancies(estimator, fitted.hypothesis)
+    return block_robust(estimator, fit, [fitted.count()], np.zeros(1), rows, known) > scales.robust
 
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
@@ -165,15 +261,10 @@ def _standing(estimator: Estimator, residual: FloatArray) -> float:
     if speed is None:
         return 0.0
     still = (speed == 0.0)[estimator.index]
-    if np.count_nonzero(still) < 50:
+    if np.count_nonzero(still) < FEW:
         return 0.0
     number = np.floor((estimator.time_s[still] - estimator.time_s[0]) / BLOCK_S).astype(np.intp)
     names, number = np.unique(number, return_inverse=True)
     mean = np.bincount(number, residual[still]) / np.bincount(number)
     step = np.diff(mean)[np.diff(names) == 1]
     return float(np.median(np.abs(step))) * 1.05 if len(step) else 0.0
-
-
-def _smoothed(estimator: Estimator, residual: FloatArray) -> FloatArray:
-    period = estimator.data.period_s * len(estimator.data.full) / len(estimator.data.points)
-    return np.asarray(uniform_filter1d(residual, max(1, round(0.1 / period))))

@@ -90,7 +90,7 @@ class Scales:
     )
 
     # What is left.
-    plain_arcsec: float = _scale(1.0, "arcsec rms", math.inf, "twice the floor, whatever it depends on")
+    plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
     shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
     episodes: float = _scale(
         0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
@@ -101,18 +101,6 @@ class Scales:
         "share of the largest piece",
         math.inf,
         "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
-    )
-    leads: float = _scale(
-        3.5,
-        "peak over rms of what is left",
-        0.0,
-        "what is there in a twelfth of a record has a peak of 3.5 times its rms",
-    )
-    foretold: float = _scale(
-        0.3,
-        "share of the square of what is left",
-        0.0,
-        "means over a coordinate foretell it on held-out stretches",
     )
 
     # How sure a name is (`hdbridge.diagnose.probability`): 128 names, 115 of them right.

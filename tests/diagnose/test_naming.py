@@ -238,5 +238,5 @@ def test_a_load_that_lags_is_a_loop_of_the_other_sign(
     ids=["more equal orders than one cause has", "bursts beside an order of the load"],
 )
 def test_what_no_cause_describes_leads(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
-    """Without `Scales.near` the orders are one cause, without `Scales.leads` the load's order comes first."""
+    """Without `Scales.near` the orders are one cause; the bursts are larger than the load's order."""
     assert names(diagnosed(effects))[0] == "unexplained"

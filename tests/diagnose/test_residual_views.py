@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.residual_views import ResidualViews
+from hdbridge.diagnose.residual_views import ResidualViews, folds, predicted
 from hdbridge.effects import Motion
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
@@ -93,3 +93,10 @@ def test_time_since_a_stop_or_start():
     motion = Motion(motor_deg=np.cumsum(speed), time_s=np.arange(6.0), motor_speed_deg_s=speed)
     least = SMALLEST_TIME_S
     assert over.since_change(motion).values.tolist() == [least, 1.0, least, 1.0, least, least]
+
+
+def test_a_stretch_foretells_nothing_of_itself():
+    values = np.where((TIME_S > 400.0) & (TIME_S < 405.0), 5.0, 0.0)  # within one stretch
+    told = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
+    assert np.all(told[values > 0.0] == 0.0)
+    assert np.max(told) > 0.0  # of its neighbours it does

@@ -360,6 +360,13 @@ def unknown(
         nearer = -math.expm1(-float(np.median(np.diff(t))) / kind["tau"])
         heat = filtered([nearer], [1.0, nearer - 1.0], v**2)
         return size * heat / np.max(heat)
+    if kind["kind"] == "ring":  # carried along by the motion until it slips back, at random
+        rng, ring, slips = np.random.default_rng(7), np.empty(len(t)), 0.7
+        for i, way in enumerate(np.diff(motor, prepend=motor[0]) / kind["travel"]):
+            ring[i] = (ring[i - 1] if i else 0.0) + way
+            if abs(ring[i]) > slips:
+                ring[i], slips = 0.2 * rng.uniform(-1.0, 1.0) * np.sign(ring[i]), rng.uniform(0.4, 1.0)
+        return size * ring
     raise ValueError(kind["kind"])
 
 

@@ -1,0 +1,40 @@
+"""What the catalogue lacks: how little of it is seen, and what is no such thing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from hdbridge.diagnose import Diagnosis
+
+LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
+
+
+@pytest.mark.parametrize(("size", "width"), [(3.1, 12.0), (5.0, 8.0)])
+def test_what_acts_in_a_small_part_of_a_record_is_unexplained(
+    diagnosed: Callable[..., Diagnosis], size: float, width: float
+) -> None:
+    """Less than half an arcsecond rms is left of it, as much as a cause needs at its peak."""
+    (found,) = diagnosed({"unknown": {"kind": "packet", "size": size, "width": width}}).findings
+    assert found.cause == "unexplained"
+    assert found.left_arcsec < 0.5 < found.peak_arcsec < 1.2 * size
+    assert found.lives_in in {"load angle", "position"}
+
+
+@pytest.mark.parametrize("law", ["dahl", "bouc_wen"])
+def test_what_another_law_leaves_at_its_reversals_is_the_loops(
+    diagnosed: Callable[..., Diagnosis], law: str
+) -> None:
+    """An arcsecond rms, but none of it where the axis has gone on further than a loop remembers."""
+    (found,) = diagnosed(law=law).findings
+    assert found.cause in LOOPS
+    assert "another shape than either law" in found.note
+
+
+def test_what_follows_the_direction_far_from_the_reversals_is_no_changed_loop(
+    diagnosed: Callable[..., Diagnosis],
+) -> None:
+    """A ring that is carried along by more than a turn of the motor before it slips."""
+    (found,) = diagnosed({"unknown": {"kind": "ring", "size": 5.0, "travel": 400.0}}).findings
+    assert found.cause == "unexplained"
