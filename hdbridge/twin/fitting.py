@@ -113,6 +113,10 @@ def fit(
             ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
         progress(0.9)
         best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
+        # A rough fit knows little of what the two gains do at rest, where only they differ.
+        other = solve(replays, exchanged(best.truth), parameters, prior, MORE_STEPS, most=most)
+        if other.loss + EARNED < best.loss:
+            best = solve(replays, other.truth, parameters, prior, STEPS, most=most, near=other)
         for name in LAST:
             wider = (*parameters, BY_NAME[name])
             if value_in(begun, BY_NAME[name]) is None or name in more:
