@@ -251,11 +251,9 @@ class Diagnosis:
             )
         words = []
         for each in self.findings:
-            if each.cause == "unexplained":
-                words.append(f"unexplained, depends on the {each.lives_in or 'time'}")
-            else:
-                others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
-                words.append(f"{each.cause}{others}, {each.peak_arcsec:.2g} arcsec")
+            others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
+            where = f" that depends on the {each.lives_in or 'time'}" if each.cause == "unexplained" else ""
+            words.append(f"{each.cause}{others}{where}, {each.peak_arcsec:.2g} arcsec")
         return (
             f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."

@@ -121,7 +121,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 def _claim(finding: Finding) -> str:
     """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
-        size = f"{_two(finding.left_arcsec)} arcsec rms beyond the noise"
+        size = f"up to {_two(finding.peak_arcsec)} arcsec"
         return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
     name = _title(finding.cause)
     if finding.aliases:
@@ -155,7 +155,7 @@ def _found(diagnosis: Diagnosis) -> Section:
             [
                 f"{number}. {_name(each.cause)}",
                 f"{each.probability:.2f}",
-                "" if each.cause == UNEXPLAINED else each.peak_arcsec,
+                each.peak_arcsec,
                 each.gain.before_arcsec if each.gain else "not made",
                 each.gain.after_arcsec if each.gain else "",
                 f"{100.0 * each.gain.recovered:.0f} %" if each.gain else "",

@@ -283,7 +283,7 @@ def test_a_change_of_orders_is_drawn_as_it_was_found():
 def test_something_unexplained_has_no_name_and_no_curve():
     text = page(unexplained())
     said = words(text)
-    assert "something unexplained that depends on the load angle and direction" in said
+    assert "something unexplained that depends on the load angle and direction, up to " in said
     assert "No cause of the catalogue fits it" in said
     assert "Do not correct what has no name" in said
     assert "--extend" not in said
