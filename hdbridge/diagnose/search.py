@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
-
 from hdbridge.diagnose import matched_filters
 from hdbridge.diagnose.acceptance import all_pieces_seen, evident, gate
 from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
@@ -252,9 +250,8 @@ class Search:
 
     def peak(self, fitted: Fitted, place: int) -> float:
         """Half the span of what an effect does in this record, arcsec, but for what is rare at either end."""
-        values = self.estimator.does(fitted.hypothesis.effects[place], fitted.hypothesis.start)
-        low, high = np.quantile(values, [self.estimator.rare, 1.0 - self.estimator.rare])
-        return 0.5 * float(high - low)
+        hypothesis = fitted.hypothesis
+        return self.estimator.half_span(self.estimator.does(hypothesis.effects[place], hypothesis.start))
 
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
         """The best candidate of each of the best causes, and of each number of parameters that it may have.

@@ -9,7 +9,7 @@ What is left near the reversals only may be the loop's, whose law nobody knows e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import NamedTuple
@@ -79,14 +79,14 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
     if np.count_nonzero(apart) < FEW:
         apart[:] = True
-    seen = [each for each in _views(estimator, residual, apart) if _is_seen(estimator, fitted, apart, each)]
+    seen = _seen(estimator, fitted, apart, _views(estimator, residual, apart))
     views = seen or _views(estimator, residual, np.ones_like(apart))
     best = max((_View(0.0, "time", np.zeros(1)), *views), key=lambda each: each.gain)
     return Rest(
         beyond_noise(estimator, residual),
         beyond_noise(estimator, residual, near),
         beyond_noise(estimator, residual, apart),
-        max(_peak(estimator, residual), _half_span(estimator, best.predicted_arcsec) if seen else 0.0),
+        max(_peak(estimator, residual), estimator.half_span(best.predicted_arcsec) if seen else 0.0),
         float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
         _standing(estimator, residual),
         best.name,
@@ -185,7 +185,7 @@ def _peak(estimator: Estimator, residual: FloatArray) -> float:
     mean, white = _blocks(estimator, residual, slice(None))
     mean, white = (each[white <= np.median(white)] for each in (mean, white))  # whole ones
     noise = NormalDist().inv_cdf(1.0 - estimator.rare) ** 2 * float(np.mean(white))
-    return float(np.sqrt(max(_half_span(estimator, mean) ** 2 - noise, 0.0)))
+    return float(np.sqrt(max(estimator.half_span(mean) ** 2 - noise, 0.0)))
 
 
 def _blocks(
@@ -201,12 +201,6 @@ def _blocks(
 def _angle_step_arcsec(estimator: Estimator) -> float:
     """A step of the angle that drives the effects in motion: a count of the motor's, or none."""
     return 0.0 if estimator.data.full.commanded else estimator.data.motor_count_arcsec
-
-
-def _half_span(estimator: Estimator, values: FloatArray) -> float:
-    """Of values, but for what is rare at either end."""
-    low, high = np.quantile(values, [estimator.rare, 1.0 - estimator.rare])
-    return 0.5 * float(high - low)
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
@@ -229,28 +223,33 @@ def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Itera
                 yield _View(gain, f"{name} and direction" if both else name, told)
 
 
-def _is_seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, view: _View) -> bool:
-    """Whether a view of some rows is held to be there by what a cause is held to be there by, and is so large
-    that it needs no name.
+def _seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]) -> list[_View]:
+    """Those views of some rows that are held to be there by what a cause is held to be there by, and are so
+    large that they need no name.
     """
-    scales = estimator.scales
+    scales, start = estimator.scales, fitted.hypothesis.start
     weight, step_arcsec = estimator.weight[rows], 0.5 * _angle_step_arcsec(estimator)
     gain, peak = scales.enter + scales.penalty, float(np.hypot(scales.plain_arcsec, step_arcsec))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the more it does, the more a real one differs from its formula
-        does = estimator.columns(law, fitted.hypothesis.start)[rows] @ law.coefficients()
+        does = estimator.columns(law, start)[rows] @ law.coefficients()
         gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
-        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * _half_span(estimator, does))
-    if view.gain < gain or _half_span(estimator, view.predicted_arcsec) < peak:
-        return False
-    column = weight * view.predicted_arcsec
-    fit = Linearised(
-        np.column_stack([fitted.tangent[rows], column]),
-        fitted.residual[rows],
-        np.vstack([fitted.linearised.known, np.zeros(2)]),
-    )
-    known = law_discrepancies(estimator, fitted.hypothesis)
-    return block_robust(estimator, fit, [fitted.count()], np.zeros(1), rows, known) > scales.robust
+        peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(does))
+    large = [
+        each for each in views if each.gain >= gain and estimator.half_span(each.predicted_arcsec) >= peak
+    ]
+    if not large:
+        return []
+    tangent, residual = fitted.tangent[rows], fitted.residual[rows]
+    known = np.vstack([fitted.linearised.known, np.zeros(2)])
+    discrepancies = law_discrepancies(estimator, fitted.hypothesis)
+
+    def robust(view: _View) -> float:
+        columns = np.column_stack([tangent, weight * view.predicted_arcsec])
+        fit = Linearised(columns, residual, known)
+        return block_robust(estimator, fit, [fitted.count()], np.zeros(1), rows, discrepancies)
+
+    return [each for each in large if robust(each) > scales.robust]
 
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:

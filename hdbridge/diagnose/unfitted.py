@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from hdbridge.effects import Effect, Part
 from hdbridge.estimation.hypothesis import Estimator, Hypothesis
 
@@ -28,9 +26,8 @@ def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
     if share < MOST:
         return ""
     does = (plain.residual - loose.residual) / estimator.weight
-    low, high = np.quantile(does, [estimator.rare, 1.0 - estimator.rare])
     return (
-        f"the model has no elastic loop, and one of {0.5 * (high - low):.3g} arcsec to either side makes up "
-        f"{100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), then "
-        "diagnose"
+        f"the model has no elastic loop, and one of {estimator.half_span(does):.3g} arcsec to either side "
+        f"makes up {100.0 * share:.0f} % of the squares that it leaves: fit a model first (hdbridge fit), "
+        "then diagnose"
     )

@@ -141,6 +141,11 @@ class Estimator:
         """
         return self.scales.rare / max(len(self.data.full), SHORT)
 
+    def half_span(self, values: FloatArray) -> float:
+        """Half the span of values, but for what is rare at either end."""
+        low, high = np.quantile(values, [self.rare, 1.0 - self.rare])
+        return 0.5 * float(high - low)
+
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
         return self._regressors.columns(effect, (start,))
