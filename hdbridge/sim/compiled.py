@@ -1,4 +1,4 @@
-"""The loops and mechanics as machine code, made of the very classes that Python runs: the same numbers.
+"""The axis as machine code, made of the very classes that Python runs: the same numbers.
 
 An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
 attribute, and numba compiles the classes' methods for such records. The physics is written only once. Where
@@ -27,9 +27,8 @@ from numba.core.typing.arraydecl import RecordAttribute
 from numba.extending import overload, overload_method
 
 from hdbridge.sim import ageing, encoder, gear, gear_pieces, hysteresis_laws
+from hdbridge.sim.axis import Axis, Told
 from hdbridge.sim.fast import FloatArray, IntArray
-from hdbridge.sim.heat import Heat
-from hdbridge.sim.loops import Loops, Seen, Slow
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.state import STATES
 
@@ -91,81 +90,67 @@ KINDS: Final[dict[Any, Kinds]] = {
 _NUMBERS: Final = {float: "f8", int: "i8", bool: "?", complex: "c16"}
 
 
-class CompiledLoops:
-    """The state of some `Loops` as one record, and the compiled methods on it; to be used like them."""
+class CompiledAxis:
+    """The state of an `Axis` as one record, and the compiled methods on it; to be used like it."""
 
-    def __init__(self, loops: Loops) -> None:
+    def __init__(self, axis: Axis) -> None:
         """Raises `Uncompilable`."""
         if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
-        plant: Any = type(loops.plant)
-        self._record = np.zeros(1, _layout_of(plant, _room(loops)))
-        _fill(self._record[0], loops)
+        plant: Any = type(axis.loops.plant)
+        self._record = np.zeros(1, _layout_of(plant, _room(axis)))
+        _fill(self._record[0], axis)
         self._methods = _methods()
 
-    def power_on(self, slow: Slow) -> float:
-        """See `Loops`."""
-        return self._methods.power_on(self._record, slow)
-
-    def begin_demand(self, demand_deg: float) -> None:
-        """See `Loops`."""
-        self._methods.begin_demand(self._record, demand_deg)
-
-    def hold(self, torque_nm: float) -> None:
-        """See `Loops`."""
-        self._methods.hold(self._record, torque_nm)
-
-    def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen:
-        """See `Loops`."""
-        return self._methods.follow(self._record, demand_deg, demand_deg_s, substeps, slow)
-
-    def follow_all(
+    def drive(
         self,
-        demand_deg: FloatArray,
-        demand_deg_s: FloatArray,
-        substeps: IntArray,
-        heat: Heat,
+        start_counts: float,
+        end_counts: float,
+        substeps: int,
         limit_nm: float,
+        noise_deg: float,
+        outer_nm: float,
+    ) -> Told:
+        """See `Axis`."""
+        return self._methods.drive(
+            self._record, start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm
+        )
+
+    def drive_all(
+        self,
+        counts: FloatArray,
+        substeps: IntArray,
+        limit_nm: float,
+        noise_deg: FloatArray,
         outer_nm: FloatArray,
         held_nm: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Closed loop over many cycles: for each what `Loops.follow` says, and the temperature after it.
+        told: FloatArray,
+    ) -> Told:
+        """`Axis.drive` over many cycles, each from the demand before it; ``told`` takes the first of what
+        each tells (`machine.Cycles`).
 
-        ``heat`` is led through them; ``outer_nm`` is the torque on the load from outside in each,
-        ``held_nm`` the one by which the loops hold the axis before it, or NaN.
+        ``held_nm`` is the torque by which the loops hold the axis before each cycle, or NaN.
         """
-        seen, body_c = np.empty((len(substeps), 11)), np.empty(len(substeps))
-        record = np.zeros(1, _layout_of(Plant, LEAST_ROOM, Heat))
-        _fill(record[0], heat)
-        self._methods.follow_all(
-            self._record,
-            record,
-            demand_deg,
-            demand_deg_s,
-            substeps,
-            limit_nm,
-            outer_nm,
-            held_nm,
-            seen,
-            body_c,
+        return self._methods.drive_all(
+            self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
         )
-        for name, hint in _attributes(Heat).items():
-            if hint in _NUMBERS:
-                setattr(heat, name, hint(record[0][name]))
-        return seen, body_c
 
-    def coast(self, brake_nm: float, substeps: int, slow: Slow) -> Seen:
-        """See `Loops`."""
-        return self._methods.coast(self._record, brake_nm, substeps, slow)
+    def roll(
+        self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
+    ) -> Told:
+        """See `Axis`."""
+        return self._methods.roll(self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm)
+
+    def hold(self, torque_nm: float) -> None:
+        """See `Axis`."""
+        self._methods.hold(self._record, torque_nm)
 
 
 class _Methods(NamedTuple):
-    power_on: Callable[..., float]
-    begin_demand: Callable[..., None]
+    drive: Callable[..., Told]
+    drive_all: Callable[..., Told]
+    roll: Callable[..., Told]
     hold: Callable[..., None]
-    follow: Callable[..., Seen]
-    follow_all: Callable[..., None]
-    coast: Callable[..., Seen]
 
 
 @cache
@@ -174,52 +159,51 @@ def _methods() -> _Methods:
     _register()
     version = _version()
 
-    def power_on(loops: Any, slow: Any) -> Any:
+    def drive(
+        axis: Any,
+        start_counts: float,
+        end_counts: float,
+        substeps: int,
+        limit_nm: float,
+        noise_deg: float,
+        outer_nm: float,
+    ) -> Any:
         assert version  # numba's file is of this version
-        return loops[0].power_on(slow)
+        return axis[0].drive(start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm)
 
-    def begin_demand(loops: Any, demand_deg: float) -> None:
-        assert version
-        loops[0].begin_demand(demand_deg)
-
-    def hold(loops: Any, torque_nm: float) -> None:
-        assert version
-        loops[0].hold(torque_nm)
-
-    def follow(loops: Any, demand_deg: float, demand_deg_s: float, substeps: int, slow: Any) -> Any:
-        assert version
-        return loops[0].follow(demand_deg, demand_deg_s, substeps, slow)
-
-    def follow_all(
-        loops: Any,
-        heat: Any,
-        demand_deg: Any,
-        demand_deg_s: Any,
+    def drive_all(
+        axis: Any,
+        counts: Any,
         substeps: Any,
         limit_nm: float,
+        noise_deg: Any,
         outer_nm: Any,
         held_nm: Any,
-        seen: Any,
-        body_c: Any,
-    ) -> None:
+        told: Any,
+    ) -> Any:
         assert version
-        dt_s = loops[0].dt_s
+        now = axis[0].at_first()
         for cycle in range(len(substeps)):
             if not math.isnan(held_nm[cycle]):
-                loops[0].hold(held_nm[cycle])
-            slow = (heat[0].body_c, heat[0].rub, limit_nm, 0.0, outer_nm[cycle])
-            told = loops[0].follow(demand_deg[cycle], demand_deg_s[cycle], substeps[cycle], slow)
-            for place in range(11):
-                seen[cycle, place] = told[place]
-            heat[0].warm(told[9], told[10], substeps[cycle] * dt_s)
-            body_c[cycle] = heat[0].body_c
+                axis[0].hold(held_nm[cycle])
+            start, end, count = counts[cycle], counts[cycle + 1], substeps[cycle]
+            now = axis[0].drive(start, end, count, limit_nm, noise_deg[cycle], outer_nm[cycle])
+            told[cycle, 0], told[cycle, 1], told[cycle, 2] = now[0], now[1], now[2]
+            told[cycle, 3], told[cycle, 4], told[cycle, 5] = now[3], now[4], now[5]
+        return now
 
-    def coast(loops: Any, brake_nm: float, substeps: int, slow: Any) -> Any:
+    def roll(
+        axis: Any, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
+    ) -> Any:
         assert version
-        return loops[0].coast(brake_nm, substeps, slow)
+        return axis[0].roll(brake_nm, substeps, limit_nm, noise_deg, outer_nm)
+
+    def hold(axis: Any, torque_nm: float) -> None:
+        assert version
+        axis[0].hold(torque_nm)
 
     compiled = numba.njit(cache=True, fastmath=False)
-    return _Methods(*(compiled(each) for each in (power_on, begin_demand, hold, follow, follow_all, coast)))
+    return _Methods(*(compiled(each) for each in (drive, drive_all, roll, hold)))
 
 
 def _version() -> int:
@@ -260,8 +244,8 @@ def _room(value: Any) -> int:
 
 
 @cache
-def _layout_of(plant: Any, room: int, whole: type = Loops) -> Any:
-    """The numpy type of a class, the `Loops` with this plant. One object for all: numba finds it at once."""
+def _layout_of(plant: Any, room: int) -> Any:
+    """The numpy type of an `Axis` with this plant. One object for all: numba finds it at once."""
 
     def layout(declared: Any) -> Any:
         if declared in _NUMBERS:
@@ -280,7 +264,7 @@ def _layout_of(plant: Any, room: int, whole: type = Loops) -> Any:
         _CLASSES[numba.from_dtype(record)] = cls
         return record
 
-    return layout(whole)
+    return layout(Axis)
 
 
 def _fill(record: Any, value: Any) -> None:
@@ -389,11 +373,16 @@ def _dispatch(protocol: Any, name: str) -> Any:
     return _function(name, ("self", "argument"), [*lines, f"return {kinds.neutral}"], {})
 
 
-_remainder = types.ExternalFunction("remainder", types.float64(types.float64, types.float64))
+def _of_the_c_library(function: Any) -> None:
+    """Let numba, which has no such function of two numbers, call the one that Python calls."""
+    same = types.ExternalFunction(function.__name__, types.float64(types.float64, types.float64))
+
+    @overload(function, strict=False)
+    def _chosen(x: Any, y: Any) -> Any:
+        if isinstance(x, types.Float) and isinstance(y, types.Float):
+            return lambda x, y: same(x, y)  # noqa: PLW0108 - numba looks at its code
+        return None
 
 
-@overload(math.remainder, strict=False)
-def _remainder_of_the_c_library(x: Any, y: Any) -> Any:
-    if isinstance(x, types.Float) and isinstance(y, types.Float):
-        return lambda x, y: _remainder(x, y)  # noqa: PLW0108 - numba looks at its code
-    return None
+_of_the_c_library(math.remainder)
+_of_the_c_library(math.fmod)

@@ -6,7 +6,6 @@ Each error is a reading error in degrees of the encoder's shaft: the shaft itsel
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterable
 from typing import Final, Protocol
 
@@ -61,16 +60,22 @@ class Disc:
         return math.degrees(off + self._oval * math.sin(2.0 * (angle - self._oval_rad)))
 
 
+@state
 class Signals:
     """The angle within a line, from a sine and a cosine that are not quite what they should be.
 
     Offsets make an error once per line, unequal amplitudes or phases twice, third harmonics four times.
     """
 
-    __slots__ = ("_cosine_offset", "_gain", "_lines", "_phase_rad", "_sine_offset", "_third")
+    _cosine_offset: float
+    _gain: float
+    _lines: float
+    _phase_rad: float
+    _sine_offset: float
+    _third: float
 
     def __init__(self, truth: TrueSignals) -> None:
-        self._lines = truth.lines_per_turn
+        self._lines = float(truth.lines_per_turn)
         self._sine_offset = truth.sine_offset
         self._cosine_offset = truth.cosine_offset
         self._gain = 1.0 + truth.gain_mismatch
@@ -147,20 +152,31 @@ class SensorWarming:
         return self._shift_deg
 
 
+@state
 class Losses:
     """Counts lost so far."""
 
-    __slots__ = ("_counts", "_to_come")
+    _counts: tuple[float, ...]
+    """Of each loss."""
+    _count: int
+    _lost: float
+    _past: int
+    """How many there were."""
+    _times_s: tuple[float, ...]
 
     def __init__(self, losses: Iterable[TrueLoss]) -> None:
-        self._to_come = deque(sorted(losses, key=lambda each: each.time_s))
-        self._counts = 0
+        in_order = sorted(losses, key=lambda each: each.time_s)
+        self._times_s = tuple(each.time_s for each in in_order)
+        self._counts = tuple(float(each.counts) for each in in_order)
+        self._count = len(in_order)
+        self._past, self._lost = 0, 0.0
 
-    def counts(self, now_s: float) -> int:
+    def counts(self, now_s: float) -> float:
         """By how much the reading is off at a time; times never go back."""
-        while self._to_come and self._to_come[0].time_s <= now_s:
-            self._counts += self._to_come.popleft().counts
-        return self._counts
+        while self._past < self._count and self._times_s[self._past] <= now_s:
+            self._lost += self._counts[self._past]
+            self._past += 1
+        return self._lost
 
 
 @state
@@ -198,14 +214,29 @@ class Late:
         self.deg = angles[second] + (angles[first] - angles[second]) * self._part
 
 
-def fixed_errors(truth: TrueEncoder) -> tuple[ReadingError, ...]:
+@state
+class FixedErrors:
     """The reading errors that follow from the shaft's angle alone."""
-    errors: list[ReadingError] = []
-    if truth.disc is not None:
-        errors.append(Disc(truth.disc))
-    if isinstance(truth, TrueLoadEncoder) and truth.signals is not None:
-        errors.append(Signals(truth.signals))
-    return tuple(errors)
+
+    _disc: Disc
+    _signals: Signals
+    _with_disc: bool
+    _with_signals: bool
+
+    def __init__(self, truth: TrueEncoder) -> None:
+        signals = truth.signals if isinstance(truth, TrueLoadEncoder) else None
+        self._with_disc, self._with_signals = truth.disc is not None, signals is not None
+        self._disc = Disc(truth.disc or TrueDisc(radius_mm=1.0))
+        self._signals = Signals(signals or TrueSignals(lines_per_turn=1))
+
+    def at_deg(self, shaft_deg: float) -> float:
+        """What is read beyond the shaft's angle."""
+        error_deg = 0.0
+        if self._with_disc:
+            error_deg += self._disc.error_deg(shaft_deg)
+        if self._with_signals:
+            error_deg += self._signals.error_deg(shaft_deg)
+        return error_deg
 
 
 @state

@@ -1,8 +1,8 @@
-"""When the loops and mechanics are compiled: where numba is installed, and once that pays.
+"""When the simulated axis is compiled: where numba is installed, and once that pays.
 
 numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling ten more the first
 time on a machine; what is compiled is kept on disk. So a process begins in Python and goes on with the
-compiled loops after so many steps of the mechanics as would have paid for it; the numbers are the same.
+compiled axis after so many steps of the mechanics as would have paid for it; the numbers are the same.
 """
 
 from __future__ import annotations
@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from hdbridge.sim.loops import Loops, Seen, Slow
-
 if TYPE_CHECKING:
-    from hdbridge.sim.heat import Heat
+    from hdbridge.sim.axis import Axis, Told
     from hdbridge.sim.plant import Plant
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 PAYS_AFTER_SUBSTEPS: Final = 140_000
-"""Steps of the mechanics that take as much longer in Python as loading the compiled loops takes: 10
+"""Steps of the mechanics that take as much longer in Python as loading the compiled axis takes: 10
 microseconds each, where loading takes 1.4 s. A control cycle of 4 ms has eight."""
 SWITCH: Final = "HDBRIDGE_COMPILE"
 """Environment variable: ``0`` keeps everything in Python."""
@@ -32,30 +30,38 @@ _PROOF_CYCLES: Final = 100
 _PROOF_STEP_DEG: Final = 0.9
 
 
-class AnyLoops(Protocol):
-    """`Loops`, compiled or not."""
+class AnyAxis(Protocol):
+    """`Axis`, compiled or not."""
 
-    def power_on(self, slow: Slow) -> float: ...
-    def begin_demand(self, demand_deg: float) -> None: ...
+    def drive(
+        self,
+        start_counts: float,
+        end_counts: float,
+        substeps: int,
+        limit_nm: float,
+        noise_deg: float,
+        outer_nm: float,
+    ) -> Told: ...
+    def roll(
+        self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
+    ) -> Told: ...
     def hold(self, torque_nm: float) -> None: ...
-    def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen: ...
-    def coast(self, brake_nm: float, substeps: int, slow: Slow) -> Seen: ...
 
 
 @runtime_checkable
-class EvenLoops(AnyLoops, Protocol):
-    """`Loops` that go through many cycles by themselves; see `compiled.CompiledLoops`."""
+class EvenAxis(AnyAxis, Protocol):
+    """`Axis` that goes through many cycles by itself; see `compiled.CompiledAxis`."""
 
-    def follow_all(
+    def drive_all(
         self,
-        demand_deg: FloatArray,
-        demand_deg_s: FloatArray,
+        counts: FloatArray,
         substeps: IntArray,
-        heat: Heat,
         limit_nm: float,
+        noise_deg: FloatArray,
         outer_nm: FloatArray,
         held_nm: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]: ...
+        told: FloatArray,
+    ) -> Told: ...
 
 
 class _Waiting:
@@ -73,39 +79,37 @@ class _Waiting:
 waiting: Final = _Waiting()
 
 
-def compiled_loops(loops: Loops) -> AnyLoops:
-    """The loops, compiled from the state in which they are; as they were where that is not possible."""
+def compiled_axis(axis: Axis) -> AnyAxis:
+    """The axis, compiled from the state in which it is; as it was where that is not possible."""
     if os.environ.get(SWITCH) == "0" or importlib.util.find_spec("numba") is None:
-        return loops
+        return axis
     from hdbridge.sim import compiled  # noqa: PLC0415 - takes half a second, and the extra
 
     try:
-        made = compiled.CompiledLoops(loops)
+        made = compiled.CompiledAxis(axis)
     except compiled.Uncompilable:
-        return loops
-    plant = type(loops.plant)
+        return axis
+    plant = type(axis.loops.plant)
     if plant not in _agreeing:
-        _agreeing[plant] = _agree(copy.deepcopy(loops))
-    return made if _agreeing[plant] else loops
+        _agreeing[plant] = _agree(copy.deepcopy(axis))
+    return made if _agreeing[plant] else axis
 
 
 _agreeing: Final[dict[type[Plant], bool]] = {}
-"""Whether, on this machine, Python and the compiled loops agree bit for bit; tried once for each plant."""
+"""Whether, on this machine, Python and the compiled axis agree bit for bit; tried once for each plant."""
 
 
-def _agree(loops: Loops) -> bool:
+def _agree(axis: Axis) -> bool:
     """Move back and forth with both, and compare all that they say."""
     from hdbridge.sim import compiled  # noqa: PLC0415
 
-    other = compiled.CompiledLoops(loops)
-    slow = (loops.plant.now.temperature_c, 1.0, loops.servo.limit_nm, 0.0, 0.0)
-    place_deg = loops.power_on(slow)
-    if other.power_on(slow) != place_deg:
-        return False
+    other = compiled.CompiledAxis(axis)
+    limit_nm, place = axis.loops.servo.limit_nm, axis.at_first()[0]
     for cycle in range(_PROOF_CYCLES):
         step_deg = _PROOF_STEP_DEG if cycle < _PROOF_CYCLES // 2 else -_PROOF_STEP_DEG
-        speed_deg_s = step_deg / (8 * loops.dt_s)
-        if loops.follow(place_deg, speed_deg_s, 8, slow) != other.follow(place_deg, speed_deg_s, 8, slow):
+        step = step_deg * axis.motor_counts_per_deg
+        ours = axis.drive(place, place + step, 8, limit_nm, 0.0, 0.0)
+        if ours != other.drive(place, place + step, 8, limit_nm, 0.0, 0.0):
             return False
-        place_deg += step_deg
+        place += step
     return True

@@ -1,4 +1,4 @@
-"""The compiled loops say what those in Python say, bit for bit, whatever the truth file says."""
+"""The compiled axis says what the one in Python says, bit for bit, whatever the truth file says."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hdbridge.drive.drive import Drive
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim import fast
 from hdbridge.sim.lockstep import simulated_bench
-from hdbridge.sim.loops import Loops
+from hdbridge.sim.axis import Axis
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
@@ -202,8 +202,8 @@ def led(machine: Machine, seed: int, cycles: int = 150) -> list[tuple[Any, ...]]
 def test_compiled_and_python_agree_bit_for_bit(known: Truth, seed: int) -> None:
     ours, theirs = Machine(known, seed), Machine(known, seed, may_compile=True)
     assert led(ours, seed) == led(theirs, seed)
-    assert isinstance(ours._loops, Loops)
-    assert isinstance(theirs._loops, compiled.CompiledLoops)
+    assert isinstance(ours._axis, Axis)
+    assert isinstance(theirs._axis, compiled.CompiledAxis)
 
 
 def test_a_motor_that_is_held_by_a_torque_sets_out_from_it_compiled_or_not() -> None:
@@ -231,15 +231,15 @@ def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: py
         ):
             drive.boot()
             columns = Bench(drive).run(Stepping(count=3)).record.columns
-            loops.append(node.firmware.motion.machine._loops)  # type: ignore[attr-defined]
+            axes.append(node.firmware.motion.machine._axis)  # type: ignore[attr-defined]
             return dict(columns)
 
-    loops: list[object] = []
+    axes: list[object] = []
     monkeypatch.setattr(fast.waiting, "left", 10**9)
     before = record()
     monkeypatch.setattr(fast.waiting, "left", 4000)
     after = record()
-    assert [type(each) for each in loops] == [Loops, compiled.CompiledLoops]
+    assert [type(each) for each in axes] == [Axis, compiled.CompiledAxis]
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
@@ -247,25 +247,25 @@ def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: py
 def test_what_cannot_be_compiled_stays_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
     seat = truth({"gear__seat": {"slip_arcsec": 5.0, "travel_deg": 200.0}})
     with pytest.raises(compiled.Uncompilable, match="Seat"):
-        compiled.CompiledLoops(Loops(seat))
-    loops = Loops(seat)
-    assert fast.compiled_loops(loops) is loops
+        compiled.CompiledAxis(Axis(seat))
+    axis = Axis(seat)
+    assert fast.compiled_axis(axis) is axis
     monkeypatch.setenv(fast.SWITCH, "0")
     assert led(Machine(seat, 1, may_compile=True), 1, 20) == led(Machine(seat, 1), 1, 20)
-    loops = Loops(truth({}))
-    assert fast.compiled_loops(loops) is loops
+    axis = Axis(truth({}))
+    assert fast.compiled_axis(axis) is axis
 
 
 def test_a_machine_on_which_they_do_not_agree_stays_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Wrong(compiled.CompiledLoops):  # type: ignore[misc]
-        def follow(self, *arguments: Any) -> Any:
-            first, *rest = super().follow(*arguments)
+    class Wrong(compiled.CompiledAxis):  # type: ignore[misc]
+        def drive(self, *arguments: Any) -> Any:
+            first, *rest = super().drive(*arguments)
             return (np.nextafter(first, 1e9), *rest)
 
-    loops = Loops(truth({}))
+    axis = Axis(truth({}))
     monkeypatch.setattr(fast, "_agreeing", {})
-    monkeypatch.setattr(compiled, "CompiledLoops", Wrong)
-    assert fast.compiled_loops(loops) is loops
+    monkeypatch.setattr(compiled, "CompiledAxis", Wrong)
+    assert fast.compiled_axis(axis) is axis
 
 
 def test_every_state_of_the_simulation_is_known_to_the_compiler() -> None:

@@ -39,7 +39,7 @@ for dead_time_ms in map(float, sys.argv[2:]):
             machine.follow(place, place + step, 8)
             place += step
             told.append((machine.motor_counts, machine.load_counts, machine.torque_nm))
-        print(type(machine._loops).__name__)
+        print(type(machine._axis).__name__)
     print(told[:200] == told[200:])
 """
 
@@ -70,4 +70,4 @@ def test_layouts_that_two_processes_compiled_run_side_by_side_in_a_third(tmp_pat
     """A dead time of 11 ms takes more room than one of 1 ms."""
     for dead_times in ([1.0], [11.0], [1.0, 11.0, 1.0], [11.0, 1.0]):
         told = said(MOVE, ARTICLE, *dead_times, NUMBA_CACHE_DIR=str(tmp_path), HDBRIDGE_COMPILE="1")
-        assert told == ["CompiledLoops", "Loops", "True"] * len(dead_times)
+        assert told == ["CompiledAxis", "Axis", "True"] * len(dead_times)

@@ -1,0 +1,168 @@
+"""The axis from control cycle to control cycle: the loops, the heat, and what the encoders read at its end.
+
+Everything that `hdbridge.sim.machine` does in a cycle but for chance: so it can be compiled as a whole, and
+one call leads it through a cycle.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.sim.encoder import FixedErrors, Losses
+from hdbridge.sim.heat import Heat
+from hdbridge.sim.loops import Loops, Seen, Slow
+from hdbridge.sim.state import state
+from hdbridge.sim.truth import Truth
+from hdbridge.units import DEG_PER_TURN
+
+Told = tuple[float, float, float, int, float, float, int, int, float, float, float, float, float]
+"""The motor's and the load's encoder in counts, before they are rounded; the motor's torque (Nm), and in
+thousandths of the rated one; the temperature; the torque on the load (Nm); both encoders in whole counts; the
+motor's speed as the drive measures it (counts/s); the time since the axis was switched on; the angles of the
+motor, the load and the gear's output themselves (deg)."""
+
+
+@state
+class Axis:
+    """A servo axis; it begins at rest at the angle zero, its power stage off."""
+
+    heat: Heat
+    loops: Loops
+    motor_counts_per_deg: float
+    _hold_counts: float
+    _hold_deg: float
+    _holds: bool
+    """The demand rests where the loops were switched on."""
+    _load_counts_per_deg: float
+    _load_errors: FixedErrors
+    _load_losses: Losses
+    _load_zero: float
+    _motor_errors: FixedErrors
+    _motor_losses: Losses
+    _motor_sense: float
+    _motor_zero: float
+    _powered: bool
+    _rated_nm: float
+    _sense_permille: float
+    _torque_sense: float
+
+    def __init__(self, truth: Truth, *, loaded: bool = False) -> None:
+        """``loaded``: there may be a torque on the load from outside."""
+        motor, load = truth.motor.encoder, truth.load_.encoder
+        self.loops = Loops(truth, loaded=loaded)
+        self.heat = Heat(truth)
+        self._powered = self._holds = False
+        self._hold_counts = self._hold_deg = 0.0
+        self.motor_counts_per_deg = motor.direction * motor.counts_per_turn / DEG_PER_TURN
+        self._motor_zero = float(motor.zero_counts)
+        self._motor_errors, self._motor_losses = FixedErrors(motor), Losses(motor.losses)
+        self._load_counts_per_deg = load.direction * load.counts_per_turn / DEG_PER_TURN
+        self._load_zero = float(load.zero_counts)
+        self._load_errors, self._load_losses = FixedErrors(load), Losses(load.losses)
+        self._rated_nm = truth.motor.rated_torque_nm
+        self._motor_sense = float(motor.direction)
+        self._sense_permille = 1000.0 * motor.direction
+        self._torque_sense = float(truth.load_.torque_sense)
+
+    def at_first(self) -> Told:
+        """What there is to know before anything has happened."""
+        return self._told(self.loops.seen(), 0.0, 0.0, 0.0)
+
+    def drive(
+        self,
+        start_counts: float,
+        end_counts: float,
+        substeps: int,
+        limit_nm: float,
+        noise_deg: float,
+        outer_nm: float,
+    ) -> Told:
+        """Closed loop: the demand moves evenly from start to end, in motor counts, at most with a torque.
+
+        ``noise_deg`` is what the load encoder reads too much at the end, ``outer_nm`` the torque on the load
+        from outside.
+        """
+        loops, per_deg = self.loops, self.motor_counts_per_deg
+        slow = self._slow(limit_nm, outer_nm)
+        demand_deg = (start_counts - self._motor_zero) / per_deg
+        elapsed_s = substeps * loops.dt_s
+        speed_deg_s = (end_counts - start_counts) / per_deg / elapsed_s
+        engaged = not self._powered
+        if engaged:
+            self._powered = True
+            self._hold_deg = loops.power_on(slow)
+            self._hold_counts = start_counts
+            self._holds = abs(self._motor_reading(loops.plant.now.motor_deg) - start_counts) <= 1.0
+        if self._holds:
+            if start_counts == self._hold_counts and end_counts == self._hold_counts:
+                demand_deg = self._hold_deg
+            else:
+                self._holds = False
+        if engaged:
+            loops.begin_demand(demand_deg)
+        seen = loops.follow(demand_deg, speed_deg_s, substeps, slow)
+        return self._told(seen, elapsed_s, noise_deg, outer_nm)
+
+    def roll(
+        self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
+    ) -> Told:
+        """Power stage off: friction, and the brake, slow the motor and hold it."""
+        self._powered = False
+        seen = self.loops.coast(brake_nm, substeps, self._slow(limit_nm, outer_nm))
+        return self._told(seen, substeps * self.loops.dt_s, noise_deg, outer_nm)
+
+    def hold(self, torque_nm: float) -> None:
+        """At rest: the loops have come to hold the axis by this torque."""
+        self.loops.hold(torque_nm)
+
+    def _slow(self, limit_nm: float, outer_nm: float) -> Slow:
+        """What the loops have to know for the next cycle."""
+        return self.heat.body_c, self.heat.rub, limit_nm, self._lost_deg(), outer_nm
+
+    def _told(self, seen: Seen, elapsed_s: float, noise_deg: float, outer_nm: float) -> Told:
+        """What the drive measures at the end of a cycle of which the loops say this."""
+        (
+            motor_deg,
+            sampled_motor_deg,
+            load_deg,
+            sampled_load_deg,
+            body_deg,
+            output_deg,
+            measured_deg_s,
+            weight_nm,
+            torque_nm,
+            torque_squares,
+            friction_j,
+        ) = seen
+        heat = self.heat
+        if elapsed_s > 0.0:
+            heat.warm(torque_squares, friction_j, elapsed_s)
+        motor_reading = self._motor_reading(sampled_motor_deg)
+        read_deg = sampled_load_deg + self._load_errors.at_deg(sampled_load_deg) + body_deg + noise_deg
+        load_reading = read_deg * self._load_counts_per_deg + self._load_zero
+        load_reading += self._load_losses.counts(heat.since_s)
+        return (
+            motor_reading,
+            load_reading,
+            self._motor_sense * torque_nm,
+            round(self._sense_permille * torque_nm / self._rated_nm),
+            heat.body_c,
+            self._torque_sense * (weight_nm + outer_nm),
+            # Multi-turn, never wrapped. A count's middle is its angle.
+            math.floor(motor_reading + 0.5),
+            math.floor(load_reading + 0.5),
+            measured_deg_s * self.motor_counts_per_deg,
+            heat.since_s,
+            motor_deg,
+            load_deg,
+            output_deg,
+        )
+
+    def _motor_reading(self, motor_deg: float) -> float:
+        """The motor encoder at an angle, before it is rounded."""
+        read_deg = motor_deg + self._motor_errors.at_deg(motor_deg) + self._lost_deg()
+        return read_deg * self.motor_counts_per_deg + self._motor_zero
+
+    def _lost_deg(self) -> float:
+        """What the motor encoder has lost."""
+        return self._motor_losses.counts(self.heat.since_s) / self.motor_counts_per_deg
