@@ -100,7 +100,8 @@ class CompiledAxis:
         plant: Any = type(axis.loops.plant)
         self._record = np.zeros(1, _layout_of(plant, _room(axis)))
         _fill(self._record[0], axis)
-        self._methods = _methods()
+        self._kind: Any = numba.typeof(self._record)  # type: ignore[no-untyped-call]
+        self._drive = _entry_point("drive", self._kind)
 
     def drive(
         self,
@@ -112,9 +113,10 @@ class CompiledAxis:
         outer_nm: float,
     ) -> Told:
         """See `Axis`."""
-        return self._methods.drive(
+        told: Told = self._drive(
             self._record, start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm
         )
+        return told
 
     def drive_all(
         self,
@@ -131,31 +133,41 @@ class CompiledAxis:
 
         ``held_nm`` is the torque by which the loops hold the axis before each cycle, or NaN.
         """
-        return self._methods.drive_all(
+        last: Told = _methods()["drive_all"](
             self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
         )
+        return last
 
     def roll(
         self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
     ) -> Told:
         """See `Axis`."""
-        return self._methods.roll(self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm)
+        told: Told = _entry_point("roll", self._kind)(
+            self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm
+        )
+        return told
 
     def hold(self, torque_nm: float) -> None:
         """See `Axis`."""
-        self._methods.hold(self._record, torque_nm)
-
-
-class _Methods(NamedTuple):
-    drive: Callable[..., Told]
-    drive_all: Callable[..., Told]
-    roll: Callable[..., Told]
-    hold: Callable[..., None]
+        _entry_point("hold", self._kind)(self._record, torque_nm)
 
 
 @cache
-def _methods() -> _Methods:
-    """The compiled methods; kept on disk by numba, for the sources as they are now."""
+def _entry_point(name: str, record: Any) -> Callable[..., Any]:
+    """A compiled method of `Axis` for such a record.
+
+    It takes its numbers as they come, whole ones too, where numba's dispatcher would look at the type of each
+    in each call, and compile once more for one that is whole.
+    """
+    *hints, _ = get_type_hints(getattr(Axis, name)).values()
+    numbers = [types.float64 if hint is float else types.int64 for hint in hints]
+    entry_point: Callable[..., Any] = _methods()[name].compile((record, *numbers))
+    return entry_point
+
+
+@cache
+def _methods() -> dict[str, Any]:
+    """Numba's dispatchers of the methods; kept on disk by numba, for the sources as they are now."""
     _register()
     version = _version()
 
@@ -203,7 +215,7 @@ def _methods() -> _Methods:
         axis[0].hold(torque_nm)
 
     compiled = numba.njit(cache=True, fastmath=False)
-    return _Methods(*(compiled(each) for each in (drive, drive_all, roll, hold)))
+    return {each.__name__: compiled(each) for each in (drive, drive_all, roll, hold)}
 
 
 def _version() -> int:
@@ -278,8 +290,6 @@ def _fill(record: Any, value: Any) -> None:
                 raise Uncompilable(f"{len(each)} of {name}")
             for place, entry in zip(record[name], each, strict=False):
                 _fill_union(place, get_args(hint)[0], entry)
-        elif hint == tuple[complex, ...]:
-            record[name][len(record[name]) - len(each) :] = each  # Horner's rule: nothing comes first
         elif get_origin(hint) in {tuple, list}:
             record[name][: len(each)] = each
         elif hint in _NUMBERS:

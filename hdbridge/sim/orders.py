@@ -15,6 +15,7 @@ class Orders:
     """``sum of amplitude cos(order angle + phase)`` as a function of an angle."""
 
     _coefficients: tuple[complex, ...]
+    _count: int
 
     def __init__(self, orders: Iterable[TrueOrder]) -> None:
         terms = {
@@ -22,11 +23,12 @@ class Orders:
         }
         # Highest order first, as Horner's rule takes them; the last one, order 0, is always zero.
         self._coefficients = tuple(terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1))
+        self._count = len(self._coefficients)
 
     def at(self, angle_rad: float) -> float:
         """The sum in arcsec."""
         turn = complex(math.cos(angle_rad), math.sin(angle_rad))
         total = 0j
-        for coefficient in self._coefficients:
-            total = (total + coefficient) * turn
+        for place in range(self._count):
+            total = (total + self._coefficients[place]) * turn
         return total.real

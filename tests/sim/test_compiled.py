@@ -17,8 +17,8 @@ from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim import fast
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.axis import Axis
+from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
