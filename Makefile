@@ -49,7 +49,7 @@ UNIT    := $(BIN)/python -m pytest -q $(PLUGINS) -n $(WORKERS) --dist worksteal 
 unit: compiled   ## the tests on the virtual bus
 	$(UNIT) -m "not slow"
 
-# Compiling takes 10 s and more of a processor, rewriting the tests' assertions 5 s: in each of the workers, unless it is
+# Compiling takes some 20 s of a processor, rewriting the tests' assertions 5 s: in each of the workers, unless it is
 # done before they begin.
 compiled: $(READY)
 	@$(BIN)/python tools/compile_simulation.py

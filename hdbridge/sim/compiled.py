@@ -15,7 +15,7 @@ import hashlib
 import inspect
 import math
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -98,10 +98,11 @@ class CompiledAxis:
         if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
         plant: Any = type(axis.loops.plant)
-        self._record = np.zeros(1, _layout_of(plant, _room(axis)))
+        room = _room(axis)
+        self._record = np.zeros(1, _layout_of(plant, room))
         _fill(self._record[0], axis)
-        self._kind: Any = numba.typeof(self._record)  # type: ignore[no-untyped-call]
-        self._drive = _entry_point("drive", self._kind)
+        self._entry_point = partial(_entry_point, plant, room)
+        self._drive = self._entry_point("drive")
 
     def drive(
         self,
@@ -142,26 +143,27 @@ class CompiledAxis:
         self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
     ) -> Told:
         """See `Axis`."""
-        told: Told = _entry_point("roll", self._kind)(
+        told: Told = self._entry_point("roll")(
             self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm
         )
         return told
 
     def hold(self, torque_nm: float) -> None:
         """See `Axis`."""
-        _entry_point("hold", self._kind)(self._record, torque_nm)
+        self._entry_point("hold")(self._record, torque_nm)
 
 
 @cache
-def _entry_point(name: str, record: Any) -> Callable[..., Any]:
-    """A compiled method of `Axis` for such a record.
+def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
+    """A compiled method of an `Axis` with this plant.
 
     It takes its numbers as they come, whole ones too, where numba's dispatcher would look at the type of each
     in each call, and compile once more for one that is whole.
     """
     *hints, _ = get_type_hints(getattr(Axis, name)).values()
     numbers = [types.float64 if hint is float else types.int64 for hint in hints]
-    entry_point: Callable[..., Any] = _methods()[name].compile((record, *numbers))
+    axis = types.Array(numba.from_dtype(_layout_of(plant, room)), 1, "C")
+    entry_point: Callable[..., Any] = _methods()[name].compile((axis, *numbers))
     return entry_point
 
 
@@ -318,7 +320,7 @@ _UNIONS: Final[dict[Any, Any]] = {}
 def _register() -> None:
     """Tell numba the methods of all classes, and what to call the code that it makes of them."""
     types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]
-    # Each pass of numba's compiler writes the types down: their names, which it has, not what is in them anew.
+    # Each pass of numba's compiler writes its types down: by the names that they have, not made anew each time.
     types.Record.__repr__ = types.Type.__repr__  # type: ignore[method-assign]
     declared = {name for cls in STATES for name in _attributes(cls)}
     for cls in STATES:

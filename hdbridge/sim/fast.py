@@ -1,6 +1,6 @@
 """When the simulated axis is compiled: where numba is installed, and once that pays.
 
-numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling ten more the first
+numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling twelve more the first
 time on a machine; what is compiled is kept on disk. So a process begins in Python and goes on with the
 compiled axis after so many steps of the mechanics as would have paid for it; the numbers are the same.
 """
