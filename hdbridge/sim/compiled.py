@@ -320,7 +320,7 @@ _UNIONS: Final[dict[Any, Any]] = {}
 def _register() -> None:
     """Tell numba the methods of all classes, and what to call the code that it makes of them."""
     types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]
-    # Each pass of numba's compiler writes its types down: by the names that they have, not made anew each time.
+    # Each pass of numba's compiler writes types down: by their names, not by what is in them, made anew.
     types.Record.__repr__ = types.Type.__repr__  # type: ignore[method-assign]
     declared = {name for cls in STATES for name in _attributes(cls)}
     for cls in STATES:
