@@ -22,7 +22,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.commands import Commands, commands_of, legs_of
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.twin.replay import run
-from hdbridge.twin.rests import RINGING_S, STANDS_COUNTS, held_rows, stands, unknown_rows
+from hdbridge.twin.rests import RINGING_S, STANDS_COUNTS, begins_in_motion, held_rows, stands, unknown_rows
 from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -187,7 +187,7 @@ def residuals(data: Data, truth: Truth, seed: Seed = None) -> dict[str, FloatArr
             off = piece.measured[name] - shown[name]
             if name == FOLLOWING and piece.rest.any():
                 rest = piece.rest > 0.0
-                if abs(np.median(piece.measured[name][rest])) > step_deg:
+                if abs(np.median(piece.measured[name][rest])) > STANDS_COUNTS * step_deg:
                     off = off - np.median(off[rest])
             found[name].append(off * piece.counts[name])
     found[LOAD] = _not_taken_along(data, found[FOLLOWING], found[LOAD])
@@ -278,7 +278,8 @@ def _piece(
     assert target is not None  # commands_of has refused it
     moved = np.abs(np.diff(target, prepend=target[0]))
     travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
-    last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, -np.inf))
+    before_s = part.time_s[0] if begins_in_motion(part) else -np.inf
+    last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, before_s))
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
     elastic = unknown | (np.cumsum(travelled) < forgets_deg)

@@ -49,6 +49,13 @@ def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) 
     return np.flatnonzero(told)
 
 
+def begins_in_motion(part: Record) -> bool:
+    """Whether the command moves before it has stood long enough for the axis to rest."""
+    target, time_s = part.motor_target_deg, part.time_s
+    assert target is not None  # commands_of has refused it
+    return bool(np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0))
+
+
 def unknown_rows(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:
     """For each row whether the load may still ring of what nobody knows.
 
@@ -57,9 +64,7 @@ def unknown_rows(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:
     """
     target, time_s = part.motor_target_deg, part.time_s
     assert target is not None  # commands_of has refused it
-    begins = []
-    if np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0):
-        begins.append(0)
+    begins = [0] if begins_in_motion(part) else []
     count_deg = 360.0 / counts_per_turn
     begins += [
         first

@@ -28,6 +28,7 @@ DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
 TRUTH = Truth.load(DEMO)
 ZERO_COUNTS = 45
+COUNT_DEG = 360.0 / 8000
 
 
 def moves(bench: Exercise) -> None:
@@ -43,10 +44,10 @@ def recorded() -> Recording:
     return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
 
 
-def told_by_another_zero() -> Recording:
+def told_by_another_zero(counts: int = ZERO_COUNTS) -> Recording:
     """The command as a controller tells it whose zero is not the drive's."""
     columns = dict(recorded().record.columns)
-    columns["motor_target_deg"] = columns["motor_target_deg"] + ZERO_COUNTS * 360.0 / 8000
+    columns["motor_target_deg"] = columns["motor_target_deg"] + counts * COUNT_DEG
     return Recording(Record(columns), axis="demo", ratio=50.0)
 
 
@@ -58,6 +59,13 @@ def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
 
 def test_another_zero_of_the_command_is_no_following_error() -> None:
     assert left(TRUTH, told_by_another_zero())[FOLLOWING] == pytest.approx(left(TRUTH)[FOLLOWING], rel=0.05)
+
+
+def test_a_count_is_no_other_zero() -> None:
+    """A motor may rest so far from its command; in motion it is a following error like any other."""
+    data = prepare(told_by_another_zero(1), AXIS, TRUTH)
+    counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
+    assert np.median(residuals(data, TRUTH)[FOLLOWING][counts]) == pytest.approx(COUNT_DEG, rel=0.3)
 
 
 def test_nor_is_it_in_a_comparison() -> None:

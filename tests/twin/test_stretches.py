@@ -50,3 +50,10 @@ def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
     assert taken.duration_s <= 40.0
     assert {"sweep", "step"} <= set(taken.kinds)
     assert data.duration_s > 130.0
+
+
+def test_a_stretch_that_begins_in_motion_does_not_rest_in_its_first_row() -> None:
+    """This axis never stands; the zero of a command is told by where it does."""
+    data = prepare(recorded(), AxisConfig.load(DEMO), Truth.load(DEMO))
+    assert len(data.pieces) > 5
+    assert not any(each.rest.any() for each in data.pieces)
