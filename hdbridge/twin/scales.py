@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hdbridge.effects import FloatArray
+from hdbridge.sim.truth import Truth
 from hdbridge.twin.likelihood import deviation
 from hdbridge.twin.misfit import CHANNELS, Data, beyond, counted, rounding
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.units import ARCSEC_PER_DEG
 
 MAD_TO_SIGMA = 1.4826
+MOST_ANSWERED = 1.5
+"""Of a speed, the largest share that a velocity loop makes up for within a step: at two it is unstable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +79,25 @@ def _least(data: Data) -> dict[str, float]:
     truth = data.base
     encoder = truth.motor.encoder
     fine_deg = 360.0 / (encoder.counts_per_turn * encoder.interpolation)
-    shaken = truth.servo.velocity_gain_nm_s_per_rad * np.radians(fine_deg) / truth.substep_s
     return {
         FOLLOWING: fine_deg,
-        TORQUE: float(shaken) / 12.0**0.5,
+        TORQUE: _shaken_nm(truth, math.radians(fine_deg)) / 12.0**0.5,
         LOAD: float(
             np.hypot(truth.load_.encoder.noise_arcsec, fine_deg * ARCSEC_PER_DEG / data.axis.gear.ratio)
         ),
     }
+
+
+def _shaken_nm(truth: Truth, off_rad: float) -> float:
+    """Torque, rms, that the velocity loop makes of readings that are off by so much, rms, each on its own.
+
+    Speed is their difference by the step, and the motor answers within the next: from reading to torque
+    the loop is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J, of which this is the norm.
+    """
+    gain, step_s = truth.servo.velocity_gain_nm_s_per_rad, truth.substep_s
+    share = min(gain * step_s / truth.motor.inertia_kg_m2, MOST_ANSWERED)
+    norm = math.sqrt(1.0 + (1.0 + share) ** 2 + share**3 / (2.0 - share))
+    return gain * off_rad / step_s * norm
 
 
 def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = None) -> Scales:

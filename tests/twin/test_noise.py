@@ -14,7 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import CHANNELS, Data, prepare
+from hdbridge.twin.misfit import CHANNELS, Data, demand_deg, prepare, traces_of
 from hdbridge.twin.naming import unexplained
 from hdbridge.twin.noise import noise_in_motion
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
@@ -51,6 +51,16 @@ def noisy(where: str) -> Data:
         }
         pieces.append(replace(piece, measured=measured))
     return replace(recorded(), pieces=tuple(pieces))
+
+
+def test_the_steps_of_a_drives_encoder_shake_its_torque_by_as_much_as_is_expected() -> None:
+    """Of a replay with them and a smooth one; 34 % more than by the gain alone, for the motor answers."""
+    data = recorded()
+    (piece,), (even,), (steps,) = data.pieces, traces_of(data, data.base), traces_of(data, data.base, "loops")
+    moves = np.abs(np.gradient(demand_deg(piece.commands, data.axis))) > 0.5
+    assert float(np.std((steps[TORQUE] - even[TORQUE])[moves])) == pytest.approx(
+        noise_floor(data)[TORQUE], rel=0.1
+    )
 
 
 def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
