@@ -139,8 +139,8 @@ def _learned(
         axis.name,
         twin.before,
         twin.after,
-        learned=_values(begun.truth, twin.truth),
-        named=_named(twin),
+        learned=_values(begun.truth, twin.truth) if gain.better else (),
+        named=_named(twin) if gain.better else _left(twin),
         translated=begun.rows,
         facts=facts,
         verdict=f"the twin is {'kept as pending' if gain.better else 'not kept'}: {gain.text}",
@@ -171,7 +171,14 @@ def _named(twin: Twin) -> list[Named]:
         Named("not told apart", f"{', '.join(each.names)}; {'; '.join(each.moves)} would tell")
         for each in twin.alike
     ]
-    named += [
+    return [*named, *_left(twin)]
+
+
+def _left(twin: Twin) -> list[Named]:
+    """What is left. Of a twin that is no better than what it began with that is all that can be told."""
+    from hdbridge.report.twin import Named
+
+    return [
         Named(
             "unexplained",
             f"{each.channel} is left with {each.times_noise:.3g} times its noise, most of it in legs of the "
@@ -179,7 +186,6 @@ def _named(twin: Twin) -> list[Named]:
         )
         for each in twin.unexplained
     ]
-    return named
 
 
 def _check(

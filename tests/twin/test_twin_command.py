@@ -189,9 +189,15 @@ def test_a_twin_that_is_no_better_is_not_kept(
     profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(profile)))
-    done = run_here(profile, "twin", profile, recording)
+    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
     assert done.returncode == 0, done.stderr
     assert "not kept" in done.stdout
+    assert "Coulomb friction" not in done.stdout, "nothing is known of it"
+    assert "unexplained: motor torque" in done.stdout
+    told = json.loads((profile / "told.json").read_text())
+    assert [each["cause"] for each in told["findings"]] == ["unexplained"]
+    assert told["parameters"] == []
+    assert "What the plant is" not in (profile / "page.html").read_text()
     assert not (profile / "pending-twin.yaml").exists()
 
 
