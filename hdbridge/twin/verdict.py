@@ -40,9 +40,9 @@ def better(before: Comparison, after: Comparison) -> Gain:
         for name, (was, now) in pairs.items()
         if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
     ]
+    # What is noise is in both differences. What they are less than is none: rounding, a jerk.
     ratios = [
-        math.log(max(now.difference, now.noise, 1e-12) / max(was.difference, was.noise, 1e-12))
-        for was, now in pairs.values()
+        math.log(max(now.difference, 1e-12) / max(was.difference, 1e-12)) for was, now in pairs.values()
     ]
     gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
     if worse:
