@@ -139,6 +139,7 @@ def draw(seed: int) -> tuple[AxisConfig, Truth]:
     while _gain_margin(truth) < GAIN_MARGIN:
         for name in ("position_gain_per_s", "velocity_gain_nm_s_per_rad", "integral_time_ms"):
             servo[name] = usual_servo[name] * some()
+    servo["load_feedforward"]["frequency_hz"] *= some()
     needed_ms = 2.0 * servo["command_filter_ms"] + servo["dead_time_ms"]
     window_deg = WINDOWS * 1e-3 * needed_ms * axis.limits.velocity_deg_s * ratio
     drive = axis.drive.model_copy(

@@ -121,6 +121,10 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
     ),
     Parameter(
+        "load feed-forward frequency", ("servo", "load_feedforward", "frequency_hz"), "Hz", 1.0, 500.0, 0.7,
+        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
+    ),
+    Parameter(
         "viscous feed-forward", ("servo", "viscous_feedforward_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7,
         FEEDFORWARD, (FOLLOWING,), _SPEEDS, 0.50,
     ),
