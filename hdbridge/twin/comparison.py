@@ -18,6 +18,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
+from hdbridge.twin.rests import STANDS_COUNTS, stands, unknown_rows
 from hdbridge.twin.settling import band_arcsec, overshoot_arcsec, scatter_s, settling_s
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -150,8 +151,9 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     """The figures, by kind of leg and over all, with traces and spectra.
 
     Both records have the same rows. What the two encoders' zeros are apart is taken off in each part of the
-    measured record, and so is by what command and motor are apart wherever it rests: zeros, too. InputError
-    where the rows do not agree, or there is no command.
+    measured record, and so is by what command and motor are apart wherever it rests: zeros, too. Rows where
+    the load may still ring of what nobody knows are in no figure, nor is the torque of a motor that stands.
+    InputError where the rows do not agree, or there is no command.
     """
     if len(measured) != len(simulated):
         raise InputError(
@@ -174,12 +176,15 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
             apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
             twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
-    groups = _groups(measured.time_s, legs)
+    count_deg = _step(measured.motor_position_deg, parts)
+    groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
+    goes = ~_stands(measured, parts, count_deg)
     rows = [
         row
         for kind, inside in groups.items()
         for name in shared
-        for row in _of_signal(name, kind, inside, (inside & calm, inside & moves), real, twin, parts)
+        for compared in (inside & goes if name == MOTOR_TORQUE else inside,)
+        for row in _of_signal(name, kind, compared, (inside & calm, inside & moves), real, twin, parts)
     ]
     stops = list(_stops(real, twin, parts))
     for kind, inside in groups.items():
@@ -202,12 +207,12 @@ def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> _Signals:
     return _Signals(record.time_s, command, record.load_position_deg * ARCSEC_PER_DEG, by_name)
 
 
-def _groups(time_s: FloatArray, legs: Sequence[Segment]) -> dict[str, Rows]:
-    """Which rows belong to each kind of leg; the whole record first."""
-    groups = {ALL: np.ones(len(time_s), dtype=np.bool_)}
+def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[str, Rows]:
+    """Which of the known rows belong to each kind of leg; the whole record first."""
+    groups = {ALL: known}
     for leg in legs:
         inside = groups.setdefault(leg.kind, np.zeros(len(time_s), dtype=np.bool_))
-        inside |= (time_s >= leg.start_s) & (time_s <= leg.end_s)
+        inside |= known & (time_s >= leg.start_s) & (time_s <= leg.end_s)
     return {kind: inside for kind, inside in groups.items() if np.count_nonzero(inside) >= LEAST_SAMPLES}
 
 
@@ -244,17 +249,10 @@ def _of_signal(
 ) -> Iterator[Row]:
     one, other = real.by_name[name], twin.by_name[name]
     unit = UNITS[name]
-    noise = noise_of(one, inside, parts)
-    yield Row(
-        name,
-        kind,
-        unit,
-        _rms(one[inside]),
-        _rms(other[inside]),
-        _rms(one[inside] - other[inside]),
-        noise,
-        int(np.count_nonzero(inside)),
-    )
+    if count := int(np.count_nonzero(inside)):
+        apart = _rms(one[inside] - other[inside])
+        noise = noise_of(one, inside, parts)
+        yield Row(name, kind, unit, _rms(one[inside]), _rms(other[inside]), apart, noise, count)
     for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
         count = int(np.count_nonzero(which))
         if count < LEAST_SAMPLES:
@@ -283,6 +281,26 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
         count += float(np.count_nonzero(whole))
     spread = math.sqrt(squares / count / 20.0) if count else 0.0
     return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
+
+
+def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
+    """Whether the motor stands: by what torque hangs on a thousandth of a count."""
+    target, motor = measured.motor_target_deg, measured.motor_position_deg
+    assert target is not None
+    still = [
+        stands(
+            np.diff(target[part], prepend=target[part.start]) != 0.0, motor[part], STANDS_COUNTS * count_deg
+        )
+        for part in parts
+    ]
+    return np.concatenate(still)
+
+
+def _step(values: FloatArray, parts: Sequence[slice]) -> float:
+    """The least change of a reading."""
+    changes = np.abs(np.concatenate([np.diff(values[part]) for part in parts]))
+    least = 1e-9 * float(np.max(np.abs(values), initial=1.0))
+    return float(np.min(changes, where=changes > least, initial=math.inf))
 
 
 @dataclass(frozen=True, slots=True)

@@ -111,6 +111,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
     recording.record.check_ratio(axis.gear.ratio)
     record, legs, held = recording.record, legs_of(recording), held_out_legs(recording)
     begins = [whole.start for whole in continuous(record)]
+    unknown = unknown_rows(record, 360.0 / axis.motor_encoder.counts_per_turn)
     pieces = []
     first = 0
     for stretch in (each for part in record.parts() for each in stretches(part, legs)):
@@ -124,9 +125,10 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
         for each in held:
             out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
         judged = np.arange(led, end) >= first
-        unknown = unknown_rows(part, axis.motor_encoder.counts_per_turn)
         forgets_deg = UNKNOWN_DEG if remembers(base) else 0.0
-        pieces.append(_piece(part, commands, numbers, kinds, out, judged, unknown, forgets_deg, axis))
+        pieces.append(
+            _piece(part, commands, numbers, kinds, out, judged, unknown[led:end], forgets_deg, axis)
+        )
         first = end
     return Data(axis, base, tuple(pieces))
 

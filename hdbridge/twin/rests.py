@@ -6,11 +6,14 @@ thousandth of a count there sets out at another time. But the recording tells by
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
+from hdbridge.twin.stretches import RUN_IN_S, continuous
 
 RINGING_S = 0.25
 """So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
@@ -19,10 +22,8 @@ STANDS_COUNTS = 1.5
 stopped at, or creeps up while friction holds it: which of the two hangs on a thousandth of a count."""
 HELD_S = 0.1
 """A motor that stands so long after the command is held by the integral alone: loops answer in some ms."""
-UNKNOWN_S = 1.0
-"""Time after which a load that was ringing before a recording is at rest, where that is not known."""
 LARGEST_UNKNOWN = 0.25
-"""Of a part of a recording, the largest share that is left out for that."""
+"""Of a recording, the largest share that is left out because of what was before it."""
 
 
 def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
@@ -56,25 +57,25 @@ def begins_in_motion(part: Record) -> bool:
     return bool(np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0))
 
 
-def unknown_rows(part: Record, counts_per_turn: int) -> NDArray[np.bool_]:
-    """For each row whether the load may still ring of what nobody knows.
+def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
+    """For each row of a recording whether the load may still ring of what nobody knows.
 
-    Where a recording begins in motion that is what was before it; where a procedure ended in motion, the
-    cycles until the drive was switched off.
+    Where a recording begins in motion, or goes on so after a while, that is what was before. Where a
+    procedure ended in motion it is the cycles until the drive was switched off. ``count_deg`` is the motor's.
     """
-    target, time_s = part.motor_target_deg, part.time_s
-    assert target is not None  # commands_of has refused it
-    begins = [0] if begins_in_motion(part) else []
-    count_deg = 360.0 / counts_per_turn
-    begins += [
-        first
-        for first in part.starts[1:]
-        if abs(target[first] - target[first - 1]) > STANDS_COUNTS * count_deg
-    ]
-    unknown = np.zeros(len(part), dtype=np.bool_)
-    ends = (*part.starts[1:], len(part))
-    for begin in begins:
-        end = next(each for each in ends if each > begin)
-        length_s = min(UNKNOWN_S, LARGEST_UNKNOWN * float(time_s[end - 1] - time_s[begin]))
-        unknown[begin:end] = time_s[begin:end] - time_s[begin] < length_s
+    target, time_s = record.motor_target_deg, record.time_s
+    unknown = np.zeros(len(record), dtype=np.bool_)
+    if target is None:
+        return unknown
+    alone = {each.start for each in continuous(record)}
+    parts = []
+    for first, end in pairwise((*record.starts, len(record))):
+        jumps = first > 0 and abs(target[first] - target[first - 1]) > STANDS_COUNTS * count_deg
+        if jumps or (first in alone and begins_in_motion(record.rows(first, end))):
+            parts.append(slice(first, end))
+    rings_s = [min(RUN_IN_S, float(time_s[each][-1] - time_s[each][0])) for each in parts]
+    whole_s = sum(float(np.ptp(each.time_s)) for each in record.parts())
+    share = min(1.0, LARGEST_UNKNOWN * whole_s / max(sum(rings_s), 1e-9))
+    for part, length_s in zip(parts, rings_s, strict=True):
+        unknown[part] = time_s[part] - time_s[part.start] <= share * length_s
     return unknown

@@ -21,6 +21,7 @@ N = 50.0
 
 
 def steps_and_a_sweep(bench: Exercise) -> None:
+    bench.hold(0.3)
     for distance in (400.0, -250.0, 300.0, -450.0):
         bench.move(distance, 800.0, 40_000.0)
         bench.hold(0.6)
@@ -93,6 +94,22 @@ def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
     spectrum = comparison.spectra["load_error"]
     peak_hz = spectrum.frequency_hz[np.argmax(spectrum.difference * (spectrum.frequency_hz > 10.0))]
     assert peak_hz == pytest.approx(np.sqrt(7000.0 / 0.25) / (2.0 * np.pi), rel=0.15)
+
+
+def test_the_torque_that_holds_a_standing_motor_is_no_difference(measured: Record) -> None:
+    """Friction holds it by any torque between two; by which hangs on a thousandth of a count."""
+    target, torque = measured.motor_target_deg, measured.columns["motor_torque_nm"]
+    assert target is not None
+    rests = np.diff(target, prepend=target[0]) == 0.0
+    last = np.searchsorted(np.cumsum(~rests), np.cumsum(~rests), side="right") - 1
+    motor = measured.motor_position_deg
+    stands = rests & (np.abs(motor - motor[last]) < 1e-6) & np.roll(rests, 20)
+    assert stands.any()
+    held = Record({**measured.columns, "motor_torque_nm": torque + 0.03 * stands})
+    row = compare(measured, held, (), N).row("motor_torque")
+    assert row is not None
+    assert row.difference == 0.0
+    assert row.count < len(measured) - np.count_nonzero(stands)
 
 
 def test_zeros_that_differ_between_parts_are_no_difference(measured: Record) -> None:

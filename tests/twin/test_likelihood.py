@@ -31,7 +31,7 @@ def sweeps(bench: Exercise) -> None:
     """So many whole counts per cycle that the motor's encoder errs alike in every row."""
     bench.hold(0.4)
     for speed_deg_s in (90.0, -90.0):
-        bench.lead(lambda seconds, speed=speed_deg_s: speed * seconds, 2.0)
+        bench.lead(lambda seconds, speed=speed_deg_s: speed * seconds, 4.0)
     bench.hold(0.2)
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from hdbridge.records.record import Record
-from hdbridge.twin.rests import HELD_S, held_rows, stands
+from hdbridge.records.record import Record, concatenate
+from hdbridge.twin.rests import HELD_S, LARGEST_UNKNOWN, held_rows, stands, unknown_rows
 
 CYCLE_S = 0.01
 COUNT_DEG = 0.045
@@ -36,3 +37,27 @@ def test_a_motor_that_is_still_under_way_tells_none() -> None:
     record, moved = moved_twice(100.0 * COUNT_DEG)
     held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
     assert held.tolist() == [99]
+
+
+def ended_in_motion(first_s: float, then_s: float) -> Record:
+    """A procedure that ends far from where the next one begins."""
+    parts = []
+    for length_s, place in ((first_s, 0.0), (then_s, 7.0)):
+        time_s = CYCLE_S * np.arange(round(length_s / CYCLE_S))
+        target = place + 5.0 * np.maximum(time_s - 0.5, 0.0)
+        columns = {"time_s": time_s, "motor_target_deg": target, "motor_position_deg": target}
+        parts.append(Record(columns | {"load_position_deg": target / 50.0}))
+    return concatenate(parts)
+
+
+def test_a_load_rings_as_long_after_an_unknown_stop_however_short_the_procedure_after_it() -> None:
+    """A hardly damped one rings on in all of a procedure of a second."""
+    record = ended_in_motion(20.0, 1.2)
+    unknown = unknown_rows(record, COUNT_DEG)
+    assert not unknown[: record.starts[1]].any(), "it begins at rest"
+    assert unknown[record.starts[1] :].all()
+
+
+def test_no_more_of_a_recording_is_unknown_than_it_can_do_without() -> None:
+    unknown = unknown_rows(ended_in_motion(1.0, 1.2), COUNT_DEG)
+    assert np.mean(unknown) == pytest.approx(LARGEST_UNKNOWN, abs=0.02)

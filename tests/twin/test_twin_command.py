@@ -177,7 +177,7 @@ def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
     assert pending.provenance["recordings"] == [str(recording)]
     assert pending.provenance["axis"] == "demo"
     told = json.loads((profile / "told.json").read_text())
-    assert figures(told, "after")["motor_torque"]["difference"] < 0.005
+    assert figures(told, "after")["motor_torque"]["difference"] < 0.008
     (friction,) = told["parameters"]
     assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
     page = (profile / "page.html").read_text()
