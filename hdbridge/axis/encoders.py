@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -17,6 +18,25 @@ class _Part(BaseModel):
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """From an encoder's counts to degrees of its shaft and back.
+
+    For the control cycle: to look up what a model of pydantic has takes longer than to compute with it.
+    """
+
+    direction: int
+    counts_per_turn: int
+
+    def counts(self, deg: float) -> float:
+        """The reading, in (fractional) counts, at an angle of the shaft in degrees."""
+        return self.direction * deg * self.counts_per_turn / 360.0
+
+    def degrees(self, counts: float) -> float:
+        """The angle of the shaft in degrees at a reading."""
+        return self.direction * counts * 360.0 / self.counts_per_turn
+
+
 class Encoder(_Part):
     """An encoder: counts per turn and direction."""
 
@@ -27,13 +47,18 @@ class Encoder(_Part):
         1, description="-1 where it counts down as the axis (as the axis file means it) turns forward"
     )
 
+    @property
+    def scale(self) -> Scale:
+        """Its counts and degrees."""
+        return Scale(self.direction, self.counts_per_turn)
+
     def counts(self, deg: float) -> float:
-        """The reading, in (fractional) counts, at an angle of its shaft in degrees."""
-        return self.direction * deg * self.counts_per_turn / 360.0
+        """`Scale.counts`."""
+        return self.scale.counts(deg)
 
     def degrees(self, counts: float) -> float:
-        """The angle of its shaft in degrees at a reading."""
-        return self.direction * counts * 360.0 / self.counts_per_turn
+        """`Scale.degrees`."""
+        return self.scale.degrees(counts)
 
     @property
     def resolution_arcsec(self) -> float:

@@ -331,7 +331,7 @@ class Bench:
             image.target_counts_for,
         )
         axis, torque_nm = image.axis, self._sensed.torque_nm
-        motor_deg, load_deg = axis.motor_encoder.degrees, axis.load_encoder.degrees
+        motor_deg, load_deg = axis.motor_encoder.scale.degrees, axis.load_encoder.scale.degrees
         period_s, duration_s, at = self.cycle.period_s, path.duration_s, path.at
         observe, ratio = self._observer.moment, self.view.ratio
         compensation, sensed = self._compensation, self._sensed

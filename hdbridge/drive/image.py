@@ -128,6 +128,7 @@ class ProcessImage:
         self.halt = False
         """Sets the halt bit of the controlword."""
 
+        self._motor, self._load = axis.motor_encoder.scale, axis.load_encoder.scale
         source = axis.load_encoder.source
         self._load_key = (source.index, source.subindex)
         self._handlers: dict[int, Callable[[bytes], None]] = {
@@ -280,16 +281,16 @@ class ProcessImage:
 
     def motor_deg(self, counts: float) -> float:
         """Motor angle of motor counts, degrees of the motor, with the encoder's direction."""
-        return self.axis.motor_encoder.degrees(counts)
+        return self._motor.degrees(counts)
 
     def load_deg(self, counts: float) -> float:
         """Load angle of load counts, degrees of the load, with the encoder's direction."""
-        return self.axis.load_encoder.degrees(counts)
+        return self._load.degrees(counts)
 
     def target_counts_for(self, motor_deg: float) -> int:
         """Nearest motor counts of a motor angle; `InputError` when it is not finite or outside the limits."""
         if not math.isfinite(motor_deg):
             raise InputError(f"target of {motor_deg!r} deg is not a finite angle; the target was not sent")
-        counts = round(self.axis.motor_encoder.counts(motor_deg))
+        counts = round(self._motor.counts(motor_deg))
         self.check_target(counts)
         return counts

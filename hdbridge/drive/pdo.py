@@ -86,12 +86,13 @@ class PdoCodec:
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:
         """The mapped values in order; `PdoLengthError` unless ``data`` has exactly the mapped length."""
-        if len(data) != self.length:
+        try:
+            values = self._unpack(data)
+        except struct.error as error:
             raise PdoLengthError(
                 f"a PDO of {', '.join(map(str, self.entries))} has {self.length} bytes, not {len(data)}; "
                 "boot the drive again so that its mapping is what the master set"
-            )
-        values = self._unpack(data)
+            ) from error
         if not self._odd:
             return values
         decoded = list(values)

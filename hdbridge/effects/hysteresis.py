@@ -128,8 +128,17 @@ class _HysteresisTracker(Tracker):
             return self._value
         sign = 1 if motor_deg > last else -1
         if sign == self._sign:
-            return self._on_branch(motor_deg, self._branch_angle, self._branch_value, sign, self._virgin)
-        return self._on_branch(motor_deg, last, self._value, sign, self._virgin and self._sign == 0)
+            origin, value, virgin = self._branch_angle, self._branch_value, self._virgin
+        else:
+            origin, value, virgin = last, self._value, self._virgin and self._sign == 0
+        xi = abs(motor_deg - origin) / self._width
+        if xi >= 1.0:
+            return float(sign)  # where every branch ends
+        if virgin:
+            height = rise_at(2.0 * xi, self._exponent, self._steepest)
+        else:
+            height = 2.0 * rise_at(xi, self._exponent, self._steepest)
+        return sign * min(sign * value + height, 1.0)
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
         last = self._angle
@@ -145,11 +154,3 @@ class _HysteresisTracker(Tracker):
             self._angle = motor_deg
             self._value = value
         return self._offset * value
-
-    def _on_branch(self, motor_deg: float, origin: float, value: float, sign: int, virgin: bool) -> float:
-        xi = abs(motor_deg - origin) / self._width
-        if virgin:
-            height = rise_at(2.0 * xi, self._exponent, self._steepest)
-        else:
-            height = 2.0 * rise_at(xi, self._exponent, self._steepest)
-        return sign * min(sign * value + height, 1.0)

@@ -165,13 +165,13 @@ class SimulatedDrive:
         self._now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
-        receive = self.bus.recv
+        receive, now = self.bus.recv, self._clock.now
         # Bounded, and each frame at its own time: a master that answers at once (as in an SDO transfer) can
         # keep this loop busy for long, and the watchdogs must not be behind then.
         left = FRAMES_PER_POLL
         while left and (message := receive(0)) is not None:
             left -= 1
-            now_s = self._clock.now()
+            now_s = now()
             self.handle(message, now_s)
         self.run_until(now_s)
 
@@ -193,7 +193,9 @@ class SimulatedDrive:
     def handle(self, message: can.Message, now_s: float) -> None:
         """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
         self._now_s = now_s
-        if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
+        if type(message) is not DataFrame and (
+            message.is_extended_id or message.is_remote_frame or message.is_error_frame
+        ):
             return
         if self.faults.silent or self.faults.deaf:
             return

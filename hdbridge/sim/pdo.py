@@ -1,14 +1,13 @@
 """The PDOs of the simulated drive: configured over SDO as CiA 301 says, compiled once, then fast.
 
 Each PDO guards its communication and mapping parameters in the dictionary. Whenever they change, the mapping
-is compiled to one ``struct`` and a tuple of bound readers or writers; a cycle only calls those.
+is compiled to one ``struct`` and the bound readers or writers; a cycle only calls those.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from operator import call
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from hdbridge.sim.dictionary import Abort, Dictionary, Entry, SdoAbortError
@@ -125,10 +124,11 @@ class Pdo:
 
 
 class TransmitPdo(Pdo):
-    """A TPDO: ``pack`` makes its data of the values of this moment."""
+    """A TPDO."""
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
-        self._readers: tuple[Callable[[], int], ...] = ()
+        self.pack: Callable[[], bytes] = bytes
+        """The mapped values now."""
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
@@ -138,7 +138,7 @@ class TransmitPdo(Pdo):
         return entry.readable
 
     def _link(self, entries: list[Entry]) -> None:
-        self._readers = tuple(entry.reader() for entry in entries)
+        self.pack = _packer(self._codec, [entry.reader() for entry in entries])
         self.restart()
 
     def restart(self) -> None:
@@ -146,10 +146,6 @@ class TransmitPdo(Pdo):
         self.sent = None
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
-
-    def pack(self) -> bytes:
-        """The mapped values now."""
-        return self._codec.pack(*map(call, self._readers))
 
     def on_sync(self) -> bytes | None:
         """The data to send upon a SYNC, None when this one is not its turn."""
@@ -163,7 +159,7 @@ class TransmitPdo(Pdo):
         if self.syncs_to_go:
             return None
         self.syncs_to_go = self.transmission_type
-        return self._codec.pack(*map(call, self._readers))
+        return self.pack()
 
     def on_event(self, now_s: float) -> bytes | None:
         """The data of an event-driven TPDO that is due: changed and not inhibited, or its timer ran out."""
@@ -202,7 +198,7 @@ class ReceivePdo(Pdo):
 
     def _link(self, entries: list[Entry]) -> None:
         self._writers = tuple(entry.writer() for entry in entries)
-        self.length = self._codec.size
+        self.length, self._unpack_from = self._codec.size, self._codec.unpack_from
         self.restart()
 
     def restart(self) -> None:
@@ -212,11 +208,20 @@ class ReceivePdo(Pdo):
 
     def apply(self, data: bytes) -> None:
         """Write ``data``, ``length`` bytes or more, to the mapped entries; refused values are dropped."""
-        for write, value in zip(self._writers, self._codec.unpack_from(data), strict=True):
+        for write, value in zip(self._writers, self._unpack_from(data), strict=True):
             try:
                 write(value)
             except SdoAbortError:
                 continue  # nobody to tell: a PDO has no answer
+
+
+def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Callable[[], bytes]:
+    """What packs what the readers give, with the calls written out: half the time of a loop over them."""
+    called = {f"read{place}": reader for place, reader in enumerate(readers)}
+    pack: Callable[[], bytes] = eval(
+        f"lambda: pack({', '.join(f'{name}()' for name in called)})", {"pack": codec.pack, **called}
+    )
+    return pack
 
 
 def _check_type(value: int) -> None:

@@ -122,7 +122,7 @@ def compensated(drive: Drive, cycle: Cycle, *, keep: bool) -> Block:
     compensation, counts_for = compensation_for(AXIS, MODEL), drive.image.target_counts_for
     compensation.reset(0.0)
     compensation.engage()
-    motor_deg, load_deg = AXIS.motor_encoder.degrees, AXIS.load_encoder.degrees
+    motor_deg, load_deg = AXIS.motor_encoder.scale.degrees, AXIS.load_encoder.scale.degrees
 
     def block() -> list[Sample]:
         samples: list[Sample] = []
