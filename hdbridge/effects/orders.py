@@ -254,7 +254,7 @@ class OrderTracker(Memoryless):
     def peek(self, motor_deg: float, moment: Moment) -> float:
         """Error in arcsec at this motor angle."""
         # `horner`, written out: it is asked several times in each control cycle.
-        turn = cmath.exp(1j * (self._scale * motor_deg))
+        turn = cmath.rect(1.0, self._scale * motor_deg)
         total = 0j
         for amplitude in self._phasors:
             total = total * turn + amplitude

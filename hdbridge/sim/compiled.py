@@ -129,10 +129,9 @@ class CompiledAxis:
         held_nm: FloatArray,
         told: FloatArray,
     ) -> Told:
-        """`Axis.drive` over many cycles, each from the demand before it; ``told`` takes the first of what
-        each tells (`machine.Cycles`).
+        """`Axis.drive` over many cycles, each from the demand before it, and first held by ``held_nm``.
 
-        ``held_nm`` is the torque by which the loops hold the axis before each cycle, or NaN.
+        ``told`` takes the first of what each tells (`machine.Cycles`).
         """
         last: Told = _methods()["drive_all"](
             self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
@@ -393,9 +392,8 @@ def _of_the_c_library(function: Any) -> None:
 
     @overload(function, strict=False)
     def _chosen(x: Any, y: Any) -> Any:
-        if isinstance(x, types.Float) and isinstance(y, types.Float):
-            return lambda x, y: same(x, y)  # noqa: PLW0108 - numba looks at its code
-        return None
+        floats = isinstance(x, types.Float) and isinstance(y, types.Float)
+        return (lambda x, y: same(x, y)) if floats else None  # noqa: PLW0108 - numba looks at its code
 
 
 _of_the_c_library(math.remainder)

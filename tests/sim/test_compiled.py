@@ -161,6 +161,9 @@ SOMETIMES = {
     "load__encoder__sensor_warming": st.just({"arcsec_at_10_deg_s": 20.0, "time_constant_s": 0.5}),
     "motor__encoder__late_ms": numbers(0.0, 6.0),
     "motor__encoder__disc": st.just({"eccentricity_um": 1.5, "radius_mm": 20.0, "ovality_um": 0.4}),
+    "load__encoder__disc": st.just({"eccentricity_um": 2.5, "radius_mm": 30.0}),
+    "load__encoder__losses": st.just([{"time_s": 0.4, "counts": -7}, {"time_s": 0.2, "counts": 3}]),
+    "load__encoder__signals": st.just({"lines_per_turn": 1800, "sine_offset": 0.02, "third_harmonic": 0.01}),
     "motor__encoder__losses": st.just([{"time_s": 0.3, "counts": 3}]),
     "motor__coulomb_nm": numbers(0.0, 0.06),
     "servo__dead_time_ms": numbers(0.0, 3.0),
@@ -293,9 +296,19 @@ def test_a_torque_from_outside_acts_alike_whether_compiled_or_not() -> None:
     assert told[0].load_torque_nm[-1] == 0.2
 
 
+@pytest.mark.parametrize("may_compile", [False, True])
+def test_a_sensor_at_the_load_tells_what_acts_from_outside_without_power_too(may_compile: bool) -> None:
+    machine = Machine(truth({}), 7, may_compile=may_compile, loaded=True)
+    machine.follow(0.0, 0.0, 4)
+    machine.coast(4, True, 0.2)
+    assert machine.load_torque_nm == 0.2
+
+
 def test_many_cycles_at_once_are_the_same_as_one_after_the_other() -> None:
-    noisy = {"motor__encoder__late_ms": 0.3, "load__encoder__noise_arcsec": 1.0}
-    made = truth(noisy | {"temperature__friction_growth_per_k": -0.01, "temperature__copper_loss_w": 40.0})
+    wrong: dict[str, Any] = {"motor__encoder__late_ms": 0.3, "load__encoder__noise_arcsec": 1.0}
+    wrong["load__encoder__signals"] = {"lines_per_turn": 1800, "cosine_offset": 0.03}
+    wrong["load__encoder__losses"] = wrong["motor__encoder__losses"] = [{"time_s": 0.1, "counts": 5}]
+    made = truth(wrong | {"temperature__friction_growth_per_k": -0.01, "temperature__copper_loss_w": 40.0})
     counts = [0.0] * 5 + [float(100 * k) for k in range(60)] + [5_900.0] * 20
     substeps = [3 + k % 2 for k in range(len(counts) - 1)]
     at_once, each = Machine(made, 7, may_compile=True), Machine(made, 7, may_compile=True)
