@@ -4,6 +4,7 @@ Angles are degrees, multi-turn, never wrapped. Errors of the gear are arcseconds
 carries its unit (``motor_deg``, ``offset_arcsec``, ``cycle_s``).
 """
 
+import math
 from typing import Final
 
 ARCSEC_PER_DEG: Final = 3600.0
@@ -47,3 +48,21 @@ def without_unit(name: str) -> str:
 
 def _ending(name: str) -> str:
     return next((each for each in _UNITS if name == each or name.endswith("_" + each)), "")
+
+
+def figure(value: float, digits: int = 4) -> str:
+    """A number for people, with so many digits; no exponent from a ten-thousandth to a million."""
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{value:.{decimals}f}".rstrip("0").rstrip(".") if decimals > 0 else f"{value:.0f}"
+
+
+def with_interval(value: float, half_width: float) -> tuple[str, str]:
+    """A number and half the width of its interval; that has two digits, the number as many decimals."""
+    if not (math.isfinite(half_width) and half_width > 0.0):
+        return figure(value), figure(half_width)
+    last = math.floor(math.log10(half_width)) - 1
+    if 0.0 < abs(value) < 1e-4:
+        return f"{value:.{max(math.floor(math.log10(abs(value))) - last, 0)}e}", f"{half_width:.1e}"
+    return f"{value:.{max(-last, 0)}f}", f"{half_width:.{max(-last, 0)}f}"

@@ -23,7 +23,7 @@ TAKEN_OFF = 0.95
 def print_calibration(result: Calibration) -> None:
     """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
     from hdbridge.model.difference import diff
-    from hdbridge.units import unit_of
+    from hdbridge.units import figure, unit_of, with_interval
 
     fit = result.fit
     before = (
@@ -38,14 +38,15 @@ def print_calibration(result: Calibration) -> None:
         table.add_column(name, justify="right" if name != "unit" else "left")
     for each in fit.intervals:
         was = before.get((each.effect, each.parameter))
-        known = each.identifiable
+        value, half_width = with_interval(each.value, each.half_width)
         table.add_row(
             each.effect,
             escape(each.parameter),
-            f"{each.value:.3f}" if known else f"({each.value:.3f})",
-            f"{each.half_width:.3f}" if known else "not known",
+            *((value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")),
             # With a model before, the table has no room for a column that the names tell already.
-            (f"{was:.3f}" if was is not None else "-") if before else unit_of(each.parameter),
+            ("-" if was is None else with_interval(was, each.half_width)[0])
+            if before
+            else unit_of(each.parameter),
         )
     print_table(table)
     noise = fit.noise

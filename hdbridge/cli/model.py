@@ -17,6 +17,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.model import TransmissionModel
 from hdbridge.model.difference import Difference, diff
 from hdbridge.model.store import ACTIVE, MODELS, PENDING, Store, Version
+from hdbridge.units import figure, with_interval
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
 TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis instead of its models.")]
@@ -164,16 +165,9 @@ def _print_diff(title: str, rows: Sequence[Difference]) -> None:
             effect = row.effect
             table.add_section()
             table.add_row(f"[bold]{escape(effect)}[/bold]")
-        known = isinstance(row.before, int | float) and isinstance(row.after, int | float)
-        cells = [
-            _cell(row.before),
-            _cell(row.after),
-            f"{row.after - row.before:+.3f}" if known and row.changed else "",
-            _cell(row.half_width),
-        ]
-        table.add_row(
-            f"{'  ' if row.effect else ''}{escape(row.parameter)}", *(cells if compared else cells[1::2])
-        )
+        before, after, change, half_width = _cells(row)
+        cells = (before, after, change, half_width) if compared else (after, half_width)
+        table.add_row(f"{'  ' if row.effect else ''}{escape(row.parameter)}", *cells)
     print_table(table)
 
 
@@ -181,10 +175,22 @@ def _names(version: Version[Any]) -> set[str]:
     return {version.name, ACTIVE} if version.active else {version.name}
 
 
-def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3f}" if isinstance(value, float) else escape(str(value))
+def _cells(row: Difference) -> tuple[str, str, str, str]:
+    """Before, after, change and half width."""
+    change: Any = ""
+    if row.changed and isinstance(row.before, int | float) and isinstance(row.after, int | float):
+        change = row.after - row.before
+    (before, _), (after, half_width), (change, _) = (
+        _cell(each, row.half_width) for each in (row.before, row.after, change)
+    )
+    return before, after, f"+{change}" if change[:1].isdigit() else change, half_width
+
+
+def _cell(value: Any, half_width: float | None) -> tuple[str, str]:
+    """A value, and half its interval: to the digits of that, else four."""
+    if isinstance(value, float):
+        return (figure(value), "-") if half_width is None else with_interval(value, half_width)
+    return "-" if value is None else escape(str(value)), "-" if half_width is None else figure(half_width, 2)
 
 
 def _version(each: Version[Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
+from hdbridge.units import figure
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -319,11 +320,11 @@ def print_report(report: TwinReport) -> None:
     for row in report.now.rows:
         if row.kind != ALL:
             continue
-        cells = [f"{row.measured:.4g}", f"{row.simulated:.4g}"]
+        cells = [figure(row.measured), figure(row.simulated)]
         if report.after is not None:
             was = report.before.row(row.channel)
-            cells.append(f"{was.difference:.4g}" if was else "")
-        table.add_row(title_of(row), *cells, f"{row.difference:.4g}", f"{row.in_noise:.3g}", row.unit)
+            cells.append(figure(was.difference) if was else "")
+        table.add_row(title_of(row), *cells, figure(row.difference), figure(row.in_noise, 3), row.unit)
     print_table(table)
     for named in report.named:
         console.print(f"{named.cause}: {named.text}", markup=False, soft_wrap=True)

@@ -25,7 +25,7 @@ from hdbridge.report.page import (
     Status,
     Table,
 )
-from hdbridge.report.words import sentence
+from hdbridge.report.words import figure, sentence
 from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.translation import Row as Translated
 
@@ -149,8 +149,7 @@ def _times(row: Row) -> str:
 
 
 def _figure(value: float) -> str:
-    """Three digits and a real minus sign."""
-    return f"{value:.3g}".replace("-", "\N{MINUS SIGN}")
+    return figure(value, 3)
 
 
 def title_of(row: Row) -> str:

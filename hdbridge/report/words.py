@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
+
+from hdbridge import units
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
@@ -15,14 +16,16 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
-def figure(value: float) -> str:
-    """Four digits and a real minus sign."""
-    return f"{value:.4g}".replace("-", "\N{MINUS SIGN}")
+def figure(value: float, digits: int = 4) -> str:
+    """A number with so many digits and a real minus sign."""
+    return _typeset(units.figure(value, digits))
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
     """The half width with two digits, the value with as many decimals."""
-    if not (math.isfinite(half_width) and half_width > 0.0):
-        return figure(value), figure(half_width)
-    decimals = max(1 - math.floor(math.log10(half_width)), 0)
-    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}"), f"{half_width:.{decimals}f}"
+    text, half = units.with_interval(value, half_width)
+    return _typeset(text), _typeset(half)
+
+
+def _typeset(number: str) -> str:
+    return number.replace("-", "\N{MINUS SIGN}")

@@ -20,6 +20,7 @@ from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter, coordinates, free_value
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import held_out, put_back, told_apart, without
+from hdbridge.units import figure
 
 ALIKE = 0.4
 """Share of a parameter in a direction that the motion does not show, from which it belongs to the set."""
@@ -41,9 +42,10 @@ class Moved:
     def sentence(self) -> str:
         """In words."""
         unit = f" {self.unit}" if self.unit else ""
-        return (
-            f"{self.name} {self.before:.3g} -> {self.after:.3g}{unit} ({self.lower:.3g} to {self.upper:.3g})"
+        before, after, lower, upper = (
+            figure(each, 3) for each in (self.before, self.after, self.lower, self.upper)
         )
+        return f"{self.name} {before} -> {after}{unit} ({lower} to {upper})"
 
 
 @dataclass(frozen=True, slots=True)

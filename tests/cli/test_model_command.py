@@ -76,14 +76,14 @@ def test_diff_compares_active_and_pending_or_any_two(hdbridge, propose, tmp_path
     hdbridge("model", "commit", folder)
     propose(42.5)
     done = hdbridge("model", "diff", folder, "--json", "diff.json")
-    assert "+1.500" in done.stdout
+    assert "+1.50 " in done.stdout
     rows = json.loads((tmp_path / "diff.json").read_text())["parameters"]
     changed = [each for each in rows if each["changed"]]
     assert [(each["parameter"], each["before"], each["after"]) for each in changed] == [
         ("offset_arcsec", 41.0, 42.5)
     ]
     hdbridge("model", "commit", folder)
-    assert "-1.500" in hdbridge("model", "diff", folder, 2, 1).stdout
+    assert "-1.5" in hdbridge("model", "diff", folder, 2, 1).stdout
     done = hdbridge("model", "diff", folder, 2, 7)
     assert done.returncode == 2
     assert "there is no model '7'" in done.stderr
