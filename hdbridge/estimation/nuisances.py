@@ -113,11 +113,6 @@ def is_turn(name: str) -> bool:
     return name.startswith("turn ")
 
 
-def is_rounding(name: str) -> bool:
-    """Whether a column of this name is there for what a count leaves open."""
-    return is_turn(name) or name.startswith(ROUNDING)
-
-
 def swing(
     rate: FloatArray,
     waves: Iterable[tuple[float, FloatArray, FloatArray]],

@@ -12,7 +12,6 @@ from hdbridge.estimation.design import Design, clusters
 from hdbridge.estimation.gain import Gain
 from hdbridge.estimation.linearised import Linearised, steps_without
 from hdbridge.estimation.noise import Precision
-from hdbridge.estimation.nuisances import is_rounding
 from hdbridge.estimation.separable import Solution
 from hdbridge.estimation.stretches import about_zeros, counted, sums
 from hdbridge.identify.result import HeldOut
@@ -39,11 +38,9 @@ def held_out(
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
     fold, over = folds(design)
-    # Turns and rounding are noise of the fit, not something that a model could be given.
     written = {place for place, each in enumerate(solution.effects) if not each.violations()}
-    kept = [at for at, each in enumerate(solution.columns) if not is_rounding(each.name)]
-    shift = [at for at in kept if solution.columns[at].effect < 0]
-    kept = shift + [at for at in kept if solution.columns[at].effect in written]
+    shift = [at for at, each in enumerate(solution.columns) if each.effect < 0]
+    kept = shift + [at for at, each in enumerate(solution.columns) if each.effect in written]
     rest_arcsec = blocks.error_arcsec - solution.jacobian[:, shift] @ solution.nuisances[shift]
     added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
     # The active model has no nuisances of its own: it is given those that suit it best.

@@ -28,6 +28,8 @@ class Axis:
     noise: float = 0.5
     load_first: float = 0.0
     motor_counts: float = 65536.0
+    behind_counts: float = 0.0
+    """By so many counts the motor lags what its encoder says, in the direction of motion."""
     zero_arcsec: float = 700.0
 
     def error(self, motor_deg: np.ndarray, state: float = 1.0) -> np.ndarray:
@@ -56,8 +58,9 @@ class Axis:
         motor = np.concatenate([each for _, each in legs])
         count = 360.0 / self.motor_counts
         motor = np.round(motor / count) * count
-        error = self.error(motor, state) + self.zero_arcsec + rng.normal(size=len(motor)) * self.noise
-        load = motor / self.ratio + error / 3600.0
+        true = motor - self.behind_counts * count * np.sign(np.diff(motor, prepend=motor[0]))
+        error = self.error(true, state) + self.zero_arcsec + rng.normal(size=len(motor)) * self.noise
+        load = true / self.ratio + error / 3600.0
         time = np.arange(len(motor)) / RATE_HZ
         segments, at = [], 0
         for kind, leg in legs:

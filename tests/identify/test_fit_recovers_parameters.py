@@ -74,6 +74,13 @@ def test_against_the_true_model_nothing_improves(bench):
     assert result.held_out.gain.before_arcsec == pytest.approx(0.5, rel=0.1)
 
 
+def test_an_axis_that_has_not_changed_is_offered_no_new_model(bench):
+    axis = bench.axis(motor_counts=8000.0, behind_counts=0.15)
+    first = fit(axis.record(bench.plan()), axis.ratio, bench.options)
+    again = fit(axis.record(bench.plan(), seed=1), axis.ratio, replace(bench.options, active=first.model))
+    assert not again.held_out.improves, again.held_out.text
+
+
 @pytest.mark.parametrize(("width", "exponent"), [(7.0, 2.0), (35.0, 2.6), (30.0, 1.25)])
 def test_shapes_far_from_the_typical_one_are_found(bench, width, exponent):
     axis = bench.axis(width=width, exponent=exponent)
