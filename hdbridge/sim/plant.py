@@ -40,6 +40,7 @@ class Plant:
     _arm: float
     _cold_coulomb: float
     _cold_drag: float
+    _cold_sticking: float
     _coulomb: float
     _coupled: bool
     _coupling: Transition
@@ -53,7 +54,9 @@ class Plant:
     _load_drag: float
     _load_friction: float
     _ratio: float
+    _sticking: float
     _stiffness: float
+    _stribeck: float
 
     def __init__(self, truth: Truth) -> None:
         dt = truth.substep_s
@@ -67,6 +70,11 @@ class Plant:
         self._inertia = motor.inertia_kg_m2 * RAD_PER_DEG / dt
         self._drag = self._cold_drag = motor.viscous_nm_s_per_rad * RAD_PER_DEG
         self._coulomb = self._cold_coulomb = motor.coulomb_nm
+        self._sticking, self._stribeck = 0.0, 1.0
+        if motor.stribeck is not None:
+            self._sticking = motor.stribeck.rise * motor.coulomb_nm
+            self._stribeck = math.degrees(motor.stribeck.speed_rad_s)
+        self._cold_sticking = self._sticking
 
         inertia = load.whole_inertia_kg_m2
         frequency = math.sqrt(gear.stiffness_nm_per_rad / inertia)
@@ -125,6 +133,7 @@ class Plant:
     def scale_friction(self, factor: float) -> None:
         """Set the motor's friction to so many times what the truth file says."""
         self._coulomb = self._cold_coulomb * factor
+        self._sticking = self._cold_sticking * factor
         self._drag = self._cold_drag * factor
 
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
@@ -134,6 +143,9 @@ class Plant:
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
+        if self._sticking:
+            speeds = speed / self._stribeck
+            held += self._sticking * math.exp(-speeds * speeds)
         arm = self._arm / self._ratio
         push = (self._inertia - arm) * speed + torque_nm - spring / self._ratio
         if push > held:

@@ -7,11 +7,13 @@ it does say. They are where a fit starts, and stand in where nothing measured co
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import Parameter, with_values
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,9 @@ VISCOUS_SHARE: Final = Usual(
     0.2, "of the rated torque at 3000 rpm", "grease of strain wave gears at 20 deg C"
 )
 RATED_SPEED_RAD_S: Final = Usual(3000.0 * math.tau / 60.0, "rad/s", "rated speed of small servo motors")
+STRIBECK_RAD_S: Final = Usual(
+    5.0, "rad/s", "bearings and teeth in grease: a film carries from some tens of turns a minute on"
+)
 BRAKE_SHARE: Final = Usual(
     3.0, "of the rated torque", "holding brakes are built for more than the motor gives"
 )
@@ -102,6 +107,13 @@ def default_truth(axis: AxisConfig) -> Truth:
     if axis.gear.teeth is not None:
         data["gear"]["teeth"] = getattr(axis.gear.teeth, axis.gear.teeth.output)
     return Truth.model_validate(data)
+
+
+def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
+    """The same simulated drive, with the sections that these parameters belong to."""
+    if truth.motor.stribeck is not None or not any("stribeck" in each.path for each in parameters):
+        return truth
+    return with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
 
 
 def _encoder(encoder: Any) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
 from hdbridge.twin.misfit import CHANNELS, coarse, prepare
 from hdbridge.twin.noise import expected
@@ -34,14 +35,14 @@ FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 FIT_S = 60.0
 """A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
 there is time: a thousand replays of a quarter of an hour would take hours."""
-LAST = ("velocity feed-forward",)
-"""Fitted last, if that earns it: most drives feed the whole speed forward, and otherwise it looks like a dead
-time until all else is right."""
+LAST = (("velocity feed-forward",), ("friction's rise at rest", "Stribeck speed"))
+"""Fitted last, if that earns it. Most drives feed the whole speed forward, and otherwise it looks like a dead
+time until all else is right; friction near rest is told from Coulomb friction by few rows."""
 EARNED = 8.0
-"""Half the drop of the scaled squares that such a parameter has to bring, and a place that is not the start's
-to be gone on from: exp(8) to one."""
+"""Half the drop of the scaled squares that these have to bring, and a place that is not the start's to be
+gone on from: exp(8) to one."""
 SURE = 4.0
-"""... and its distance from where it was, in standard deviations."""
+"""... and the first one's distance from where it was, in standard deviations."""
 FILTER_SHARES = (0.25, 0.9)
 """Shares of the lag that may be the command filter's, to begin with."""
 FIRST_STEPS = 6
@@ -59,7 +60,7 @@ ROUNDS = 3
 """So often at most that is looked at anew, where the fit has gone;"""
 SAME = 0.3
 """... that is, by more than so many standard deviations."""
-OPTIONAL = (*LAST, "load friction", "temperature", "current limit", "motor encoder delay")
+OPTIONAL = ("velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay")
 """Not fitted unless asked for: the ordinary motion does not show them, or others can take their place."""
 
 
@@ -117,16 +118,7 @@ def fit(
         other = solve(replays, exchanged(best.truth), parameters, prior, MORE_STEPS, most=most)
         if other.loss + EARNED < best.loss:
             best = solve(replays, other.truth, parameters, prior, STEPS, most=most, near=other)
-        for name in LAST:
-            wider = (*parameters, BY_NAME[name])
-            if value_in(begun, BY_NAME[name]) is None or name in more:
-                continue
-            around = np.array(coordinates(begun, wider))
-            tried = solve(replays, best.truth, wider, around, 1, known=best.scales)
-            off = abs(float(tried.place[-1] - around[-1])) / math.sqrt(float(tried.covariance[-1, -1]))
-            if best.cost - tried.cost > EARNED * best.inflation and off > SURE:
-                best = tried
-        around = np.array(coordinates(begun, best.parameters))
+        best, around = with_last(replays, best, prior)
         for _ in range(ROUNDS):
             last, loops = best, loops_about(replays, best)
             best = solve(
@@ -136,6 +128,23 @@ def fit(
                 break
     progress(1.0)
     return best
+
+
+def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
+    """A fit with those of `LAST` that earn it, not yet led to the minimum, and what its prior is about."""
+    for names in LAST:
+        extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
+        if not extra:
+            continue
+        wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
+        around = np.append(prior, coordinates(there, extra))
+        tried = solve(replays, there, wider, around, 1, known=best.scales)
+        new = len(best.parameters)
+        off = abs(float(tried.place[new] - around[new]))
+        sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
+        if sure and best.cost - tried.cost > EARNED * best.inflation:
+            best, prior = tried, around
+    return best, prior
 
 
 def loops_about(replays: Replays, fitted: Fitted) -> Loops:

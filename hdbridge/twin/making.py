@@ -10,6 +10,7 @@ from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.commands import legs_of
 from hdbridge.twin.comparison import Comparison, compare
+from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.fitting import FIT_S, fit
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
 from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
@@ -37,7 +38,7 @@ def fit_twin(
     fitted = fit(whole, axis, start, lambda share: progress(0.9 * share), workers)
     data = coarse(prepare(whole, axis, start), FIT_S)
     with Replays(data, workers) as replays, Replays(coarse(data), workers) as rough:
-        findings, rivals = name_causes(replays, rough, start, fitted)
+        findings, rivals = name_causes(replays, rough, with_sections(start, fitted.parameters), fitted)
         (left,) = replays([fitted.truth])
         sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
         rest = unexplained(data, left, noise_in_motion(data))

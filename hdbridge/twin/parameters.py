@@ -81,6 +81,14 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         (TORQUE,), _SPEEDS, 0.25,
     ),
     Parameter(
+        "friction's rise at rest", ("motor", "stribeck", "rise"), "", 0.0, 10.0, 0.3, FRICTION,
+        (TORQUE, FOLLOWING), _REVERSALS, 0.1, linear=True,
+    ),
+    Parameter(
+        "Stribeck speed", ("motor", "stribeck", "speed_rad_s"), "rad/s", 0.01, 1e3, 0.7, FRICTION,
+        (TORQUE, FOLLOWING), _SPEEDS, 0.5,
+    ),
+    Parameter(
         "load inertia", ("load", "inertia_kg_m2"), "kg m2", 1e-7, 1e5, 0.7, "load inertia",
         (TORQUE, LOAD), _STEPS, 0.10,
     ),

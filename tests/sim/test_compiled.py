@@ -166,6 +166,7 @@ SOMETIMES = {
     "load__encoder__signals": st.just({"lines_per_turn": 1800, "sine_offset": 0.02, "third_harmonic": 0.01}),
     "motor__encoder__losses": st.just([{"time_s": 0.3, "counts": 3}]),
     "motor__coulomb_nm": numbers(0.0, 0.06),
+    "motor__stribeck": st.just({"rise": 0.6, "speed_rad_s": 2.0}),
     "servo__dead_time_ms": numbers(0.0, 3.0),
     "servo__load_feedforward": st.none(),
     "servo__torque_limit_percent": numbers(20.0, 300.0),

@@ -104,6 +104,23 @@ def test_a_torque_within_the_friction_moves_nothing_and_one_beyond_it_does() -> 
     assert plant.now.motor_deg > 0.0
 
 
+def test_a_motor_whose_friction_is_higher_near_rest_sticks_and_keeps_its_speed_by_less() -> None:
+    truth = plain(motor__stribeck={"rise": 0.5, "speed_rad_s": 3.0}, motor__viscous_nm_s_per_rad=0.0)
+    plant = Plant(truth)
+    for _ in range(1000):
+        plant.step(0.0449, 0.0)
+    assert plant.now.motor_deg == 0.0
+    plant.step(0.0451, 0.0)
+    assert plant.motor_deg_s > 0.0
+    for speed_rad_s in (-6.0, 1.0, 3.0):
+        plant = Plant(truth)
+        plant.motor_deg_s, plant.load_deg_s = math.degrees(speed_rad_s), math.degrees(speed_rad_s) / 50.0
+        held_nm = 0.03 + 0.015 * math.exp(-((speed_rad_s / 3.0) ** 2))
+        for _ in range(20):
+            plant.step(math.copysign(held_nm, speed_rad_s), 0.0)
+        assert math.radians(plant.motor_deg_s) == pytest.approx(speed_rad_s, rel=1e-3)
+
+
 def test_friction_at_the_load_leaves_wind_up_at_rest() -> None:
     for coulomb_nm in (0.0, 2.0):
         plant = Plant(plain(load__coulomb_nm=coulomb_nm))

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.parameters import (
     BY_NAME,
     PARAMETERS,
@@ -17,7 +18,7 @@ from hdbridge.twin.parameters import (
     with_values,
 )
 
-DEMO = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
+DEMO = with_sections(Truth.load(Path(__file__).parents[2] / "profiles" / "demo"), PARAMETERS)
 
 
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda each: each.name)
@@ -34,6 +35,12 @@ def test_coordinates_lead_there_and_back() -> None:
     place = coordinates(DEMO, PARAMETERS)
     again = at_coordinates(DEMO, PARAMETERS, place)
     assert coordinates(again, PARAMETERS) == pytest.approx(place)
+
+
+def test_a_section_that_a_parameter_needs_is_as_good_as_none() -> None:
+    assert DEMO.motor.stribeck is not None
+    assert DEMO.motor.stribeck.rise == 0.0
+    assert with_sections(DEMO, PARAMETERS) is DEMO
 
 
 def test_a_section_that_is_not_there_has_no_value() -> None:

@@ -8,6 +8,15 @@ from hdbridge.sim.truth.encoder import TrueMotorEncoder
 from hdbridge.sim.truth.part import Part
 
 
+class TrueMotorStribeck(Part):
+    """Friction on the motor's shaft that is higher near rest, where no film of lubricant carries yet."""
+
+    rise: float = Field(
+        ge=0, le=10, description="share of the Coulomb friction by which it is higher at rest"
+    )
+    speed_rad_s: float = Field(gt=0, le=1_000, description="motor speed by which that has come down to 1/e")
+
+
 class TrueMotor(Part):
     """The motor with the wave generator, and the friction on their shaft."""
 
@@ -17,6 +26,9 @@ class TrueMotor(Part):
         0.0, ge=0, le=10_000, description="Coulomb friction; it holds the shaft at rest"
     )
     viscous_nm_s_per_rad: float = Field(0.0, ge=0, le=1_000, description="viscous friction")
+    stribeck: TrueMotorStribeck | None = Field(
+        None, description="friction near rest; without it: Coulomb only"
+    )
     brake_nm: float = Field(1.0, ge=0, le=100_000, description="torque up to which the brake holds")
     encoder: TrueMotorEncoder = Field(description="encoder on the motor shaft")
 
