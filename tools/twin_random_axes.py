@@ -23,6 +23,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,8 @@ CHANGES: dict[str, tuple[str, Callable[[Truth], dict[str, float]]]] = {
     "warmer gear": ("warmth", lambda t: {"temperature": t.temperature.ambient_c + 15.0}),
 }
 """By name: the cause that is to be named, and what becomes of the plant."""
+PAIRS = 3
+"""Pairs of changes, drawn for each axis."""
 WINDOWS = 3.0
 """The following error allowed, over what the delay makes at the highest speed: `hdbridge bringup` asks
 for three times what it has seen."""
@@ -267,16 +270,13 @@ def patient(axis: AxisConfig) -> AxisConfig:
 
 
 def changed_plants(truth: Truth, seed: int) -> Iterator[tuple[str, set[str], Truth]]:
-    """Nothing changed, each change alone, and one pair."""
-    yield "nothing", set(), truth
-    names = list(CHANGES)
-    for name in names:
-        cause, values = CHANGES[name]
-        yield name, {cause}, with_values(truth, values(truth))
-    pair = names[seed % 5], names[(seed + 1 + seed // 5) % 5]
-    if pair[0] != pair[1]:
-        both = {key: value for name in pair for key, value in CHANGES[name][1](truth).items()}
-        yield " + ".join(pair), {CHANGES[name][0] for name in pair}, with_values(truth, both)
+    """Nothing changed, each change alone, and some pairs."""
+    pairs = list(combinations(CHANGES, 2))
+    drawn = np.random.default_rng(seed + 4000).choice(len(pairs), PAIRS, replace=False)
+    for names in ((), *((name,) for name in CHANGES), *(pairs[place] for place in drawn)):
+        values = {key: value for name in names for key, value in CHANGES[name][1](truth).items()}
+        plant = with_values(truth, values) if values else truth
+        yield " + ".join(names) or "nothing", {CHANGES[name][0] for name in names}, plant
 
 
 def line(each: Outcome) -> str:
