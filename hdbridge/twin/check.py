@@ -1,16 +1,17 @@
 """What has changed since a twin was made: a new recording against its replay, named cause by cause.
 
-Forward selection: each parameter alone is moved by several sizes; the causes that explain most so are
-fitted, and the best of them is taken in if it has moved by more than the new recording and the twin itself
-leave open, and by as much as matters; then the next, with those before fitted along. At the end each has to
-earn its place once more.
+All parameters are fitted together, each held to where the twin has it as closely as the twin can be trusted.
+Those that are drawn from there by more than chance are set free, with all of their cause, and so are those
+that explain most when they are moved alone. Then one cause after the other has to earn its place next to the
+rest: it has to have moved by more than the new recording and the twin leave open, and by as much as matters,
+and what would make up for it has to be less likely.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
-from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, solve, told
+from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve, told
 from hdbridge.twin.misfit import CHANNELS, coarse, prepare
 from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
@@ -31,22 +32,24 @@ from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import FALSE_ALARM
 from hdbridge.twin.scales import Scales, noise_floor
 
-MOST_CAUSES = 4
-"""Changes that are looked for at most."""
-CHECK_S = 40.0
+CHECK_S = 20.0
 """A longer recording is checked on pieces that take about so long."""
 SIZES = (1.0, 2.5, 6.0)
 """Each parameter is moved by so many of the changes that matter, either way: what a spring or a load rings by
 goes out of step at a small share of a larger change already, and slopes say nothing of it."""
-CONTENDERS = 3
-"""So many causes are fitted; the others are behind with one parameter alone already."""
-EXCHANGED = 2
-"""Once so many causes are found, the first one is looked for again."""
-STEPS = 6
+CONTENDERS = 2
+"""So many such places a fit begins at, in addition to the twin's own."""
+STEPS = 8
+ROUNDS = 3
+"""So often the causes that are drawn away are set free. In the first round they are nearly always all."""
 DRAWS = 8
 """Rounded and noisy replays about a place, within what the twin leaves open. A recording is held against
 their mean: rounding is no noise (see `likelihood`). And a sample counts by how far they are apart: how a
 motor breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
+TOLERANCE = 0.5
+"""A twin's values may be off by what its fit leaves open, and by so much of the least change that matters
+(95 %). Two values that make up for each other in its own recordings do so no longer once a third has changed:
+were they held where they are, what they leave would be told as a change of something else."""
 LEAST_SUSPECT = 0.25
 """Share of that which the slopes have to promise: they say little of what goes out of step."""
 TOLERATED = (1.0 / 3.0) ** 2
@@ -96,14 +99,7 @@ def check(
     with Replays(data, workers) as replays:
         search = _Search(replays, twin, known, scale, free_parameters(twin, OWN))
         (before,) = replays([twin])
-        best = search.at((), twin)
-        while len(best.causes) < MOST_CAUSES:
-            progress(len(best.causes) / MOST_CAUSES)
-            step = search.next_after(best)
-            if step is None:
-                break
-            best = search.exchanged(step) if len(step.causes) == EXCHANGED else step
-        best = search.without_idle(best)
+        best = search.found(progress)
         (after,) = replays([best.truth])
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
@@ -155,7 +151,9 @@ class _Search:
         self._replays, self._twin, self._scale = replays, twin, scale
         self._every = parameters
         self._causes = tuple(dict.fromkeys(each.cause for each in parameters))
-        self._root = known.root(parameters)
+        tolerated = TOLERANCE / NORMAL_95 * np.array([each.least_change for each in parameters])
+        self._known = known.root(parameters)
+        self._root = np.hstack([self._known, np.diag(tolerated)])
         self._rows = fitted_rows(replays.data, everything=True)
         self._legs = legs_of_rows(replays.data, self._rows)
         self._channels = np.repeat(np.arange(len(CHANNELS)), len(self._rows) // len(CHANNELS))[self._rows]
@@ -167,7 +165,7 @@ class _Search:
         rng = np.random.default_rng(0)
         low, high = np.array([each.bounds for each in self._every]).T
         places = [
-            np.clip(here.place + self._root @ rng.standard_normal(self._root.shape[1]), low, high)
+            np.clip(here.place + self._known @ rng.standard_normal(self._known.shape[1]), low, high)
             for _ in range(DRAWS)
         ]
         drawn = self._replays.drawn([at_coordinates(truth, self._every, each.tolist()) for each in places])
@@ -181,36 +179,69 @@ class _Search:
         slopes, mean = here.jacobian / apart[:, None], np.mean(left, axis=0) / apart
         return _Place(causes, truth, here.place - twin, slopes, mean, apart)
 
-    def next_after(self, best: _Place) -> _Place | None:
-        """The causes with one more; None where no other has earned it."""
-        others = [cause for cause in self._causes if cause not in best.causes]
-        suspects = [cause for cause in others if self._suspect(cause, best)]
-        contenders = self._contenders(best, suspects) if suspects else []
-        fits = [self._fit((*best.causes, cause), start, best) for cause, start in contenders]
-        # The best first: what is significant next to it may only stand in for it.
-        for causes, fitted in sorted(fits, key=lambda each: each[1].cost + 0.5 * self._price(each[0][-1])):
-            found = self.at(causes, fitted.truth)
-            if self._significant(causes[-1], found) and self._matters(best, found):
-                return found
-        return None
+    def found(self, progress: Callable[[float], None]) -> _Place:
+        """The causes without which the recording cannot be told, and what they have come to."""
+        best = self.at((), self._twin)
+        suspects = [cause for cause in self._causes if self._suspect(cause, best)]
+        if not suspects:
+            return best
+        starts = self._contenders(best, suspects)
+        best = self._settled((), self._twin, best)
+        for done in range(ROUNDS):
+            progress((done + 0.5) / ROUNDS)
+            pulled = [each for each in self._causes if each not in best.causes and self._pulled(each, best)]
+            if not pulled and best.causes:
+                break
+            more = tuple(dict.fromkeys([*best.causes, *pulled, *(cause for cause, _ in starts)]))
+            fits = [
+                self._settled(more, start, best) for start in (best.truth, *(start for _, start in starts))
+            ]
+            step = self._needed(min(fits, key=self._evidence))
+            if not step.causes or not self._explains_more(step, best):
+                break
+            best, starts = step, []
+        return best if best.causes else self.at((), self._twin)
 
-    def exchanged(self, best: _Place) -> _Place:
-        """The place with another cause for the first one, where that explains more.
+    def _needed(self, best: _Place) -> _Place:
+        """The place without the causes that others, and what the twin leaves open, make up for."""
+        tried: set[str] = set()
+        while rest := sorted(set(best.causes) - tried, key=lambda cause: self._moved(cause, best).distance):
+            cause = rest[0]
+            kept = tuple(each for each in best.causes if each != cause)
+            without = self._settled(kept, self._put_back(cause, best.truth), best)
+            idle = not self._significant(cause, best) or not self._matters(cause, best)
+            if idle or self._explains_more(without, best):
+                best = without
+            else:
+                tried.add(cause)
+        return best
 
-        The first had to explain all that has changed, and may have stood in for two.
-        """
-        others = best.causes[1:]
-        instead = self.next_after(self.at(others, self._fit(others, self._twin, best)[1].truth))
-        return instead if instead is not None and self._explains_more(instead, best) else best
+    def _settled(self, causes: tuple[str, ...], start: Truth, near: _Place) -> _Place:
+        """The place of some causes, all other parameters along within what the twin leaves open."""
+        spread = np.sqrt(np.sum(np.square(self._root), axis=1))
+        parameters = tuple(
+            each if each.cause in causes else replace(each, spread=min(each.spread, float(most)))
+            for each, most in zip(self._every, spread, strict=True)
+        )
+        prior, known = np.array(coordinates(self._twin, parameters)), Scales(self._scale_at(near))
+        fit = solve(self._replays, start, parameters, prior, STEPS, known=known, everything=True)
+        return self.at(causes, fit.truth)
 
-    def without_idle(self, best: _Place) -> _Place:
-        """Only the causes that are still significant next to the others."""
-        while True:
-            kept = tuple(cause for cause in best.causes if self._significant(cause, best))
-            if kept == best.causes:
-                return best
-            truth = self._fit(kept, self._twin, best)[1].truth if kept else self._twin
-            best = self.at(kept, truth)
+    def _put_back(self, cause: str, truth: Truth) -> Truth:
+        """A truth with a cause's parameters as the twin has them."""
+        own = [each for each in self._every if each.cause == cause]
+        return at_coordinates(truth, own, coordinates(self._twin, own))
+
+    def _pull(self, cause: str, best: _Place) -> float:
+        """How far a cause has gone along, in squared standard deviations of what the twin leaves open."""
+        own = [number for number, each in enumerate(self._every) if each.cause == cause]
+        root = self._root[own]
+        return float(best.off[own] @ np.linalg.solve(root @ root.T, best.off[own]))
+
+    def _pulled(self, cause: str, best: _Place) -> bool:
+        """Whether that is further than by chance."""
+        count = sum(each.cause == cause for each in self._every)
+        return float(chdtrc(count, self._pull(cause, best))) < FALSE_ALARM / len(self._causes)
 
     def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
         """What is said of a cause."""
@@ -244,7 +275,7 @@ class _Search:
             for size in SIZES
             for way in (-1.0, 1.0)
         ]
-        truths = [best.truth, *(_shifted(best.truth, each, by) for each, by in moves)]
+        truths = [self._twin, *(_shifted(self._twin, each, by) for each, by in moves)]
         scale = self._scale_at(best)
         here, *costs = (self._cost(found, scale) for found in self._replays(truths))
         nearest: dict[str, tuple[float, Truth]] = {}
@@ -266,17 +297,17 @@ class _Search:
         by_channel = zip(CHANNELS, np.split(rows, len(CHANNELS)), strict=True)
         return {name: self._scale[name] * each for name, each in by_channel}
 
-    def _fit(self, causes: tuple[str, ...], start: Truth, near: _Place) -> tuple[tuple[str, ...], Fitted]:
-        parameters = tuple(each for each in self._every if each.cause in causes)
-        prior = np.array(coordinates(self._twin, parameters))
-        known = Scales(self._scale_at(near))
-        return causes, solve(self._replays, start, parameters, prior, STEPS, known=known, everything=True)
+    def _moved(self, cause: str, at: _Place, *more: str, trusted: bool = False) -> _Moved:
+        """How far a cause has moved next to the place's own, all other parameters as the twin leaves them.
 
-    def _moved(self, cause: str, at: _Place, *more: str) -> _Moved:
-        """How far a cause has moved next to the place's own, all other parameters as the twin leaves them."""
+        ``trusted``: a twin is off by no more than it says.
+        """
         free = [number for number, each in enumerate(self._every) if each.cause in (*at.causes, *more)]
         precision = np.array([each.spread for each in self._every]) ** -2.0
-        found = change_of(free, at.slopes, at.left, self._legs, self._root, precision, at.off)
+        along = np.where(np.isin(np.arange(len(self._every)), free), 0.0, at.off)
+        left = at.left - at.slopes @ along
+        root = self._known if trusted else self._root
+        found = change_of(free, at.slopes, left, self._legs, root, precision, at.off)
         own = [number for number, place in enumerate(free) if self._every[place].cause == cause]
         places = [free[number] for number in own]
         return _Moved(places, at.off[places] + found.by[own], found.covariance[np.ix_(own, own)])
@@ -293,24 +324,30 @@ class _Search:
         after = best.left - slopes @ np.linalg.lstsq(slopes, best.left, rcond=None)[0]
         explained = self._squares(best.left) - self._squares(after)
         return bool(np.any(explained > LEAST_SUSPECT * TOLERATED)) and self._certain(
-            self._moved(cause, best, cause)
+            self._moved(cause, best, cause, trusted=True)
         )
 
-    def _matters(self, best: _Place, found: _Place) -> bool:
-        """Whether one cause more explains more than a twin may leave."""
-        before, after = self._alike(best, found)
-        return bool(np.any(self._squares(before) - self._squares(after) > TOLERATED))
+    def _matters(self, cause: str, found: _Place) -> bool:
+        """Whether a cause explains more than a twin may leave."""
+        back = self._put_back(cause, found.truth)
+        with_it, without = (
+            told(each, Scales(self._scale_at(found)), self._rows)
+            for each in self._replays([found.truth, back])
+        )
+        return bool(np.any(self._squares(without) - self._squares(with_it) > TOLERATED))
 
     def _explains_more(self, one: _Place, other: _Place) -> bool:
-        """Whether as many causes leave less, by what each costs."""
-        left, right = (0.5 * float(each @ each) for each in self._alike(one, other))
-        prices = [0.5 * sum(map(self._price, each.causes)) for each in (one, other)]
-        return left + prices[0] < right + prices[1]
-
-    def _alike(self, one: _Place, other: _Place) -> tuple[FloatArray, FloatArray]:
-        """What two places leave, on one scale."""
+        """Whether one place leaves less than the other, by what their causes cost."""
         apart = np.maximum(one.apart, other.apart)
-        return one.left * one.apart / apart, other.left * other.apart / apart
+        return self._evidence(one, apart) < self._evidence(other, apart)
+
+    def _evidence(self, at: _Place, apart: FloatArray | None = None) -> float:
+        """What a place leaves, how far it is from the twin, and what its causes cost: less is better."""
+        left = at.left if apart is None else at.left * at.apart / apart
+        others = [number for number, each in enumerate(self._every) if each.cause not in at.causes]
+        root = self._root[others]
+        along = float(at.off[others] @ np.linalg.solve(root @ root.T, at.off[others]))
+        return 0.5 * (float(left @ left) + along + sum(map(self._price, at.causes)))
 
     def _squares(self, left: FloatArray) -> FloatArray:
         """Mean square by channel."""
