@@ -8,15 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from hdbridge.effects.base import MEASURED
 from hdbridge.files.yamlfile import wrong
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
+from hdbridge.strictness import Strict
 
 EveryCycles = Annotated[int, Field(ge=1, le=240, description="it comes with every n-th SYNC")]
 HoldMs = Annotated[
@@ -34,7 +30,7 @@ class Scale(NamedTuple):
     greatest: float
 
 
-class ChannelSource(_Part):
+class ChannelSource(Strict):
     """The object of the drive that carries a channel."""
 
     index: int = Field(ge=0x1000, le=0xFFFF, description="index of the object")
@@ -45,7 +41,7 @@ class ChannelSource(_Part):
     via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
 
 
-class LoadTorque(_Part):
+class LoadTorque(Strict):
     """The torque on the load: from a sensor at its flange, or what the drive knows of it."""
 
     source: ChannelSource = Field(description="the object that tells it")
@@ -66,7 +62,7 @@ class LoadTorque(_Part):
         return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit)
 
 
-class Temperature(_Part):
+class Temperature(Strict):
     """The temperature of the gear."""
 
     source: ChannelSource = Field(description="the object that tells it")
@@ -99,7 +95,7 @@ class Temperature(_Part):
         return Scale(self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius)
 
 
-class Quantity(_Part):
+class Quantity(Strict):
     """Any other channel of the table, in its unit there."""
 
     source: ChannelSource = Field(description="the object that tells it")
@@ -123,13 +119,13 @@ BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
 OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
 if TYPE_CHECKING:
 
-    class OtherChannels(_Part):
+    class OtherChannels(Strict):
         """The channels of the table that `AxisConfig` does not spell out."""
 
 else:
     OtherChannels = create_model(
         "OtherChannels",
-        __base__=_Part,
+        __base__=Strict,
         **{
             key: (Quantity | None, Field(None, description=f"{each.about}, {each.unit}"))
             for key, each in BY_KEY.items()

@@ -11,7 +11,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
 from hdbridge.axis.channels import BY_KEY, LoadTorque, MeasuredChannel, OtherChannels, Temperature
@@ -19,15 +19,14 @@ from hdbridge.axis.encoders import INT32_MAX, LoadEncoder, MotorEncoder, NodeId
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, wrong
+from hdbridge.strictness import Strict
 from hdbridge.units import ARCSEC_PER_DEG
 
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 
 
-class _Part(BaseModel):
+class _Part(Strict):
     """A mapping of the file: frozen, no unknown keys, finite numbers."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class BusConfig(_Part):

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import wrong
+from hdbridge.strictness import Strict
 
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Direction = Literal[1, -1]
 INT32_MAX = 2**31 - 1
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +34,7 @@ class Scale:
         return self.direction * counts * 360.0 / self.counts_per_turn
 
 
-class Encoder(_Part):
+class Encoder(Strict):
     """An encoder: counts per turn and direction."""
 
     counts_per_turn: int = Field(
@@ -70,7 +67,7 @@ class MotorEncoder(Encoder):
     """The encoder of the motor, which the drive closes its loop on (6064h, 607Ah)."""
 
 
-class Source(_Part):
+class Source(Strict):
     """The object that carries the load encoder's reading."""
 
     WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from hdbridge.axis import BusConfig, RealtimeConfig
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode
@@ -18,16 +18,15 @@ from hdbridge.daemon.memory.layout import AXES_AT_MOST
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.yamlfile import wrong
+from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 """What names a machine; its socket and its service are called so, too."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 
 
-class _Part(BaseModel):
+class _Part(Strict):
     """A mapping of the file: frozen, no unknown keys, finite numbers."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class LoadLoopSettings(_Part):

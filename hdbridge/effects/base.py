@@ -21,7 +21,7 @@ from itertools import product
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import Coordinate
@@ -53,6 +53,7 @@ from hdbridge.effects.motion import (
 )
 from hdbridge.effects.observations import Observations
 from hdbridge.effects.tracker import Memoryless, Tracker
+from hdbridge.strictness import Strict
 
 __all__ = [
     "AT_REST",
@@ -90,11 +91,8 @@ GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 """Values of each shape that the default proposals try, by the number of shapes."""
 
 
-class Effect(BaseModel, ABC):
+class Effect(Strict, ABC):
     """One cause of transmission error with its parameters."""
-
-    # A process reads few of the effects; what pydantic makes to read all of them takes a tenth of a second.
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: ClassVar[str]
     """The canonical name: in model files, findings and tests."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.effects.base import Effect, Part
 from hdbridge.effects.hysteresis import Hysteresis
@@ -19,12 +19,11 @@ from hdbridge.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.effects.synchronous import TYPICAL_ORDERS, Synchronous
 from hdbridge.effects.torque import TorqueGrowth
+from hdbridge.strictness import Strict
 
 
-class Loop(BaseModel):
+class Loop(Strict):
     """The elastic loop that is modulated: the parameters of `hysteresis`, and which law it follows."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     offset_arcsec: Annotated[
         float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")

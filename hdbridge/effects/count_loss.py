@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.effects.base import (
     Cause,
@@ -27,15 +27,14 @@ from hdbridge.effects.base import (
     Tracker,
 )
 from hdbridge.effects.path import away_from_reversals
+from hdbridge.strictness import Strict
 
 NEAR_S, LEAST_NEAR = 1.0, 5
 """Next to a step: so long, and so many samples at least."""
 
 
-class Step(BaseModel):
+class Step(Strict):
     """One loss: from this time on the error is larger by its size."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     time_s: Annotated[float, Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")]
     size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.base import (
@@ -30,15 +30,14 @@ from hdbridge.effects.kinematics import speed_of
 from hdbridge.effects.observations import longest_rest_s
 from hdbridge.effects.path import standing_s
 from hdbridge.effects.recurrence import recurrence
+from hdbridge.strictness import Strict
 
 RESTS = 3.0
 """It is known by its bend: its shortest time constant is at most so many times the longest rest."""
 
 
-class Relaxation(BaseModel):
+class Relaxation(Strict):
     """One exponential."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     amplitude_arcsec: Annotated[
         float, Field(ge=-3600, le=3600, description="strain after a long move forward, at the load")

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, ClassVar, Final, Self, TypeVar, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from hdbridge.effects.base import (
     Coefficient,
@@ -23,6 +23,7 @@ from hdbridge.effects.base import (
     Tracker,
 )
 from hdbridge.effects.path import away_from_reversals, once
+from hdbridge.strictness import Strict
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_MOTOR_ORDER: Final = 24
@@ -32,10 +33,8 @@ _ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
 _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 
 
-class MotorOrder(BaseModel):
+class MotorOrder(Strict):
     """One harmonic: amplitude * cos(order * angle + phase)."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     order: Annotated[int, Field(ge=1, le=1000, description="periods per turn")]
     amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]

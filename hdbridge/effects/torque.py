@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hdbridge.effects.base import SLOT, Channel, FloatArray, Moment, Motion
+from hdbridge.strictness import Strict
 
 TorqueChannel = Annotated[
     Literal["load_torque_nm", "motor_torque_nm"],
@@ -43,10 +44,8 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
     return tuple(lines)
 
 
-class TorqueGrowth(BaseModel):
+class TorqueGrowth(Strict):
     """A growth of amplitudes with torque, of which `torque_modulation` has the fields too."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     growth_percent_per_nm: Annotated[
         float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")

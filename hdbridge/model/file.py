@@ -12,20 +12,19 @@ from hdbridge.axis import Identity, Teeth
 from hdbridge.effects import CATALOGUE, Effect, conflicts
 from hdbridge.files.expectation import nearest
 from hdbridge.files.yamlfile import Document, Hex, dump_yaml
+from hdbridge.strictness import Strict
 
 _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.md describes its keys.\n"
 
 
-class GearOfModel(BaseModel):
+class GearOfModel(Strict):
     """The gear that a model was measured on."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     teeth: Teeth | None = Field(None, description="numbers of teeth")
 
 
-class Provenance(BaseModel):
+class Provenance(Strict):
     """Where a model comes from and what it is bound to; further keys are kept as they are."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
@@ -51,8 +50,6 @@ class EffectEntry(BaseModel):
 
 class ModelFile(BaseModel):
     """The model file as it stands; the parameters are checked by the effect that they belong to."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")

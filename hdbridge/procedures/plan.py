@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
@@ -30,6 +30,7 @@ from hdbridge.procedures.sine import Sines
 from hdbridge.procedures.standstill import Precondition, Reference, Standstill
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.procedures.sweep import Sweep
+from hdbridge.strictness import Strict
 from hdbridge.units import DEG_PER_TURN
 
 SPEED_SHARE = 0.95
@@ -38,11 +39,7 @@ SMALLEST_TRAVEL_DEG = 90.0
 """Motor degrees on either side of the middle without which no procedure makes sense."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class StandstillEntry(_Part):
+class StandstillEntry(Strict):
     """Standing at the reference pose: the noise of the encoders."""
 
     procedure: Literal["standstill"] = Field(description="stand at the reference pose")
@@ -53,7 +50,7 @@ class StandstillEntry(_Part):
         yield Standstill(room.pose_deg, self.duration_s)
 
 
-class SweepEntry(_Part):
+class SweepEntry(Strict):
     """Constant speed both ways: the synchronous part, load orders, the height of the loop."""
 
     procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
@@ -78,7 +75,7 @@ class SweepEntry(_Part):
         yield Sweep(room.middle_deg - half, room.middle_deg + half, speed, self.laps)
 
 
-class SinesEntry(_Part):
+class SinesEntry(Strict):
     """Slow sines of several amplitudes, some smaller than the hysteresis is wide."""
 
     procedure: Literal["sines"] = Field(description="slow sines about the reference pose")
@@ -101,7 +98,7 @@ class SinesEntry(_Part):
         yield Sines(room.middle_deg, amplitudes, frequency, self.periods)
 
 
-class ReversalsEntry(_Part):
+class ReversalsEntry(Strict):
     """Nested reversals: first-order reversal curves."""
 
     procedure: Literal["reversals"] = Field(description="nested reversals at the reference pose")
@@ -123,7 +120,7 @@ class ReversalsEntry(_Part):
         yield Reversals(room.middle_deg, depths, reach, room.speed(name, self.motor_deg_per_s), self.beyond)
 
 
-class SteppingEntry(_Part):
+class SteppingEntry(Strict):
     """The stepping test, without compensation."""
 
     procedure: Literal["stepping"] = Field(description="steps both ways, at rest after each")
@@ -165,7 +162,7 @@ Entry = Annotated[
 ]
 
 
-class ValidationEntry(_Part):
+class ValidationEntry(Strict):
     """The stepping test by which a new model is judged, with and without it."""
 
     count: int = Field(120, ge=2, le=100_000, description="steps each way")
@@ -192,7 +189,7 @@ class ValidationEntry(_Part):
         return self
 
 
-class Plan(_Part):
+class Plan(Strict):
     """A plan file."""
 
     schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="kind and version of this file")

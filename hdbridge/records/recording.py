@@ -16,12 +16,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically, wrong
 from hdbridge.records.record import Record, concatenate, time_shifts_s
+from hdbridge.strictness import Strict
 
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
@@ -29,11 +30,7 @@ HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md desc
 """How ``recording.yaml`` begins."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Segment(_Part):
+class Segment(Strict):
     """One leg of what the axis did."""
 
     kind: str = Field(
@@ -50,7 +47,7 @@ class Segment(_Part):
         return self
 
 
-class RecordedFile(_Part):
+class RecordedFile(Strict):
     """A file of the recording."""
 
     name: str = Field(pattern=r"^[^/\\]+$", description="its name in this folder")
@@ -58,7 +55,7 @@ class RecordedFile(_Part):
     samples: int = Field(ge=0, description="rows")
 
 
-class RecordingFile(_Part):
+class RecordingFile(Strict):
     """The content of ``recording.yaml``."""
 
     schema_: Literal["hdbridge.recording/1"] = Field(

@@ -15,21 +15,20 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from hdbridge.daemon.adaptation.adaptation import Memory
 from hdbridge.daemon.adaptation.proposal import Entry
 from hdbridge.errors import OutputError
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.model import TransmissionModel
+from hdbridge.strictness import Strict
 
 SCHEMA = "hdbridge.adaptation/1"
 
 
-class StateFile(BaseModel):
+class StateFile(Strict):
     """``AXIS.json``."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     schema_: Literal["hdbridge.adaptation/1"] = Field(alias="schema")
     model: str

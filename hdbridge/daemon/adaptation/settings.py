@@ -5,7 +5,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from hdbridge.strictness import Strict
 
 Mode = Literal["off", "observe", "on"]
 Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
@@ -22,10 +24,8 @@ class Standing(StrEnum):
     """A fault; the reason is told. Ends by itself when what it depends on is well again, or by `resume`."""
 
 
-class Excitation(BaseModel):
+class Excitation(Strict):
     """What an axis must have done since the last update before the next one is made."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     turns: float = Field(
         2.0, ge=0.5, le=1000, description="motor turns (both directions) that show the orders of the motor"
@@ -38,10 +38,8 @@ class Excitation(BaseModel):
     )
 
 
-class AdaptationSettings(BaseModel):
+class AdaptationSettings(Strict):
     """Rates are per hour of the axis's own time, bounds are about the committed model."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     mode: Mode = Field(
         "off", description="off, observe (only report what would change), or on (change the model in use)"

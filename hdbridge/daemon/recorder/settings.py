@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from hdbridge.strictness import Strict
 
 
-class RecorderSettings(BaseModel):
+class RecorderSettings(Strict):
     """The ring on disk, and what is kept aside of it."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     folder: str | None = Field(
         None,

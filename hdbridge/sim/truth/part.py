@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from hdbridge.strictness import Strict
 
 
-class Part(BaseModel):
+class Part(Strict):
     """A mapping of the file: frozen, no unknown keys, finite numbers."""
-
-    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid", allow_inf_nan=False)
