@@ -80,7 +80,7 @@ def _least(data: Data) -> dict[str, float]:
     encoder = truth.motor.encoder
     fine_deg = 360.0 / (encoder.counts_per_turn * encoder.interpolation)
     return {
-        FOLLOWING: fine_deg,
+        FOLLOWING: fine_deg / 12.0**0.5,
         TORQUE: _shaken_nm(truth, math.radians(fine_deg)) / 12.0**0.5,
         LOAD: float(
             np.hypot(truth.load_.encoder.noise_arcsec, fine_deg * ARCSEC_PER_DEG / data.axis.gear.ratio)
