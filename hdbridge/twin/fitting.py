@@ -43,6 +43,8 @@ EARNED = 8.0
 gone on from: exp(8) to one."""
 SURE = 4.0
 """... and the first one's distance from where it was, in standard deviations."""
+LAST_STEPS = 6
+"""Steps that show whether they are: how fast friction falls off is seen only once it is known to."""
 FILTER_SHARES = (0.25, 0.9)
 """Shares of the lag that may be the command filter's, to begin with."""
 FIRST_STEPS = 6
@@ -138,7 +140,7 @@ def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
         around = np.append(prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, around, 1, known=best.scales)
+        tried = solve(replays, there, wider, around, LAST_STEPS, known=best.scales)
         new = len(best.parameters)
         off = abs(float(tried.place[new] - around[new]))
         sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
