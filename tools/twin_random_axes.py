@@ -96,8 +96,8 @@ class Outcome:
     """What was changed, the causes that are to be named, and those that were."""
 
 
-def draw(seed: int) -> tuple[AxisConfig, Truth]:
-    """A random axis."""
+def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
+    """A random axis; ``sticking``: with friction that is higher near rest, too."""
     rng = np.random.default_rng(seed)
 
     def some() -> float:
@@ -148,6 +148,12 @@ def draw(seed: int) -> tuple[AxisConfig, Truth]:
     drive = axis.drive.model_copy(
         update={"following_error_deg": max(window_deg, axis.drive.following_error_deg)}
     )
+    if sticking:
+        more = np.random.default_rng([seed, 1])
+        motor["stribeck"] = {
+            "rise": float(more.uniform(0.2, 1.0)),
+            "speed_rad_s": float(np.exp(more.uniform(math.log(1.5), math.log(10.0)))),
+        }
     return axis.model_copy(update={"drive": drive}), Truth.model_validate(truth)
 
 
@@ -218,9 +224,8 @@ def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
     return Recording.joined(parts)
 
 
-def recorded(seed: int) -> tuple[Recording, Recording] | None:
-    """A random axis on both plans; None where its drive cannot follow them and stops."""
-    axis, truth = draw(seed)
+def recorded(seed: int, axis: AxisConfig, truth: Truth) -> tuple[Recording, Recording] | None:
+    """An axis on both plans; None where its drive cannot follow them and stops."""
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
     try:
         return bench(axis, truth, Plan.load("dynamics"), seed), bench(axis, truth, another, seed + 1000)
@@ -229,9 +234,17 @@ def recorded(seed: int) -> tuple[Recording, Recording] | None:
         return None
 
 
-def one(seed: int, recording: Recording, other: Recording, *, checks: bool, workers: int) -> Outcome:
+def one(
+    seed: int,
+    axis: AxisConfig,
+    truth: Truth,
+    recording: Recording,
+    other: Recording,
+    *,
+    checks: bool,
+    workers: int,
+) -> Outcome:
     """Twin and judge."""
-    axis, truth = draw(seed)
     began_s = time.perf_counter()
     twin = fit_twin([recording], axis, usual(axis, truth), workers=workers)
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
@@ -304,6 +317,7 @@ def main() -> None:
     parser.add_argument("--axes", type=int, default=20)
     parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--sticking", action="store_true", help="friction that is higher near rest, too")
     parser.add_argument("--checks", action="store_true", help="change the plants, and check the twins")
     options = parser.parse_args()
     print(
@@ -311,10 +325,11 @@ def main() -> None:
     )
     found = []
     for seed in range(options.first, options.first + options.axes):
-        both = recorded(seed)
+        drawn = draw(seed, sticking=options.sticking)
+        both = recorded(seed, *drawn)
         if both is None:
             continue
-        each = one(seed, *both, checks=options.checks, workers=options.workers)
+        each = one(seed, *drawn, *both, checks=options.checks, workers=options.workers)
         found.append(each)
         print(line(each), flush=True)
         for miss in each.missed:
