@@ -55,7 +55,8 @@ def figure(value: float, digits: int = 4) -> str:
     if not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
-    return f"{value:.{decimals}f}".rstrip("0").rstrip(".") if decimals > 0 else f"{value:.0f}"
+    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
+    return text.rstrip("0").rstrip(".") if decimals > 0 else text
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
@@ -65,4 +66,5 @@ def with_interval(value: float, half_width: float) -> tuple[str, str]:
     last = math.floor(math.log10(half_width)) - 1
     if 0.0 < abs(value) < 1e-4:
         return f"{value:.{max(math.floor(math.log10(abs(value))) - last, 0)}e}", f"{half_width:.1e}"
-    return f"{value:.{max(-last, 0)}f}", f"{half_width:.{max(-last, 0)}f}"
+    told, half = (f"{round(each, -last):.{max(-last, 0)}f}" for each in (value, half_width))
+    return told, half

@@ -76,8 +76,10 @@ def test_against_the_true_model_nothing_improves(bench):
 
 def test_an_axis_that_has_not_changed_is_offered_no_new_model(bench):
     axis = bench.axis(motor_counts=8000.0, behind_counts=0.15)
-    first = fit(axis.record(bench.plan()), axis.ratio, bench.options)
-    again = fit(axis.record(bench.plan(), seed=1), axis.ratio, replace(bench.options, active=first.model))
+    first = fit(axis.record(bench.plan(turns=6.0)), axis.ratio, bench.options)
+    again = fit(
+        axis.record(bench.plan(turns=6.0), seed=1), axis.ratio, replace(bench.options, active=first.model)
+    )
     assert not again.held_out.improves, again.held_out.text
 
 
