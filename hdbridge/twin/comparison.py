@@ -176,7 +176,8 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
             apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
             twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
-    count_deg = _step(measured.motor_position_deg, parts)
+    motor = measured.motor_position_deg
+    count_deg = _least(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
     goes = ~_stands(measured, parts, count_deg)
     rows = [
@@ -270,12 +271,12 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     A motion that is smooth over four samples is not in it. A reading in steps of q is off by q / sqrt(12).
     """
     squares = count = 0.0
-    resolution, least = math.inf, 1e-9 * float(np.max(np.abs(values), initial=1.0))
+    resolution = math.inf
     for part in parts:
         third = np.diff(values[part], 3)
         inside = which[part]
-        steps = np.abs(np.diff(values[part]))[inside[1:] & inside[:-1]]
-        resolution = min(resolution, float(np.min(steps, where=steps > least, initial=math.inf)))
+        changes = np.diff(values[part])[inside[1:] & inside[:-1]]
+        resolution = min(resolution, _least(changes, values))
         whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
         squares += float(np.sum(third[whole] ** 2))
         count += float(np.count_nonzero(whole))
@@ -296,11 +297,10 @@ def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
     return np.concatenate(still)
 
 
-def _step(values: FloatArray, parts: Sequence[slice]) -> float:
-    """The least change of a reading."""
-    changes = np.abs(np.concatenate([np.diff(values[part]) for part in parts]))
-    least = 1e-9 * float(np.max(np.abs(values), initial=1.0))
-    return float(np.min(changes, where=changes > least, initial=math.inf))
+def _least(changes: FloatArray, values: FloatArray) -> float:
+    """The least of a reading's changes, beyond what arithmetic leaves of none."""
+    beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
+    return float(np.min(size, where=size > beyond, initial=math.inf))
 
 
 @dataclass(frozen=True, slots=True)
