@@ -181,12 +181,12 @@ class _Search:
 
     def found(self, progress: Callable[[float], None]) -> _Place:
         """The causes without which the recording cannot be told, and what they have come to."""
-        best = self.at((), self._twin)
-        suspects = [cause for cause in self._causes if self._suspect(cause, best)]
+        unchanged = self.at((), self._twin)
+        suspects = [cause for cause in self._causes if self._suspect(cause, unchanged)]
         if not suspects:
-            return best
-        starts = self._contenders(best, suspects)
-        best = self._settled((), self._twin, best)
+            return unchanged
+        starts = self._contenders(unchanged, suspects)
+        best = self._settled((), self._twin, unchanged)
         for done in range(ROUNDS):
             progress((done + 0.5) / ROUNDS)
             pulled = [each for each in self._causes if each not in best.causes and self._pulled(each, best)]
@@ -200,7 +200,7 @@ class _Search:
             if not step.causes or not self._explains_more(step, best):
                 break
             best, starts = step, []
-        return best if best.causes else self.at((), self._twin)
+        return best if best.causes else unchanged
 
     def _needed(self, best: _Place) -> _Place:
         """The place without the causes that others, and what the twin leaves open, make up for."""
@@ -232,16 +232,15 @@ class _Search:
         own = [each for each in self._every if each.cause == cause]
         return at_coordinates(truth, own, coordinates(self._twin, own))
 
-    def _pull(self, cause: str, best: _Place) -> float:
-        """How far a cause has gone along, in squared standard deviations of what the twin leaves open."""
-        own = [number for number, each in enumerate(self._every) if each.cause == cause]
-        root = self._root[own]
-        return float(best.off[own] @ np.linalg.solve(root @ root.T, best.off[own]))
+    def _pull(self, numbers: Sequence[int], at: _Place) -> float:
+        """How far parameters have gone along, in squared standard deviations of what the twin leaves open."""
+        off, root = at.off[numbers], self._root[numbers]
+        return float(off @ np.linalg.solve(root @ root.T, off))
 
     def _pulled(self, cause: str, best: _Place) -> bool:
-        """Whether that is further than by chance."""
-        count = sum(each.cause == cause for each in self._every)
-        return float(chdtrc(count, self._pull(cause, best))) < FALSE_ALARM / len(self._causes)
+        """Whether a cause has gone along by more than chance."""
+        own = [number for number, each in enumerate(self._every) if each.cause == cause]
+        return float(chdtrc(len(own), self._pull(own, best))) < FALSE_ALARM / len(self._causes)
 
     def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
         """What is said of a cause."""
@@ -345,8 +344,7 @@ class _Search:
         """What a place leaves, how far it is from the twin, and what its causes cost: less is better."""
         left = at.left if apart is None else at.left * at.apart / apart
         others = [number for number, each in enumerate(self._every) if each.cause not in at.causes]
-        root = self._root[others]
-        along = float(at.off[others] @ np.linalg.solve(root @ root.T, at.off[others]))
+        along = self._pull(others, at)
         return 0.5 * (float(left @ left) + along + sum(map(self._price, at.causes)))
 
     def _squares(self, left: FloatArray) -> FloatArray:
