@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, settings
 
 for each in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # as the command line does, see hdbridge/__main__.py
     os.environ.setdefault(each, "1")
-# Most of what a collection walks through here lives as long as the tests do.
+# Most of what a collection walks through here lives as long as the tests do; a full one takes half a second.
+# With these numbers there is hardly one but where a test asks for it.
 gc.set_threshold(20_000, 50, 100)
 slow_machines = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # A change fails or it does not, but not by lot: more of always the same examples would tell little more.
@@ -22,17 +23,6 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGQUIT, signal.SIG_DFL)):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def what_lives_already_is_collected_no_more() -> None:
-    """To walk through it takes a third of a second; to ask how much of it is left out takes a hundredth.
-
-    At the first test, and in the module after one that has prepared for real time, which thaws everything.
-    """
-    if not gc.get_freeze_count():
-        gc.collect()
-        gc.freeze()
 
 
 @pytest.fixture

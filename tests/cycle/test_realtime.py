@@ -10,11 +10,6 @@ import pytest
 from hdbridge.control.realtime import left_realtime, prepare_realtime, resumed_realtime
 
 
-@pytest.fixture(autouse=True)
-def nothing_frozen() -> None:
-    gc.unfreeze()
-
-
 def state() -> tuple[int, int, bool, int, set[int]]:
     return (
         os.sched_getscheduler(0),
