@@ -9,7 +9,9 @@ and a fit costs no more than one with white noise (Rybicki and Press 1995).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -24,6 +26,8 @@ SMALLEST_ARCSEC = 1e-3
 DIFFERENCE = 1e-4
 """Step of the likelihood's slopes, in logarithms: the rounding of a smaller one stops the fit on its way."""
 COLUMNS_AT_ONCE = 8
+CHAINS_KEPT = 8
+"""A slope of the likelihood needs two at each length and one at a step from it."""
 SAME_LEG = 1e-8
 """A block's step along a wander that stays the same over a leg: as good as none."""
 
@@ -68,6 +72,65 @@ class White:
         )
 
 
+class _Chain(NamedTuple):
+    """A wander of unit size along some blocks: its inverse covariance, and what a block's mean has of it."""
+
+    diagonal: FloatArray
+    off_diagonal: FloatArray
+    log_determinant: float
+    load: FloatArray
+
+
+class _Wanders:
+    """The chains of some blocks. A search for a noise model asks for the same length again and again."""
+
+    def __init__(self, blocks: Blocks) -> None:
+        self._blocks = blocks
+        self._fresh = np.diff(blocks.chain) != 0
+        self._kept: dict[object, _Chain] = {}
+
+    def in_time(self, length_s: float) -> _Chain:
+        """The slow wander."""
+        blocks = self._blocks
+        return self._once(("time", length_s), lambda: self._along(blocks.time_s, blocks.duration_s, length_s))
+
+    def in_place(self, length_deg: float) -> _Chain:
+        """The wander over the motor's travel."""
+        blocks = self._blocks
+        return self._once(
+            ("place", length_deg), lambda: self._along(blocks.travel_deg, blocks.extent_deg, length_deg)
+        )
+
+    def over_legs(self) -> _Chain:
+        """What stays the same over a leg, of the size that the blocks say."""
+        blocks = self._blocks
+        return self._once(
+            "leg",
+            lambda: _chain(np.where(np.diff(blocks.leg) != 0, np.inf, SAME_LEG), blocks.locked_arcsec),
+        )
+
+    def _along(self, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
+        way = np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length
+        return _chain(np.where(self._fresh, np.inf, way), np.sqrt(_averaged(extent / length)))
+
+    def _once(self, key: object, make: Callable[[], _Chain]) -> _Chain:
+        if key not in self._kept:
+            if len(self._kept) >= CHAINS_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+def _chain(step: FloatArray, load: FloatArray) -> _Chain:
+    """By the steps from block to block in correlation lengths; infinite where nothing is left."""
+    spread = -np.expm1(-2.0 * step)
+    decay = np.exp(-step)
+    diagonal = np.ones(len(load))
+    diagonal[:-1] += decay**2 / spread
+    diagonal[1:] += decay**2 / spread
+    return _Chain(diagonal, -decay / spread, float(-np.sum(np.log(spread))), load)
+
+
 class Precision:
     """The inverse covariance of the noise of some blocks, applied without ever being written out.
 
@@ -75,46 +138,42 @@ class Precision:
     K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
     """
 
-    def __init__(self, noise: NoiseModel, blocks: Blocks, left_out: BoolArray | None = None) -> None:
-        """Blocks in ``left_out`` count as not observed."""
+    def __init__(
+        self,
+        noise: NoiseModel,
+        blocks: Blocks,
+        left_out: BoolArray | None = None,
+        wanders: _Wanders | None = None,
+    ) -> None:
+        """Blocks in ``left_out`` count as not observed; ``wanders`` are those of the blocks, where known."""
         weight = 1.0 / noise.white_variance(blocks)
         if left_out is not None:
             weight = np.where(left_out, 0.0, weight)
         self.weight: FloatArray = weight
-        self._loads: list[FloatArray] = []
-        chains: list[tuple[FloatArray, FloatArray]] = []
-        fresh = np.diff(blocks.chain) != 0
-        other_leg = np.where(np.diff(blocks.leg) != 0, np.inf, SAME_LEG)
         self._log_determinant = float(np.sum(np.log(weight[weight > 0])))
-        steps: list[FloatArray] = []
-        for size, length, place, extent in (
-            (noise.slow_arcsec, noise.slow_s, blocks.time_s, blocks.duration_s),
-            (noise.place_arcsec, noise.place_deg, blocks.travel_deg, blocks.extent_deg),
-        ):
-            if size > 0:
-                way = np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length
-                steps.append(np.where(fresh, np.inf, way))
-                self._loads.append(size * np.sqrt(_averaged(extent / length)))
+        wanders = wanders or _Wanders(blocks)
+        chains: list[_Chain] = []
+        self._loads: list[FloatArray] = []
+        if noise.slow_arcsec > 0:
+            chains.append(wanders.in_time(noise.slow_s))
+            self._loads.append(noise.slow_arcsec * chains[-1].load)
+        if noise.place_arcsec > 0:
+            chains.append(wanders.in_place(noise.place_deg))
+            self._loads.append(noise.place_arcsec * chains[-1].load)
         if np.any(blocks.locked_arcsec):
-            steps.append(other_leg)
-            self._loads.append(blocks.locked_arcsec)
-        for step in steps:
-            spread = -np.expm1(-2.0 * step)
-            decay = np.exp(-step)
-            diagonal = np.ones(len(blocks))
-            diagonal[:-1] += decay**2 / spread
-            diagonal[1:] += decay**2 / spread
-            chains.append((diagonal, -decay / spread))
-            self._log_determinant += float(-np.sum(np.log(spread)))
+            chains.append(wanders.over_legs())
+            self._loads.append(chains[-1].load)
+        for chain in chains:
+            self._log_determinant += chain.log_determinant
         self._factor = self._factored(chains) if chains else None
 
-    def _factored(self, chains: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    def _factored(self, chains: list[_Chain]) -> FloatArray:
         """Cholesky factor of the bracket, wanders interleaved."""
         width, count = len(chains), len(self.weight)
         band = np.zeros((width + 1, width * count))
-        for number, (diagonal, off_diagonal) in enumerate(chains):
-            band[0, number::width] = diagonal + self.weight * self._loads[number] ** 2
-            band[width, number : width * (count - 1) : width] = off_diagonal
+        for number, chain in enumerate(chains):
+            band[0, number::width] = chain.diagonal + self.weight * self._loads[number] ** 2
+            band[width, number : width * (count - 1) : width] = chain.off_diagonal
         for apart in range(1, width):
             for number in range(width - apart):
                 band[apart, number::width] = self.weight * self._loads[number] * self._loads[number + apart]
@@ -177,8 +236,10 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
     lower = np.log([SMALLEST_ARCSEC, SMALLEST_ARCSEC, SMALLEST_ARCSEC, 0.3, SMALLEST_ARCSEC, 0.01])
     upper = np.log([1e3, 1e3, 1e3, 600.0, 1e3, 60.0])
 
+    wanders = _Wanders(part)
+
     def cost(x: FloatArray) -> float:
-        return -Precision(model(x), part).log_likelihood(left)
+        return -Precision(model(x), part, wanders=wanders).log_likelihood(left)
 
     x = np.log(np.maximum(astuple(begin), SMALLEST_ARCSEC))
     found = minimize(
