@@ -81,10 +81,24 @@ static int arm(void)
     return real_timer_settime(timer, 0, &each, NULL);
 }
 
+/* Not only when all are idle: a command that computes from its first moment would do so while time still flies. */
+static void slow_down_when_booted(void)
+{
+    if (!slowed_from || access(slowed_from, F_OK) != 0)
+        return;
+    int64_t now_ns = guest_ns();
+    machine_base_ns = machine_ns();
+    guest_base_ns = now_ns;
+    slowed = slowed_later;
+    quickened = 1;
+    slowed_from = NULL;
+}
+
 int timer_settime(timer_t which, int flags, const struct itimerspec *set, struct itimerspec *old)
 {
     if (!slowed || flags)
         return real_timer_settime(which, flags, set, old);
+    slow_down_when_booted();
     timer = which;
     every_ns = ns_of(&set->it_interval);
     expiry_ns = ns_of(&set->it_value);
@@ -112,20 +126,10 @@ int timer_gettime(timer_t which, struct itimerspec *left)
     return 0;
 }
 
-static void slow_down(void)
-{
-    int64_t now_ns = guest_ns();
-    machine_base_ns = machine_ns();
-    guest_base_ns = now_ns;
-    slowed = slowed_later;
-    quickened = 1;
-    slowed_from = NULL;
-}
-
 int sigsuspend(const sigset_t *mask)
 {
-    if (slowed && slowed_from && access(slowed_from, F_OK) == 0)
-        slow_down();
+    if (slowed)
+        slow_down_when_booted();
     if (slowed && expiry_ns) {
         int64_t left_ns = expiry_ns - guest_ns();
         if (left_ns > 0)
