@@ -44,7 +44,7 @@ class Errors:
     """Errors at the load, by the encoders, in the parts of one short run."""
 
     def __init__(self, truth: Truth) -> None:
-        exercise = Exercise(Machine(truth, 1))
+        exercise = Exercise(Machine(truth, 1, may_compile=True))
         marks: dict[str, tuple[int, int]] = {}
 
         def part(name: str, do: Callable[[], None]) -> None:

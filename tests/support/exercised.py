@@ -12,7 +12,7 @@ from hdbridge.sim.truth import Truth
 
 def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> Record:
     """What the encoders of a simulated axis say while it is led through moves; every channel is there."""
-    bench = Exercise(Machine(truth, seed))
+    bench = Exercise(Machine(truth, seed, may_compile=True))
     lead(bench)
     readings = bench.readings()
     return Record(

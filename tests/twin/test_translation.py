@@ -51,6 +51,7 @@ from hdbridge.effects import (
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
+from hdbridge.sim import fast
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
@@ -155,6 +156,8 @@ class Case:
     floor_arcsec: float = 0.5
     """... and what the plant's dynamics add at these speeds."""
     plant: Callable[[Truth], Truth] = lambda truth: truth
+    in_python: bool = False
+    """Its law has more elements than others: to compile an axis with room for them takes far longer."""
 
 
 SPRING = Compliance(
@@ -185,7 +188,7 @@ CASES = {
     ),
     "channel_skew": Case((*BASIC, ChannelSkew.of_delay(2.0, N)), several_speeds, floor_arcsec=2.0),
     "backlash": Case((*BASIC, Backlash.of_gap(40.0, N, softness=1.0)), left=0.15),
-    "hysteresis_memory": Case((BASIC[0], HysteresisMemory(**LOOP)), nested),
+    "hysteresis_memory": Case((BASIC[0], HysteresisMemory(**LOOP)), nested, in_python=True),
     "hysteresis_parameters": Case(
         (
             *BASIC,
@@ -289,8 +292,10 @@ def test_every_effect_of_the_catalogue_has_its_row() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_simulated_drive_errs_as_the_model_says(name: str) -> None:
+def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES[name]
+    if case.in_python:
+        monkeypatch.setenv(fast.SWITCH, "0")
     base = case.plant(default_truth(AXIS))
     # A spring that nothing asks for would wind up without the model's knowledge.
     translation = translate(

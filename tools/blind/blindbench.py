@@ -71,7 +71,9 @@ class Bench:
     def __init__(self, truth: Truth, seed: int, plan: Plan, means: bool = False) -> None:
         self._plan = plan
         self._means = means
-        self._exercise = Exercise(Machine(truth, seed), CYCLE_S, 1 if means else CYCLES_PER_SAMPLE)
+        self._exercise = Exercise(
+            Machine(truth, seed, may_compile=True), CYCLE_S, 1 if means else CYCLES_PER_SAMPLE
+        )
 
     def record(self) -> Readings:
         """The whole record."""
