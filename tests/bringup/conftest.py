@@ -65,7 +65,8 @@ class Case:
         truth = Truth.from_text(edited(plain, self.truth))
         nameplate = nameplate_of(truth if self.honest else Truth.from_text(plain))
         eds = ARTICLE.parents[1] / "eds" / "hdbridge-402.eds"
-        with lockstep_bench(Machine(truth, 0), eds, self.node_id, nameplate=nameplate) as (bus, clock, node):
+        machine = Machine(truth, 0, may_compile=True)
+        with lockstep_bench(machine, eds, self.node_id, nameplate=nameplate) as (bus, clock, node):
             self.node = node
             self.spoil(node)
             yield bus, clock
