@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,8 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
-from hdbridge.twin.misfit import CHANNELS, coarse, prepare
+from hdbridge.twin.minima import elsewhere, exchanged, lags, springs
+from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
     BY_NAME,
@@ -24,14 +25,11 @@ from hdbridge.twin.parameters import (
     at_coordinates,
     coordinates,
     value_in,
-    with_values,
 )
 from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
-from hdbridge.twin.scales import Loops, scales
+from hdbridge.twin.scales import Loops, Scales, scales
 
-FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
-"""Where the resonance of the load is looked for: a fit finds only the nearest of its minima."""
 FIT_S = 60.0
 """A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
 there is time: a thousand replays of a quarter of an hour would take hours."""
@@ -45,13 +43,13 @@ SURE = 4.0
 """... and the first one's distance from where it was, in standard deviations."""
 LAST_STEPS = 6
 """Steps that show whether they are: how fast friction falls off is seen only once it is known to."""
-FILTER_SHARES = (0.25, 0.9)
-"""Shares of the lag that may be the command filter's, to begin with."""
 FIRST_STEPS = 6
 """From each of the starts a fit goes so many steps, as many more from the first and the best of the others,
 and as many from the better of these with its gains exchanged;"""
 MORE_STEPS = 10
 """... then so many from the first, and the best of what else there is."""
+FEW_STEPS = 4
+"""From each of the places that are tried in the end, first."""
 NEAR_STEPS = 30
 """Steps at most over all of the recording, by the noise that is expected;"""
 STEPS = 30
@@ -94,17 +92,16 @@ def fit(
     begun = start_of(start, data)
     parameters = free_parameters(begun, more)
     prior = np.array(coordinates(begun, parameters))
-    with Replays(rough, workers) as replays:
-        begun = _at_best_frequency(replays, begun)
+    with Replays(rough, workers) as roughly, Replays(data, workers) as replays:
+        begun = _at_best_frequency(roughly, begun)
         progress(0.1)
-        first = _best_of(replays, _starts(begun), parameters, prior)
-    progress(0.2)
-    with Replays(data, workers) as replays:
+        first = _best_of(roughly, [begun, *lags(begun)], parameters, prior)
+        progress(0.2)
         (before,) = replays([start])
         most = scales(data, before)
         ends = []
         for number, each in enumerate(first):
-            progress(0.2 + 0.7 * number / len(first))
+            progress(0.2 + 0.4 * number / len(first))
             # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
             # that tells it from the right one.
             if each.inflation < SOFT**2:
@@ -114,22 +111,73 @@ def fit(
             # This axis has what no simulation has, in the channel that led the way. By the noise, however
             # tempered, the others had no say; by what each of them is left with they have.
             ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
-        progress(0.9)
+        progress(0.6)
         best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
-        # A rough fit knows little of what the two gains do at rest, where only they differ.
-        other = solve(replays, exchanged(best.truth), parameters, prior, MORE_STEPS, most=most)
-        if other.loss + EARNED < best.loss:
-            best = solve(replays, other.truth, parameters, prior, STEPS, most=most, near=other)
-        best, around = with_last(replays, best, prior)
+        while True:
+            if _leaves_more(replays.data, best):
+                for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
+                    best = _better(replays, best, there, prior, most)
+            # A rough fit knows little of what the two gains do at rest, where only they differ.
+            best = _better(replays, best, exchanged(best.truth), prior, most)
+            wider, prior = with_last(replays, best, prior)
+            if wider is best:
+                break
+            best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+        progress(0.85)
         for _ in range(ROUNDS):
             last, loops = best, loops_about(replays, best)
             best = solve(
-                replays, best.truth, best.parameters, around, STEPS, most=most, near=best, loops=loops
+                replays, best.truth, best.parameters, prior, STEPS, most=most, near=best, loops=loops
             )
             if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
                 break
+        # So much longer differences are no guide to a minimum: next to it the loops may be unstable.
+        best = solve(
+            replays, best.truth, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True
+        )
     progress(1.0)
     return best
+
+
+def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
+    """The fit from another place, if that is beyond doubt better."""
+    other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most)
+    if other.loss + EARNED >= best.loss:
+        return best
+    return solve(replays, other.truth, best.parameters, prior, STEPS, most=most, near=other)
+
+
+def _leaves_more(data: Data, best: Fitted) -> bool:
+    """Whether a fit leaves more of any channel than the true axis would."""
+    noise = expected(data).deviation
+    return any(best.scales.deviation[name] > noise[name] for name in CHANNELS)
+
+
+def better_places(
+    roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth, prior: FloatArray
+) -> list[Truth]:
+    """Of each kind of places the one that is led to a better fit of a few legs, if one is.
+
+    The other parameters are known by now: where the fit began, each of these was as good as any other.
+    """
+    (before,) = roughly([begun])
+    most = scales(roughly.data, before)
+
+    def led(truth: Truth, steps: int, near: Fitted | None = None) -> Fitted:
+        return solve(roughly, truth, best.parameters, prior, steps, most=most, near=near)
+
+    def loss(fitted: Fitted) -> float:
+        return fitted.loss
+
+    own = led(best.truth, FEW_STEPS + FIRST_STEPS)
+    found = []
+    for places in kinds:
+        if places:
+            nearest = min((led(each, FEW_STEPS) for each in places), key=loss)
+            reached = led(nearest.truth, FIRST_STEPS, nearest)
+            if reached.loss + EARNED < own.loss:
+                found.append(reached.truth)
+    return found
 
 
 def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
@@ -153,8 +201,7 @@ def loops_about(replays: Replays, fitted: Fitted) -> Loops:
     """What a drive's loops do otherwise than smooth ones about a fit, within its covariance."""
     rng = np.random.default_rng(0)
     low, high = np.array([each.bounds for each in fitted.parameters]).T
-    root = np.linalg.cholesky(fitted.covariance)
-    places = fitted.place + rng.standard_normal((LOOPS, len(root))) @ root.T
+    places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
     truths = [
         at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
     ]
@@ -164,30 +211,6 @@ def loops_about(replays: Replays, fitted: Fitted) -> Loops:
     return Loops(
         {name: np.mean(each, axis=0) for name, each in apart.items()},
         {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
-    )
-
-
-def _starts(truth: Truth) -> list[Truth]:
-    """The truth, and with other shares of command filter and dead time in the same lag."""
-    lag_ms = 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
-    return [truth] + [
-        with_values(
-            truth, {"command filter": 0.5 * share * lag_ms, "servo dead time": (1.0 - share) * lag_ms}
-        )
-        for share in FILTER_SHARES
-    ]
-
-
-def exchanged(truth: Truth) -> Truth:
-    """The truth with position gain and the inverse of the integral time exchanged.
-
-    While the axis moves that is the same loop, for only their sum and their product are in its answer: each
-    of the two has a minimum of its own.
-    """
-    servo = truth.servo
-    return with_values(
-        truth,
-        {"position gain": 1e3 / servo.integral_time_ms, "integral time": 1e3 / servo.position_gain_per_s},
     )
 
 
@@ -226,13 +249,6 @@ def _best_of(
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:
     """The truth with the spring at which the load's angle comes out best."""
-    inertia = truth.load_.whole_inertia_kg_m2
-    now = truth.gear.stiffness_nm_per_rad
-    tried = [truth]
-    for hz in FREQUENCIES_HZ:
-        stiffness = inertia * (math.tau * hz) ** 2
-        damping = truth.gear.damping_nm_s_per_rad * math.sqrt(stiffness / now)
-        if stiffness < 0.9 * truth.highest_stiffness_nm_per_rad:
-            tried.append(with_values(truth, {"gear stiffness": stiffness, "gear damping": damping}))
+    tried = [truth, *springs(truth)]
     off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(tried)]
     return tried[int(np.argmin(off))]

@@ -17,7 +17,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import over_legs
+from hdbridge.twin.covariance import over_legs
 from hdbridge.twin.parameters import Parameter
 
 

@@ -18,9 +18,8 @@ from scipy.optimize import brentq, lsq_linear
 
 from hdbridge.effects import FloatArray
 from hdbridge.estimation.intervals import NORMAL_95
-from hdbridge.estimation.stretches import counted as numbered
-from hdbridge.estimation.stretches import sums
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.covariance import eigen, root_of, sandwich
 from hdbridge.twin.likelihood import FINE, rooted, surprise
 from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
@@ -34,6 +33,13 @@ RESPONSE = 1.0
 motion shows less."""
 FARTHEST = 0.1
 """The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
+WIDE = 3.0
+"""So much longer, and in both senses, are the differences that intervals are made of. A motor that sticks
+breaks away elsewhere in each replay: short differences are steep by that alone, and intervals too narrow."""
+TOO_FAR = 1.0
+"""Change of scaled residuals (rms) beyond which a difference ends where the loops are unstable;"""
+NEARER = 0.1
+"""... so much shorter it is made anew."""
 DAMPINGS = (0.0, 0.001, 0.01, 0.1)
 """Shares of the information's diagonal that are added to it (Marquardt)."""
 LONGEST = (4.0, 1.5, 0.6, 0.2)
@@ -49,9 +55,6 @@ WORTH = 1.0
 """A drop of half the squares by less is no evidence of anything."""
 SOFT = 4.0
 """Residuals beyond so many scales count less: a replay that slips elsewhere is no measure of a parameter."""
-
-LEAST = 1e-9
-"""Of the information of all legs, a share that none of them has alone."""
 
 Progress = Callable[[float], None]
 
@@ -124,6 +127,7 @@ def solve(
     near: Fitted | None = None,
     loops: Loops | None = None,
     tempered: bool = False,
+    wide: bool = False,
 ) -> Fitted:
     """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
 
@@ -131,7 +135,8 @@ def solve(
     what each step leaves, ``most`` at most: a channel that has become worse does not count for less.
     ``tempered``: known scales grow with what a place leaves on the way to the minimum.
     Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
-    directions the first differences are made along, ``loops`` what a drive's loops do otherwise.
+    directions the first differences are made along, ``loops`` what a drive's loops do otherwise. ``wide``:
+    the last differences, of which the covariance is made, are wide ones.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -145,6 +150,9 @@ def solve(
     (found,) = led([place])
     scale = known if known is not None else _capped(scales(data, found, loops), most)
 
+    def seen(places: Sequence[FloatArray]) -> list[FloatArray]:
+        return [scale.scaled(each)[rows] for each in led(places)]
+
     def cost(place: FloatArray, found: dict[str, FloatArray]) -> float:
         """Half the squares of the residuals as they count, and the prior's."""
         left, off = told(found, scale, rows), (place - prior) / spread
@@ -157,9 +165,7 @@ def solve(
         if known is not None and tempered:
             scale = known if last else _tempered(known, found, rows)
         now = scale.scaled(found)[rows]
-        ends = _ends(place, moves, low, high)
-        changes = np.stack([scale.scaled(each)[rows] for each in led(ends)]) - now
-        slopes: FloatArray = (np.linalg.pinv(np.stack(ends) - place) @ changes).T
+        slopes = slopes_at(seen, now, place, moves, (low, high), wide=wide and last)
         left, weights = counting(now, scale, rows)
         slopes *= weights[:, None]
         if last:
@@ -241,8 +247,8 @@ class _Damped:
     """A step by the linear reckoning."""
 
     step: FloatArray
-    information: FloatArray
-    """With its damping."""
+    root: FloatArray
+    """Of the information with its damping: that is its transpose times it."""
 
     def turn(self, bent: FloatArray) -> FloatArray:
         """By how much a path along the step has to turn, at its end, to follow a curved valley.
@@ -250,7 +256,7 @@ class _Damped:
         ``bent`` is the slopes' product with half the second derivative of the residuals along the step
         (geodesic acceleration; Transtrum and Sethna, arXiv:1201.5885).
         """
-        return np.asarray(-np.linalg.solve(self.information, bent), dtype=np.float64)
+        return np.asarray(-np.linalg.solve(self.root, np.linalg.solve(self.root.T, bent)), dtype=np.float64)
 
 
 def _damped_steps(
@@ -264,55 +270,72 @@ def _damped_steps(
     """Steps by the linear reckoning, within the bounds, the boldest first (Levenberg, Marquardt).
 
     All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
+    By orthogonal factors: next to where its loops are unstable a simulation changes by so much that of the
+    prior nothing would be left in a sum of squares.
     """
-    information = information_of(slopes, spread)
+    seen = root_of(slopes, np.diag(1.0 / spread))
     gradient = slopes.T @ left + (place - prior) / spread**2
     low, high = bounds
     room = (np.minimum(low - place, -1e-12), np.maximum(high - place, 1e-12))
     found = []
     for damping, longest in zip(DAMPINGS, LONGEST, strict=True):
-        damped = information + damping * np.diag(np.diag(information))
-        damped += np.diag(_held(damped, gradient, spread, longest) / spread**2)
-        root = np.linalg.cholesky(damped)
+        root = root_of(seen, np.sqrt(damping) * np.diag(np.linalg.norm(seen, axis=0)))
+        held = _held(root, gradient, spread, longest)
+        root = root_of(root, np.diag(np.sqrt(held) / spread))
         # Least squares of which these are the normal equations.
-        target = -np.linalg.solve(root, gradient)
-        found.append(_Damped(lsq_linear(root.T, target, room).x, damped))
+        target = -np.linalg.solve(root.T, gradient)
+        found.append(_Damped(lsq_linear(root, target, room).x, root))
     return found
 
 
-def _held(information: FloatArray, gradient: FloatArray, spread: FloatArray, longest: float) -> float:
+def _held(root: FloatArray, gradient: FloatArray, spread: FloatArray, longest: float) -> float:
     """What is to be added to the information, in units of the prior's, for a step no longer than this."""
-    worth, directions = np.linalg.eigh(information * np.outer(spread, spread))
-    along = directions.T @ (gradient * spread)
+    _, size, directions = np.linalg.svd(root * spread)
+    along = directions @ (gradient * spread)
 
     def beyond(more: float) -> float:
-        return float(np.linalg.norm(along / (worth + more))) - longest
+        return float(np.linalg.norm(along / (size**2 + more))) - longest
 
     return float(brentq(beyond, 0.0, np.linalg.norm(along) / longest)) if beyond(0.0) > 0.0 else 0.0
 
 
-def _ends(place: FloatArray, moves: FloatArray, low: FloatArray, high: FloatArray) -> list[FloatArray]:
-    """Where to take differences from a place: each move in the sense in which the bounds leave more room."""
-    ends = []
-    for move in moves:
-        both = [np.clip(place + way * move, low, high) for way in (1.0, -1.0)]
-        ends.append(max(both, key=lambda each: float(np.linalg.norm(each - place))))
-    return ends
+def slopes_at(
+    seen: Callable[[Sequence[FloatArray]], list[FloatArray]],
+    now: FloatArray,
+    place: FloatArray,
+    moves: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    *,
+    wide: bool,
+) -> FloatArray:
+    """Derivatives, by coordinate, of the scaled residuals that are ``seen`` at places, ``now`` where we are.
+
+    By differences along the moves, each in the sense in which the bounds leave more room; ``wide`` ones,
+    which intervals are made of, are `WIDE` times as long and go both ways.
+    """
+    both = [
+        [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
+        for move in moves * (WIDE if wide else 1.0)
+    ]
+    if wide:
+        ends = [end for pair in both for end in pair]
+    else:
+        ends = [max(pair, key=lambda each: float(np.linalg.norm(each - place))) for pair in both]
+    changes = np.stack(seen(ends)) - now
+    far = np.flatnonzero(np.mean(np.square(changes), axis=1) > TOO_FAR**2)
+    if wide and len(far):
+        for each in far:
+            ends[each] = place + NEARER * (ends[each] - place)
+        changes[far] = np.stack(seen([ends[each] for each in far])) - now
+    return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
 def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     """Along the principal directions of the information, each as far as residuals change by `RESPONSE`."""
-    worth, directions = _eigen(slopes, spread)
+    worth, directions = eigen(slopes, spread)
     far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
-
-
-def _eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information and principal directions of the coordinates in units of their spreads."""
-    scaled = slopes * spread
-    worth, directions = np.linalg.eigh(scaled.T @ scaled + np.eye(len(spread)))
-    return worth, directions
 
 
 def softened(values: FloatArray) -> FloatArray:
@@ -326,51 +349,3 @@ def _softening(values: FloatArray) -> FloatArray:
     """Derivative of `softened`."""
     size = np.maximum(np.abs(values) / SOFT, 1.0)
     return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
-
-
-def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """What residuals of unit variance and the prior say of the coordinates, shape (p, p)."""
-    return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
-
-
-def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
-    """Sums of rows (n, p) over each leg, shape (legs, p); their squares make up for few legs."""
-    by_leg = sums(rows, numbered(legs.astype(np.intp)))
-    return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
-
-
-def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Directions of the coordinates, one a column, shape (p, p), in each of which the information is one.
-
-    A long valley is one of them. Each may be known worse by a factor of its own; were each *coordinate*, what
-    two of them have in common, which is known best of all, would be lost.
-    """
-    worth, directions = _eigen(slopes, spread)
-    return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
-
-
-def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
-    """Covariance of the coordinates where residuals of one leg go together and legs are independent.
-
-    By how far each leg alone has drawn the fit: without it, that would have ended elsewhere (jackknife by
-    legs; Bell and McCaffrey, Survey Methodology 28, 2002). One leg that a replay cannot follow draws a fit
-    by all that the others leave open, and has little left itself.
-
-    By principal directions: of a few legs no more can be said. None is better known than independent
-    residuals of the present size would have it, nor worse than before the fit. What the slopes would still
-    take of the residuals is no scatter of the legs.
-    """
-    along = principal(slopes, spread)
-    rows = slopes @ along
-    left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-    numbers = numbered(legs.astype(np.intp))
-    order = np.argsort(numbers, kind="stable")
-    drawn = []
-    for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
-        others = (1.0 + LEAST) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
-        drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
-    squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
-    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
-    white = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
-    times = np.minimum(np.maximum(squares, white), before)
-    return np.asarray(along * times @ along.T, dtype=np.float64)

@@ -16,15 +16,8 @@ from scipy.special import ndtri
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import (
-    Fitted,
-    fitted_rows,
-    information_of,
-    legs_of_rows,
-    over_legs,
-    solve,
-    told,
-)
+from hdbridge.twin.covariance import information_of, over_legs
+from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, solve, told
 from hdbridge.twin.misfit import counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays

@@ -17,11 +17,11 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
-from hdbridge.twin.fitting import exchanged, with_last
+from hdbridge.twin.fitting import with_last
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
-from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, value_in, with_values
+from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.scales import noise_floor
@@ -164,15 +164,3 @@ def test_a_check_names_what_has_changed_and_not_what_a_twin_is_off_by() -> None:
 def test_a_check_needs_a_twin_that_was_fitted() -> None:
     with pytest.raises(InputError, match=r"provenance\.fit"):
         check(recorded(), AXIS, TRUTH)
-
-
-def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_axis_moves() -> None:
-    data = prepare(recorded(), AXIS, TRUTH)
-    other = exchanged(TRUTH)
-    softer = with_values(TRUTH, {"position gain": other.servo.position_gain_per_s})
-    with Replays(data, 1) as replays:
-        own, same, wrong = (each[FOLLOWING] for each in replays([TRUTH, other, softer]))
-    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
-    assert np.std((same - own)[moving]) < 0.1 * np.std((wrong - own)[moving])
-    assert other.servo.position_gain_per_s < 0.5 * TRUTH.servo.position_gain_per_s
-    assert exchanged(other).servo.position_gain_per_s == pytest.approx(TRUTH.servo.position_gain_per_s)

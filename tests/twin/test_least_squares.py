@@ -1,36 +1,55 @@
-"""How sure a fit is of its parameters, where residuals of one leg go together."""
+"""Slopes of a misfit that is rough, or that ends where the loops are unstable."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
-from hdbridge.twin.least_squares import sandwich
+from hdbridge.twin.least_squares import slopes_at
 
-
-def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:
-    rng = np.random.default_rng(1)
-    slopes = rng.standard_normal((600, 1)) + 0.01 * rng.standard_normal((600, 3))  # a valley
-    spread, legs = np.full(3, 0.7), np.repeat([0.0, 1.0], 300)
-    white = rng.standard_normal(600)
-    for left in (white, white + 5.0 * slopes[:, 0]):
-        covariance = sandwich(slopes, left, legs, spread)
-        least = np.linalg.inv(slopes.T @ slopes + np.diag(spread**-2.0))
-        times = np.linalg.eigvals(covariance @ np.linalg.inv(least)).real
-        assert np.all(times > 0.9), "never better than by independent residuals"
-        assert np.all(times < 8.0), "nor much worse where they are"
-        assert np.all(np.linalg.eigvalsh(covariance / 0.49) < 1.0 + 1e-9), "nor than before the fit"
+Rows = NDArray[np.float64]
+TRUE = np.random.default_rng(3).standard_normal((400, 2))
+BOUNDS = (np.full(2, -5.0), np.full(2, 5.0))
 
 
-def test_intervals_hold_the_truth_where_one_leg_draws_the_fit_more_than_the_others() -> None:
-    """Each leg has a value of its own, and one of eight has as much information as four others."""
-    legs = np.repeat(np.arange(8.0), 50)
-    slopes = np.where(legs == 0.0, 2.0, 1.0)[:, None]
-    off = []
-    for seed in range(300):
-        rng = np.random.default_rng(seed)
-        own = rng.standard_normal(8)
-        seen = slopes[:, 0] * own[legs.astype(int)] + rng.standard_normal(400)
-        found = np.linalg.lstsq(slopes, seen, rcond=None)[0]
-        covariance = sandwich(slopes, seen - slopes @ found, legs, np.full(1, 10.0))
-        off.append(float(found[0]) / float(np.sqrt(covariance[0, 0])))
-    assert 0.88 <= np.mean(np.abs(off) < 1.96) <= 0.98
+def sight(shape: Callable[[Rows], Rows]) -> Callable[[Sequence[Rows]], list[Rows]]:
+    return lambda places: [shape(place) for place in places]
+
+
+def test_wide_differences_see_through_what_differs_from_replay_to_replay() -> None:
+    rng = np.random.default_rng(4)
+    where, rough = rng.uniform(size=400), 0.2
+
+    def shape(place: Rows) -> Rows:
+        """Rows that break away sooner or later, however little the place has changed."""
+        return TRUE @ place + rough * np.sin(2e3 * where * (1.0 + place.sum()))
+
+    moves = 0.05 * np.eye(2)
+    off = [
+        float(
+            np.linalg.norm(
+                slopes_at(sight(shape), shape(np.zeros(2)), np.zeros(2), moves, BOUNDS, wide=wide) - TRUE
+            )
+        )
+        for wide in (True, False)
+    ]
+    assert off[0] < 0.4 * off[1]
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_a_bound_leaves_the_slopes_the_other_way(wide: bool) -> None:
+    place = np.array([5.0, 0.0])
+    now = TRUE @ place
+    found = slopes_at(sight(lambda at: TRUE @ at), now, place, 0.01 * np.eye(2), BOUNDS, wide=wide)
+    np.testing.assert_allclose(found, TRUE, atol=1e-9)
+
+
+def test_no_slope_is_taken_from_where_the_loops_are_unstable() -> None:
+    def shape(place: Rows) -> Rows:
+        return TRUE @ place + (1e9 * np.sin(np.arange(400.0)) if place[0] > 0.05 else 0.0)
+
+    found = slopes_at(sight(shape), shape(np.zeros(2)), np.zeros(2), 0.03 * np.eye(2), BOUNDS, wide=True)
+    np.testing.assert_allclose(found, TRUE, atol=1e-9)

@@ -1,0 +1,70 @@
+"""Places where a fit may have a minimum of its own, beside the one that it has come to.
+
+A resonance that is off by more than its width makes things worse before it makes them better. Filter and
+dead time share a lag, the feed-forwards of motor and load share a torque, and while the axis moves two gains
+stand in for each other: along each of these a fit comes to rest at several places.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.parameters import with_values
+
+FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
+"""Where a resonance of the load is looked for: a fit finds only the nearest of its minima."""
+FILTER_SHARES = (0.25, 0.9)
+"""Shares of the lag that may be the command filter's."""
+
+
+def elsewhere(truth: Truth, usual: Truth) -> tuple[list[Truth], ...]:
+    """The truth at other places, by what is other there; ``usual`` is where the fit began."""
+    return springs(truth), lags(truth), feedforwards(truth, usual)
+
+
+def springs(truth: Truth) -> list[Truth]:
+    """The truth with springs at which the load resonates elsewhere, as far as its time step resolves them."""
+    inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
+    found = []
+    for hz in FREQUENCIES_HZ:
+        stiffness = inertia * (math.tau * hz) ** 2
+        damping = truth.gear.damping_nm_s_per_rad * math.sqrt(stiffness / now)
+        if stiffness < 0.9 * truth.highest_stiffness_nm_per_rad:
+            found.append(with_values(truth, {"gear stiffness": stiffness, "gear damping": damping}))
+    return found
+
+
+def lags(truth: Truth) -> list[Truth]:
+    """The truth with other shares of command filter and dead time in the same lag."""
+    lag_ms = 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
+    return [
+        with_values(
+            truth, {"command filter": 0.5 * share * lag_ms, "servo dead time": (1.0 - share) * lag_ms}
+        )
+        for share in FILTER_SHARES
+    ]
+
+
+def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
+    """The truth with the load's feed-forward at other frequencies, and its usual share of both inertias'."""
+    servo, load, there = truth.servo, truth.servo.load_feedforward, usual.servo.load_feedforward
+    if load is None or there is None:
+        return []
+    both = servo.inertia_feedforward_kg_m2 + load.inertia_kg_m2
+    share = there.inertia_kg_m2 / (usual.servo.inertia_feedforward_kg_m2 + there.inertia_kg_m2)
+    inertias = {"inertia feed-forward": (1.0 - share) * both, "load feed-forward": share * both}
+    return [with_values(truth, {**inertias, "load feed-forward frequency": hz}) for hz in FREQUENCIES_HZ]
+
+
+def exchanged(truth: Truth) -> Truth:
+    """The truth with position gain and the inverse of the integral time exchanged.
+
+    While the axis moves that is the same loop, for only their sum and their product are in its answer: each
+    of the two has a minimum of its own.
+    """
+    servo = truth.servo
+    return with_values(
+        truth,
+        {"position gain": 1e3 / servo.integral_time_ms, "integral time": 1e3 / servo.position_gain_per_s},
+    )

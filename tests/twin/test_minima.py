@@ -1,0 +1,97 @@
+"""A fit that has come to one minimum looks for others."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.exercised import record_of
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.fitting import better_places
+from hdbridge.twin.least_squares import solve
+from hdbridge.twin.minima import exchanged, feedforwards, lags, springs
+from hdbridge.twin.misfit import Data, prepare
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
+from hdbridge.twin.replays import Replays
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS = AxisConfig.load(DEMO)
+TRUTH = with_values(Truth.load(DEMO), {"load feed-forward frequency": 75.0})
+
+
+@cache
+def data() -> Data:
+    """Two quick steps, the load left to ring after each."""
+
+    def lead(bench: Exercise) -> None:
+        for distance in (60.0, -60.0):
+            bench.move(distance, 1500.0, 60_000.0)
+            bench.hold(0.25)
+
+    record = record_of(TRUTH, lead)
+    legs = (Segment(kind="step", start_s=0.0, end_s=float(record.time_s[-1])),)
+    return prepare(Recording(record, legs, axis="demo", ratio=50.0), AXIS, TRUTH)
+
+
+def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_the_true_one() -> None:
+    names = ("inertia feed-forward", "load feed-forward", "load feed-forward frequency")
+    parameters = tuple(BY_NAME[name] for name in names)
+    begun = with_values(TRUTH, {"load feed-forward frequency": 20.0})
+    prior = np.array(coordinates(begun, parameters))
+    with Replays(data(), 1) as replays:
+        there = solve(replays, begun, parameters, prior, 3)
+        assert free_value(there.truth, parameters[2]) < 40.0, "a minimum of its own"
+        (place,) = better_places(replays, there, [feedforwards(there.truth, begun)], begun, prior)
+        found, true = (solve(replays, each, parameters, prior, 3) for each in (place, TRUTH))
+    assert found.loss < there.loss
+    assert free_value(found.truth, parameters[2]) == pytest.approx(
+        free_value(true.truth, parameters[2]), rel=0.1
+    )
+
+
+def test_springs_ring_elsewhere_and_as_long() -> None:
+    for truth in springs(TRUTH):
+        gear, was = truth.gear, TRUTH.gear
+        assert gear.damping_nm_s_per_rad / math.sqrt(gear.stiffness_nm_per_rad) == pytest.approx(
+            was.damping_nm_s_per_rad / math.sqrt(was.stiffness_nm_per_rad)
+        )
+        assert gear.stiffness_nm_per_rad < truth.highest_stiffness_nm_per_rad
+
+
+def test_a_lag_stays_as_long_whosever_it_is() -> None:
+    late = with_values(TRUTH, {"servo dead time": 1.5})
+    wanted = 2.0 * late.servo.command_filter_ms + 1.5
+    for truth in lags(late):
+        assert 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms == pytest.approx(wanted)
+    assert len({each.servo.dead_time_ms for each in lags(late)}) > 1
+
+
+def test_as_much_is_fed_forward_whosever_inertia_it_is() -> None:
+    small = with_values(TRUTH, {"load feed-forward": 1e-6})
+    both = small.servo.inertia_feedforward_kg_m2 + 1e-6
+    places = feedforwards(small, TRUTH)
+    assert places
+    for truth in places:
+        load = truth.servo.load_feedforward
+        assert load is not None
+        assert truth.servo.inertia_feedforward_kg_m2 + load.inertia_kg_m2 == pytest.approx(both)
+    without = TRUTH.model_copy(update={"servo": TRUTH.servo.model_copy(update={"load_feedforward": None})})
+    assert feedforwards(without, TRUTH) == []
+
+
+def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_axis_moves() -> None:
+    other = exchanged(TRUTH)
+    softer = with_values(TRUTH, {"position gain": other.servo.position_gain_per_s})
+    with Replays(data(), 1) as replays:
+        own, same, wrong = (each[FOLLOWING] for each in replays([TRUTH, other, softer]))
+    moving = np.concatenate([each.rest for each in data().pieces]) == 0.0
+    assert np.std((same - own)[moving]) < 0.1 * np.std((wrong - own)[moving])
+    assert other.servo.position_gain_per_s < 0.5 * TRUTH.servo.position_gain_per_s
+    assert exchanged(other).servo.position_gain_per_s == pytest.approx(TRUTH.servo.position_gain_per_s)
