@@ -8,14 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
-from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
 from hdbridge.twin.minima import elsewhere, exchanged, lags, springs
-from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
+from hdbridge.twin.misfit import CHANNELS, Data
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
     BY_NAME,
@@ -75,66 +73,51 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
     return tuple(free)
 
 
-def fit(
-    recording: Recording,
-    axis: AxisConfig,
-    start: Truth,
-    progress: Progress = lambda _: None,
-    workers: int | None = None,
-    more: Sequence[str] = (),
-) -> Fitted:
-    """From the start to the parameters that explain the recording best.
-
-    InputError where it has no command.
-    """
-    data = coarse(prepare(recording, axis, start), FIT_S)
-    rough = coarse(data)
+def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted:
+    """From the truth that the recordings were prepared with to the parameters that explain them best."""
+    data, roughly = replays.data, replays.rough
+    start = data.base
     begun = start_of(start, data)
     parameters = free_parameters(begun, more)
     prior = np.array(coordinates(begun, parameters))
-    with Replays(rough, workers) as roughly, Replays(data, workers) as replays:
-        begun = _at_best_frequency(roughly, begun)
-        progress(0.1)
-        first = _best_of(roughly, [begun, *lags(begun)], parameters, prior)
-        progress(0.2)
-        (before,) = replays([start])
-        most = scales(data, before)
-        ends = []
-        for number, each in enumerate(first):
-            progress(0.2 + 0.4 * number / len(first))
-            # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
-            # that tells it from the right one.
-            if each.inflation < SOFT**2:
-                near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
-                ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
-        if not ends:
-            # This axis has what no simulation has, in the channel that led the way. By the noise, however
-            # tempered, the others had no say; by what each of them is left with they have.
-            ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
-        progress(0.6)
-        best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
-        while True:
-            if _leaves_more(replays.data, best):
-                for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
-                    best = _better(replays, best, there, prior, most)
-            # A rough fit knows little of what the two gains do at rest, where only they differ.
-            best = _better(replays, best, exchanged(best.truth), prior, most)
-            wider, prior = with_last(replays, best, prior)
-            if wider is best:
-                break
-            best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
-        progress(0.85)
-        for _ in range(ROUNDS):
-            last, loops = best, loops_about(replays, best)
-            best = solve(
-                replays, best.truth, best.parameters, prior, STEPS, most=most, near=best, loops=loops
-            )
-            if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
-                break
-        # So much longer differences are no guide to a minimum: next to it the loops may be unstable.
-        best = solve(
-            replays, best.truth, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True
-        )
+    begun = _at_best_frequency(roughly, begun)
+    progress(0.1)
+    first = _best_of(roughly, [begun, *lags(begun)], parameters, prior)
+    progress(0.2)
+    (before,) = replays([start])
+    most = scales(data, before)
+    ends = []
+    for number, each in enumerate(first):
+        progress(0.2 + 0.4 * number / len(first))
+        # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
+        # that tells it from the right one.
+        if each.inflation < SOFT**2:
+            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
+            ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
+    if not ends:
+        # This axis has what no simulation has, in the channel that led the way. By the noise, however
+        # tempered, the others had no say; by what each of them is left with they have.
+        ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
+    progress(0.6)
+    best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
+    while True:
+        if _leaves_more(data, best):
+            for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
+                best = _better(replays, best, there, prior, most)
+        # A rough fit knows little of what the two gains do at rest, where only they differ.
+        best = _better(replays, best, exchanged(best.truth), prior, most)
+        wider, prior = with_last(replays, best, prior)
+        if wider is best:
+            break
+        best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+    progress(0.85)
+    for _ in range(ROUNDS):
+        last, loops = best, loops_about(replays, best)
+        best = solve(replays, best.truth, best.parameters, prior, STEPS, most=most, near=best, loops=loops)
+        if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
+            break
+    # So much longer differences are no guide to a minimum: next to it the loops may be unstable.
+    best = solve(replays, best.truth, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
     progress(1.0)
     return best
 

@@ -35,10 +35,10 @@ def fit_twin(
     ``workers`` processes. InputError where a recording has no command or is of another gear.
     """
     whole = Recording.joined(list(recordings))
-    fitted = fit(whole, axis, start, lambda share: progress(0.9 * share), workers)
     data = coarse(prepare(whole, axis, start), FIT_S)
-    with Replays(data, workers) as replays, Replays(coarse(data), workers) as rough:
-        findings, rivals = name_causes(replays, rough, with_sections(start, fitted.parameters), fitted)
+    with Replays(data, workers) as replays:
+        fitted = fit(replays, lambda share: progress(0.9 * share))
+        findings, rivals = name_causes(replays, with_sections(start, fitted.parameters), fitted)
         (left,) = replays([fitted.truth])
         sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
         rest = unexplained(data, left, noise_in_motion(data))

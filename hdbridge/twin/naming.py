@@ -91,13 +91,13 @@ class Unexplained:
 
 
 def name_causes(
-    replays: Replays, rough: Replays, start: Truth, fitted: Fitted
+    replays: Replays, start: Truth, fitted: Fitted
 ) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
     """The causes in which the start was wrong, the most telling first, and what cannot be told apart there.
 
     A cause without which held-out legs come out worse, whatever else makes up for it, is named. If the twin
     needs more than those, the others are named with what may stand in for them; if not, nothing tells what
-    they came to from the start, and that is a set. Rivals are fitted to ``rough`` ones of the pieces.
+    they came to from the start, and that is a set. Rivals are fitted to a few of the legs.
     """
     contest = _Contest(replays, start, fitted)
     groups: dict[str, list[Parameter]] = {}
@@ -107,12 +107,12 @@ def name_causes(
     alone = replays([put_back(start, fitted.truth, own) for own in suspects.values()])
     matter = [cause for cause, there in zip(suspects, alone, strict=True) if contest.lost(there)]
     moved = [each for own in suspects.values() for each in own]
-    rivals = {cause: without(rough, start, fitted, groups[cause], moved) for cause in matter}
+    rivals = {cause: without(replays.rough, start, fitted, groups[cause], moved) for cause in matter}
     shown = dict(zip(rivals, replays(rivals.values()), strict=True))
     needed = {cause: groups[cause] for cause in matter if contest.lost(shown[cause])}
     aliases: dict[str, list[Parameter]] = {cause: [] for cause in needed}
     rest = [each for each in fitted.parameters if each.cause not in needed]
-    least = without(rough, start, fitted, rest, moved) if rest else fitted.truth
+    least = without(replays.rough, start, fitted, rest, moved) if rest else fitted.truth
     sets: list[Alike] = []
     (shown_least,) = replays([least])
     if contest.lost(shown_least):

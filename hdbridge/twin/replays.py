@@ -7,31 +7,39 @@ import os
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from copy import copy
 from itertools import repeat
 from typing import Any, Self
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import Data, Seed, residuals
+from hdbridge.twin.misfit import Data, Seed, coarse, residuals
 
 WORTH_S = 2.0
 """Replays that take the axis no longer than this are made here: a process costs as much as some of them."""
 
-_data: Data | None = None
-"""A worker's own recordings."""
+_data: tuple[Data, Data] | None = None
+"""A worker's own recordings, and a few of their legs."""
 
 
 class Replays:
     """Replays of the same recordings; a context manager, because of its processes."""
 
+    rough: Replays
+    """Of a few of their legs, in the same processes."""
+
     def __init__(self, data: Data, workers: int | None = None) -> None:
         self.data = data
+        self._place = 0
         wanted = workers if workers is not None else min(os.cpu_count() or 1, 8)
         self._pool: ProcessPoolExecutor | None = None
+        few = coarse(data)
         if wanted > 1 and data.duration_s > WORTH_S:
             # Not forked: this process may have threads, and locks that they hold.
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(wanted, context, _begin, (data,))
+            self._pool = ProcessPoolExecutor(wanted, context, _begin, ((data, few),))
+        rough = self.rough = copy(self)
+        rough.data, rough.rough, rough._place = few, rough, 1
 
     def __enter__(self) -> Self:
         return self
@@ -44,16 +52,16 @@ class Replays:
         self, truths: Iterable[Truth], seeds: Iterable[Seed] = repeat(None)
     ) -> list[dict[str, FloatArray]]:
         """The residuals of each truth, in order, by replays as `misfit.traces_of` has them."""
-        if self._pool is None:
+        if self._pool is None or self.data.duration_s <= WORTH_S:
             return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
-        return list(self._pool.map(_residuals, truths, seeds))
+        return list(self._pool.map(_residuals, truths, seeds, repeat(self._place)))
 
     def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
         """The residuals of each truth, in order, by replays that are rounded and noisy as a recording is."""
         return self(truths, range(1, len(truths) + 1))
 
 
-def _begin(data: Data) -> None:
+def _begin(data: tuple[Data, Data]) -> None:
     global _data  # noqa: PLW0603 - a process's own, set once where it begins
     _data = data
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -67,6 +75,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _residuals(truth: Truth, seed: Seed) -> dict[str, FloatArray]:
+def _residuals(truth: Truth, seed: Seed, place: int) -> dict[str, FloatArray]:
     assert _data is not None
-    return residuals(_data, truth, seed)
+    return residuals(_data[place], truth, seed)

@@ -36,6 +36,7 @@ class Known:
         leg = np.repeat(np.arange(float(LEGS)), ROWS // LEGS)
         ones = {name: np.ones(ROWS) for name in shown}
         out = np.where(leg % 4.0 == 3.0, 1.0, 0.0)
+        self.rough = self
         self.data: Any = SimpleNamespace(
             leg=leg, out=out, pieces=(SimpleNamespace(counts=ones, leg=leg, out=out),), duration_s=1.0
         )
@@ -63,7 +64,7 @@ def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, 
     prior = np.array(coordinates(TRUTH, parameters))
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
     fitted = solve(replays, TRUTH, parameters, prior, 12, known=Scales(noise))
-    found, sets = name_causes(replays, replays, TRUTH, fitted)
+    found, sets = name_causes(replays, TRUTH, fitted)
     return found, (*sets, *alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data))))
 
 

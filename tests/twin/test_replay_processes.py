@@ -47,8 +47,10 @@ def test_two_processes_give_what_one_gives() -> None:
     truths = [with_values(truth, {"Coulomb friction": each}) for each in (0.034, 0.05)]
     data = prepare(recorded(), AxisConfig.load(DEMO), truth)
     with Replays(data, 1) as alone, Replays(data, 2) as together:
-        for one, other in zip(alone(truths), together(truths), strict=True):
-            assert all(np.array_equal(one[name], other[name]) for name in one)
+        for few in (False, True):
+            ones, others = (each.rough(truths) if few else each(truths) for each in (alone, together))
+            for one, other in zip(ones, others, strict=True):
+                assert all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) -> None:
