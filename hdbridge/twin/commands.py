@@ -2,7 +2,8 @@
 
 Before a recording nothing is known of the axis, so the replay begins on a drive that is switched on at its
 angle zero and led to the first command at the axis's limits; so does each part that does not follow another
-one. Where it begins on a drive that holds the axis, the torque that it tells is where the loops have come to.
+one. Where it begins on a drive that holds the axis, the torque that it tells is where the loops have come to;
+where it tells the temperature, the axis is as warm.
 Between parts that follow each other the drive is switched off, as the bench does, and the load rings on.
 """
 
@@ -52,6 +53,8 @@ class Commands:
     """Cycles in which the drive is switched off."""
     held: tuple[tuple[int, float], ...] = ()
     """Cycles before which the loops are brought to hold the axis by a torque, and that torque in Nm."""
+    start_c: float | None = None
+    """Temperature that the axis begins at; None: the truth's own."""
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
@@ -106,8 +109,10 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     off = [each for each in off if each.stop > each.start]
     torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
     held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    warmth_c = part.columns.get(Channel.TEMPERATURE.value)
+    start_c = None if warmth_c is None else float(warmth_c[0])
     return Commands(
-        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held
+        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held, start_c
     )
 
 

@@ -5,7 +5,7 @@ afford the hundreds of replays that it needs. Nothing but the frames leads the d
 load from outside, and by what torque a drive held it before, no drive is told.
 
 What acted on the axis from outside is part of a recording as its commands are: where it tells the torque on
-the load, the simulated load is pushed by as much, in place of its own weight.
+the load, the simulated load is pushed by as much, in place of its own weight. So is how warm it was at first.
 """
 
 from __future__ import annotations
@@ -60,7 +60,11 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
         commands = commands_of(part, axis, truth)
         bench_axis = at_cycle(axis, commands.cycle_s)
         with (
-            simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+            simulated_bench(as_warm(truth, commands), axis.eds_path, axis.drive.node_id, seed) as (
+                bus,
+                clock,
+                _,
+            ),
             Drive(bus, bench_axis, clock) as drive,
         ):
             drive.boot()
@@ -90,9 +94,9 @@ def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: 
             Channel.TEMPERATURE: traces.temperature_c,
             Channel.LOAD_TORQUE: traces.load_torque_nm,
         }
-        for key in axis.channels:
-            if BY_KEY[key] in known:
-                columns[BY_KEY[key].value] = known[BY_KEY[key]]
+        for channel, column in known.items():
+            if channel.value in part.columns or any(BY_KEY[key] is channel for key in axis.channels):
+                columns[channel.value] = column
         records.append(Record(columns, starts=part.starts))
     return records[0] if len(records) == 1 else concatenate(records)
 
@@ -106,7 +110,7 @@ def run(
     smooth: bool = False,
 ) -> Traces:
     """The commands through the machine alone; a ``smooth`` one reports what it does unrounded."""
-    outer_nm = np.zeros(len(commands.counts))
+    truth, outer_nm = as_warm(truth, commands), np.zeros(len(commands.counts))
     if commands.told_nm is not None:
         truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
     machine = Machine(truth, seed, may_compile=True, loaded=commands.told_nm is not None)
@@ -186,6 +190,14 @@ def _coasted(machine: Machine, substeps: Sequence[int], outer_nm: FloatArray) ->
         machine.coast(count, at_rest, outer)
         rows.append([getattr(machine, name) for name in Cycles._fields])
     return Cycles(*np.array(rows, dtype=np.float64).reshape(-1, len(Cycles._fields)).T)
+
+
+def as_warm(truth: Truth, commands: Commands) -> Truth:
+    """The truth, at the beginning as warm as these commands found the axis, where they know."""
+    if commands.start_c is None:
+        return truth
+    heat = truth.temperature.model_copy(update={"start_c": commands.start_c})
+    return truth.model_copy(update={"temperature": heat})
 
 
 def _weightless(truth: Truth) -> Truth:

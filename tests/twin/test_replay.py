@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench, axis_view
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -24,6 +25,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.replay import replay, replay_directly
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
 CHANNELS = ("time_s", "motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 
 
@@ -98,6 +100,33 @@ def test_parts_are_replayed_one_by_one() -> None:
     assert len(joined.record.parts()) == 2
     given = replay_directly(joined, axis, truth)
     assert np.array_equal(given.motor_position_deg, joined.record.motor_position_deg)
+
+
+def test_a_part_begins_as_warm_as_it_was_recorded() -> None:
+    """An axis whose friction falls by a hundredth per kelvin, and which is 20 K warmer at the second part."""
+    axis, truth = demo()
+    axis = axis.model_copy(update={"temperature": Temperature(source=SENSOR, celsius_per_count=0.1)})
+    heat = truth.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
+    plants = [
+        truth.model_copy(update={"temperature": heat.model_copy(update={"start_c": warm_c})})
+        for warm_c in (22.0, 42.0)
+    ]
+    joined = Recording.joined([benched(axis, each, Stepping(2, start_deg=0.0)) for each in plants])
+    for again in (replay(joined, axis, plants[0]), replay_directly(joined, axis, plants[0])):
+        apart = {
+            name: np.max(np.abs(again.columns[name] - joined.record.columns[name]))
+            for name in ("motor_position_deg", "motor_torque_nm", "temperature_c")
+        }
+        assert apart["motor_position_deg"] < 1.5 * 360.0 / 8000.0
+        assert apart["motor_torque_nm"] < 0.1 * truth.motor.coulomb_nm
+        assert apart["temperature_c"] < 0.15
+    untold = [column for column in joined.record.columns if column != "temperature_c"]
+    record = Record({name: joined.record.columns[name] for name in untold}, starts=joined.record.starts)
+    cold = replay_directly(replace(joined, record=record), axis, plants[0])
+    second = slice(joined.record.starts[1], None)
+    torque_nm = (each.columns["motor_torque_nm"][second] for each in (cold, joined.record))
+    apart = np.abs(np.subtract(*torque_nm))
+    assert np.median(apart) > 0.1 * truth.motor.coulomb_nm
 
 
 def test_without_a_command_there_is_nothing_to_replay() -> None:
