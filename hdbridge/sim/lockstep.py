@@ -9,11 +9,11 @@ frames. The frames themselves are real: python-can messages over python-can ``vi
 from __future__ import annotations
 
 import gc
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from queue import Queue
 from typing import Any, Final, Protocol
@@ -68,20 +68,17 @@ class VirtualClock:
 
         False, and nothing happened but the clock's advance, when no event comes before the deadline.
         """
-        event_s = math.inf
+        until_s, happens = deadline_s, False
         for node in self.nodes:
             due_s = node.next_event_s()
-            if due_s < event_s:  # noqa: PLR1730 - min() costs three times as much, several times a cycle
-                event_s = due_s
-        happens = event_s <= deadline_s
-        until_s = event_s if happens else deadline_s
-        if until_s > self.now_s:  # noqa: PLR1730 - as above
+            if due_s <= until_s:
+                until_s, happens = due_s, True
+        if until_s > self.now_s:  # noqa: PLR1730 - max() costs three times as much, twice a cycle
             self.now_s = until_s
-        if not happens:
-            return False
-        for node in self.nodes:
-            node.poll(self.now_s)
-        return True
+        if happens:
+            for node in self.nodes:
+                node.poll(self.now_s)
+        return happens
 
 
 class _PolledQueue(Queue[can.Message]):
@@ -105,20 +102,34 @@ class _PolledBus(VirtualBus):
             place = self.channel.index(self.queue)
             self.channel[place] = self.queue = _PolledQueue()
         self._waiting = self.queue.queue
+        self._met: list[Queue[can.Message]] = []
+        """The queues on the channel when it was last looked at."""
+        self._puts: list[Callable[[can.Message], None]] = []
+        """What gives a frame to each of the others there."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        ours = type(msg) is DataFrame
-        if not (ours or _is_plain(msg)):
-            super().send(msg, timeout)
-            return
-        own = self.queue
-        for waiting in self.channel:
-            if waiting is own:
-                continue
-            if ours and type(waiting) is _PolledQueue:
-                waiting.queue.append(msg)  # nobody changes it: one for all
-            else:
-                waiting.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
+        if type(msg) is not DataFrame:
+            if not _is_plain(msg):
+                super().send(msg, timeout)
+                return
+            msg = DataFrame(msg.arbitration_id, msg.data, self.channel_id)
+        if self.channel != self._met:
+            self._meet()
+        for put in self._puts:
+            put(msg)
+
+    def _meet(self) -> None:
+        """Somebody has joined or left."""
+        self._met = list(self.channel)
+        self._puts = [
+            # Nobody here changes it: one for all. Others get a copy each.
+            each.queue.append if type(each) is _PolledQueue else partial(self._put_copy, each)
+            for each in self._met
+            if each is not self.queue
+        ]
+
+    def _put_copy(self, queue: Queue[can.Message], msg: can.Message) -> None:
+        queue.put(DataFrame(msg.arbitration_id, msg.data, self.channel_id))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         waiting = self._waiting
