@@ -33,7 +33,8 @@ class Emergency:
     def __init__(self, dictionary: Dictionary, send: Callable[[int, bytes], None]) -> None:
         self._dictionary = dictionary
         self._send = send
-        self._active: list[int] = []
+        self.active: list[int] = []
+        """Codes of the errors that have not ended, oldest first."""
         dictionary[0x1001, 0].bind(self._register)
         dictionary[0x1014, 0].guard = self._check_can_id
         dictionary[0x1003, 0].guard = _only_zero
@@ -45,36 +46,31 @@ class Emergency:
 
     def reset(self) -> None:
         """As after power-on; nothing is sent."""
-        self._active.clear()
+        self.active.clear()
         self._history.clear()
 
     def _past(self, age: int) -> int:
         return self._history[age] if age < len(self._history) else 0
 
-    @property
-    def any_active(self) -> bool:
-        """Whether an error is active."""
-        return bool(self._active)
-
     def occur(self, code: int, additional: bytes = b"") -> None:
         """Make ``code`` active and send it, unless it already is; ``additional`` are up to five bytes."""
-        if code in self._active:
+        if code in self.active:
             return
-        self._active.append(code)
+        self.active.append(code)
         self._history.insert(0, code)
         del self._history[HISTORY_DEPTH:]
         self._transmit(code, additional)
 
     def clear(self, code: int) -> None:
         """End one error; the last one to end sends 'error reset'."""
-        if code in self._active:
-            self._active.remove(code)
-            self._transmit(self._active[-1] if self._active else ErrorCode.NONE, b"")
+        if code in self.active:
+            self.active.remove(code)
+            self._transmit(self.active[-1] if self.active else ErrorCode.NONE, b"")
 
     def clear_all(self) -> None:
         """End all errors, as a fault reset does."""
-        if self._active:
-            self._active.clear()
+        if self.active:
+            self.active.clear()
             self._transmit(ErrorCode.NONE, b"")
 
     def _transmit(self, code: int, additional: bytes) -> None:
@@ -85,7 +81,7 @@ class Emergency:
     def _register(self) -> int:
         """Object 1001h: bit 0 any error, bits 1 to 7 by the class of the code."""
         register = 0
-        for code in self._active:
+        for code in self.active:
             register |= 1 | _register_bit(code)
         return register
 

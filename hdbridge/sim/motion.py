@@ -69,11 +69,9 @@ class Motion:
         self.load_jump_counts = 0
         self.load_reading: Callable[[int], int] | None = None
         self._owed_s = 0.0
-        self._min = dictionary[0x607D, 1]
-        self._max = dictionary[0x607D, 2]
         self._target = dictionary[0x607A, 0]
-        for index in (0x607E, 0x6080):
-            dictionary[index, 0].follower = lambda _: self.take_parameters()
+        for index, sub in ((0x607D, 1), (0x607D, 2), (0x607E, 0), (0x6080, 0)):
+            dictionary[index, sub].follower = lambda _: self.take_parameters()
         self.take_parameters()
 
     def take_parameters(self) -> None:
@@ -83,6 +81,9 @@ class Motion:
         """-1 where object 607Eh reverses positions, else 1."""
         self.max_speed_counts_s: float = value(0x6080) * value(0x608F, 1) / 60.0
         """Object 6080h in counts/s."""
+        low, high = value(0x607D, 1), value(0x607D, 2)
+        self._has_limits = low < high and (low > -_HALF or high < _HALF - 1)
+        self._low, self._high = low, high
 
     def user(self, counts: float) -> int:
         """The user's (unbounded) position of a plant position."""
@@ -97,8 +98,8 @@ class Motion:
         sign = self.sign
         here = sign * round(self.demand_counts) + self.home_counts
         distance = ((target - here + _HALF) & _MASK) - _HALF
-        low, high = self._min.value, self._max.value
-        if low < high and (low > -_HALF or high < _HALF - 1):
+        if self._has_limits:
+            low, high = self._low, self._high
             here32 = ((here + _HALF) & _MASK) - _HALF
             reach = here32 + distance
             if not low <= reach <= high:

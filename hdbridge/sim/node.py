@@ -8,7 +8,8 @@ drive without a master stops by itself. Single-threaded: everything happens insi
 
 from __future__ import annotations
 
-from enum import IntEnum
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +24,7 @@ from hdbridge.sim.faults import Faults, Outgoing
 from hdbridge.sim.firmware import Firmware
 from hdbridge.sim.motion import Machine
 from hdbridge.sim.nameplate import Nameplate
+from hdbridge.sim.nmt import Nmt, NmtCommand
 from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
 from hdbridge.sim.sdo_server import SdoServer
 
@@ -36,26 +38,7 @@ _NEVER: Final = float("inf")
 _HEARTBEAT: Final = 0x700
 
 
-class Nmt(IntEnum):
-    """NMT states as a heartbeat tells them."""
-
-    INITIALISING = 0x00
-    STOPPED = 0x04
-    OPERATIONAL = 0x05
-    PRE_OPERATIONAL = 0x7F
-
-
-class NmtCommand(IntEnum):
-    """NMT commands."""
-
-    START = 1
-    STOP = 2
-    ENTER_PRE_OPERATIONAL = 128
-    RESET_NODE = 129
-    RESET_COMMUNICATION = 130
-
-
-_INITIALISING, _STOPPED, _OPERATIONAL = Nmt.INITIALISING, Nmt.STOPPED, Nmt.OPERATIONAL
+_INITIALISING = Nmt.INITIALISING
 # For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
 
 _AFTER_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
@@ -107,7 +90,7 @@ class SimulatedDrive:
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()
         entry[0x1016, 1].guard = _check_consumer
-        entry[0x1016, 1].follower = lambda _: self._watch_heartbeat()
+        entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
         for sub in (1, 2):
             entry[0x60C2, sub].follower = lambda _: self._take_period()
@@ -120,8 +103,8 @@ class SimulatedDrive:
         self._run_due_s = self._now_s + self._period_s
         for pdo in (*self._tpdos, *self._rpdos):
             pdo.compile()
-        self._route()
         self._watch_heartbeat()
+        self._route()
         self._start_heartbeat()
         self._due_s = self._now_s
 
@@ -140,6 +123,10 @@ class SimulatedDrive:
         self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
         self._watch_due_s = _NEVER
 
+    def _change_watch(self) -> None:
+        self._watch_heartbeat()
+        self._listen()
+
     def _start_heartbeat(self) -> None:
         self._heartbeat_s = self.dictionary.value(0x1017) * 1e-3
         self._heartbeat_due_s = self._now_s + self._heartbeat_s if self._heartbeat_s else _NEVER
@@ -154,9 +141,22 @@ class SimulatedDrive:
         self._event_tpdos = [pdo for pdo in tpdos if not pdo.is_synchronous]
         self._sync_rpdos = [pdo for pdo in rpdos if pdo.is_synchronous]
         self._rpdo_by_id = {pdo.can_id: pdo for pdo in rpdos}
-        self._sync_id = self.dictionary.value(0x1005) & 0x7FF
         self._rpdo_due_s = _NEVER
         self._due_s = self._now_s
+        self._listen()
+
+    def _listen(self) -> None:
+        """Note what takes the data of each frame that concerns the node as it is now."""
+        takers: dict[int | None, Callable[[bytearray, float], None]] = {
+            self._watched_id: self._on_watched_heartbeat,
+            0x000: self._on_nmt,
+        }
+        for can_id, pdo in self._rpdo_by_id.items():
+            takers[can_id] = partial(self._on_rpdo, pdo)
+        if self.nmt is not Nmt.STOPPED:
+            takers[0x600 + self.node_id] = self._on_sdo_request
+            takers[self.dictionary.value(0x1005) & 0x7FF] = self._on_sync
+        self._takers = takers
 
     # ---------------------------------------------------------------- the outside
 
@@ -193,25 +193,13 @@ class SimulatedDrive:
     def handle(self, message: can.Message, now_s: float) -> None:
         """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
         self._now_s = now_s
-        if type(message) is not DataFrame and (
+        take = self._takers.get(message.arbitration_id)
+        if take is None or self.faults.silent or self.faults.deaf:
+            return
+        if type(message) is DataFrame or not (
             message.is_extended_id or message.is_remote_frame or message.is_error_frame
         ):
-            return
-        if self.faults.silent or self.faults.deaf:
-            return
-        can_id = message.arbitration_id
-        if can_id == self._sync_id:
-            if self.nmt is not _STOPPED:
-                self._on_sync(now_s)
-        elif (pdo := self._rpdo_by_id.get(can_id)) is not None:
-            self._on_rpdo(pdo, bytes(message.data), now_s)
-        elif can_id == 0x000:
-            self._on_nmt(message.data)
-        elif can_id == 0x600 + self.node_id:
-            if self.nmt is not Nmt.STOPPED and (answer := self._sdo.respond(bytes(message.data))):
-                self._send(0x580 + self.node_id, answer)
-        elif can_id == self._watched_id:
-            self._on_watched_heartbeat(now_s)
+            take(message.data, now_s)
 
     # ---------------------------------------------------------------- frames
 
@@ -227,7 +215,7 @@ class SimulatedDrive:
         if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
             self._send(can_id, data)
 
-    def _on_sync(self, now_s: float) -> None:
+    def _on_sync(self, _: bytearray, now_s: float) -> None:
         tpdos: list[Outgoing] = []
         for tpdo in self._sync_tpdos:
             data = tpdo.on_sync()
@@ -239,13 +227,13 @@ class SimulatedDrive:
             self._send(can_id, data)
         for rpdo in self._sync_rpdos:
             if rpdo.pending is not None:
-                data, rpdo.pending = rpdo.pending, None
-                rpdo.apply(data)
+                pending, rpdo.pending = rpdo.pending, None
+                rpdo.apply(pending)
         self._advance()
         self._run_due_s = now_s + 1.5 * self._period_s
         self._due_s = self._next_due_s()
 
-    def _on_rpdo(self, pdo: ReceivePdo, data: bytes, now_s: float) -> None:
+    def _on_rpdo(self, pdo: ReceivePdo, data: bytearray, now_s: float) -> None:
         if len(data) < pdo.length:
             self.emergency.occur(ErrorCode.PDO_TOO_SHORT)
             return
@@ -260,7 +248,7 @@ class SimulatedDrive:
                 self._due_s = self._next_due_s()
         if len(data) > pdo.length:
             self.emergency.occur(ErrorCode.PDO_TOO_LONG)
-        elif self.emergency.any_active:
+        elif self.emergency.active:
             for code in (ErrorCode.PDO_TOO_SHORT, ErrorCode.PDO_TOO_LONG):
                 self.emergency.clear(code)
         if pdo.is_synchronous:
@@ -268,7 +256,11 @@ class SimulatedDrive:
         else:
             pdo.apply(data)
 
-    def _on_nmt(self, data: bytearray) -> None:
+    def _on_sdo_request(self, data: bytearray, _: float) -> None:
+        if answer := self._sdo.respond(bytes(data)):
+            self._send(0x580 + self.node_id, answer)
+
+    def _on_nmt(self, data: bytearray, _: float) -> None:
         if len(data) < 2 or data[1] not in (0, self.node_id):
             return
         command = data[0]
@@ -308,7 +300,7 @@ class SimulatedDrive:
         self._begin()
         self._boot()
 
-    def _on_watched_heartbeat(self, now_s: float) -> None:
+    def _on_watched_heartbeat(self, _: bytearray, now_s: float) -> None:
         self._watch_due_s = now_s + self._watched_s
         self.emergency.clear(ErrorCode.HEARTBEAT)
         self._due_s = self._next_due_s()

@@ -17,6 +17,7 @@ EXTENDED: Final = 1 << 29
 MAX_ENTRIES: Final = 8
 MAX_BITS: Final = 64
 SYNC_ACYCLIC: Final = 0
+SYNC_EVERY: Final = 1
 SYNC_LAST: Final = 240
 EVENT_DRIVEN: Final = (254, 255)
 
@@ -132,6 +133,8 @@ class TransmitPdo(Pdo):
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
+        self.on_sync: Callable[[], bytes | None] = bytes
+        """The data to send upon a SYNC, None when this one is not its turn."""
         super().__init__(dictionary, 0x1800 + number - 1, 0x1A00 + number - 1, changed)
 
     def _may_map(self, entry: Entry) -> bool:
@@ -139,6 +142,8 @@ class TransmitPdo(Pdo):
 
     def _link(self, entries: list[Entry]) -> None:
         self.pack = _packer(self._codec, [entry.reader() for entry in entries])
+        by_type = {SYNC_ACYCLIC: self._if_changed, SYNC_EVERY: self.pack}
+        self.on_sync = by_type.get(self.transmission_type, self._in_turn)
         self.restart()
 
     def restart(self) -> None:
@@ -147,14 +152,14 @@ class TransmitPdo(Pdo):
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
 
-    def on_sync(self) -> bytes | None:
-        """The data to send upon a SYNC, None when this one is not its turn."""
-        if self.transmission_type == SYNC_ACYCLIC:
-            data = self.pack()
-            if data == self.sent:
-                return None
-            self.sent = data
-            return data
+    def _if_changed(self) -> bytes | None:
+        data = self.pack()
+        if data == self.sent:
+            return None
+        self.sent = data
+        return data
+
+    def _in_turn(self) -> bytes | None:
         self.syncs_to_go -= 1
         if self.syncs_to_go:
             return None
@@ -189,7 +194,7 @@ class ReceivePdo(Pdo):
         self._writers: tuple[Callable[[int], None], ...] = ()
         self.length = 0
         """Bytes that are mapped."""
-        self.pending: bytes | None = None
+        self.pending: bytearray | None = None
         self.deadline_s = float("inf")
         super().__init__(dictionary, 0x1400 + number - 1, 0x1600 + number - 1, changed)
 
@@ -206,7 +211,7 @@ class ReceivePdo(Pdo):
         self.pending = None
         self.deadline_s = float("inf")
 
-    def apply(self, data: bytes) -> None:
+    def apply(self, data: bytearray) -> None:
         """Write ``data``, ``length`` bytes or more, to the mapped entries; refused values are dropped."""
         for write, value in zip(self._writers, self._unpack_from(data), strict=True):
             try:
