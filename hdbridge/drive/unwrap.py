@@ -41,8 +41,8 @@ class Unwrap:
             self._value = raw
             return raw
         # Centred modular difference: in [-half, modulus - half).
-        self._value = last + (raw - last + self._half) % self._modulus - self._half
-        return self._value
+        value = self._value = last + (raw - last + self._half) % self._modulus - self._half
+        return value
 
     def peek(self, raw: int) -> int:
         """What `update` would give, without taking the reading."""

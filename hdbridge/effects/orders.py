@@ -244,17 +244,17 @@ def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
 class OrderTracker(Memoryless):
     """A series of harmonics on line; ``scale`` is radians of order 1 per motor degree."""
 
-    __slots__ = ("_phasors", "_scale")
+    __slots__ = ("_highest", "_lower", "_scale")
 
     def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
-        self._phasors = amplitudes
+        self._highest, *self._lower = amplitudes
         self._scale = scale
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
         """Error in arcsec at this motor angle."""
         # `horner`, written out: it is asked several times in each control cycle.
         turn = cmath.rect(1.0, self._scale * motor_deg)
-        total = 0j
-        for amplitude in self._phasors:
+        total = self._highest
+        for amplitude in self._lower:
             total = total * turn + amplitude
         return total.real
