@@ -154,9 +154,10 @@ def _values(before: Truth, after: Truth) -> list[Learned]:
     """What was fitted, as it was assumed and as it is."""
     from hdbridge.report.twin import Learned
     from hdbridge.twin.parameters import PARAMETERS, value_in
+    from hdbridge.twin.thermal import THERMAL
 
     rows = []
-    for each in PARAMETERS:
+    for each in {parameter.path: parameter for parameter in (*PARAMETERS, *THERMAL)}.values():
         now, interval = value_in(after, each), after.intervals.get(".".join(each.path))
         if now is not None and interval is not None:
             rows.append(Learned(each.name, each.unit, value_in(before, each), now, interval))

@@ -26,7 +26,8 @@ from hdbridge.report.page import (
     Table,
 )
 from hdbridge.report.words import figure, sentence
-from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
+from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row
+from hdbridge.twin.traces import Spectrum, Trace
 from hdbridge.twin.translation import Row as Translated
 
 WINDOW_S: Final = 1.0

@@ -25,9 +25,9 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
 from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve, told
-from hdbridge.twin.misfit import CHANNELS, coarse, prepare
+from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
 from hdbridge.twin.naming import Finding, finding
-from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
+from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import FALSE_ALARM
 from hdbridge.twin.scales import Scales, noise_floor
@@ -57,6 +57,8 @@ TOLERATED = (1.0 / 3.0) ** 2
 third of the noise to every channel nobody at the bench would see, and a twin may be off by as much."""
 OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
 """Looked at in addition to what a fit changes."""
+KNOWN_WARMTH = "temperature"
+"""... of which this one is no unknown where both twin and recording tell the temperature."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,7 @@ def check(
     floor = noise_floor(data)
     scale = {name: max(known.noise.get(name, 0.0), floor[name]) for name in CHANNELS}
     with Replays(data, workers) as replays:
-        search = _Search(replays, twin, known, scale, free_parameters(twin, OWN))
+        search = _Search(replays, twin, known, scale, free_parameters(twin, _own(data, twin)))
         (before,) = replays([twin])
         best = search.found(progress)
         (after,) = replays([best.truth])
@@ -105,6 +107,13 @@ def check(
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
     return Check(changes, _in_scales(before, scale), _in_scales(after, scale), search.unseen(best))
+
+
+def _own(data: Data, twin: Truth) -> list[str]:
+    """Those of `OWN` that neither twin nor recording tells: a warmer gear is no other one."""
+    path = ".".join(BY_NAME[KNOWN_WARMTH].path)
+    told = path in twin.intervals and all(each.commands.start_c is not None for each in data.pieces)
+    return [each for each in OWN if not (told and each == KNOWN_WARMTH)]
 
 
 @dataclass(frozen=True, eq=False)

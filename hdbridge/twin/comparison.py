@@ -14,27 +14,29 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.twin.rests import STANDS_COUNTS, stands, unknown_rows
 from hdbridge.twin.settling import band_arcsec, overshoot_arcsec, scatter_s, settling_s
+from hdbridge.twin.traces import Spectrum, Trace, spectrum_of
 from hdbridge.units import ARCSEC_PER_DEG
 
 Rows = NDArray[np.bool_]
 ALL: Final = "all"
 """The kind that stands for the whole record."""
 LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE = "load_error", "following_error", "motor_torque"
+TEMPERATURE: Final = "temperature"
 SETTLING_TIME, OVERSHOOT = "settling_time", "overshoot"
 NOISE_AT_REST, NOISE_IN_MOTION = "noise_at_rest", "noise_in_motion"
 UNITS: Final[Mapping[str, str]] = {
     LOAD_ERROR: "arcsec", FOLLOWING_ERROR: "motor deg", MOTOR_TORQUE: "Nm",
-    SETTLING_TIME: "s", OVERSHOOT: "arcsec",
+    TEMPERATURE: "\N{DEGREE SIGN}C", SETTLING_TIME: "s", OVERSHOOT: "arcsec",
 }  # fmt: skip
 TITLES: Final[Mapping[str, str]] = {
     LOAD_ERROR: "load error", FOLLOWING_ERROR: "following error", MOTOR_TORQUE: "motor torque",
-    SETTLING_TIME: "settling time", OVERSHOOT: "overshoot",
+    TEMPERATURE: "temperature", SETTLING_TIME: "settling time", OVERSHOOT: "overshoot",
     NOISE_AT_REST: "noise at rest", NOISE_IN_MOTION: "noise in motion",
 }  # fmt: skip
 
@@ -47,7 +49,6 @@ CALM_S: Final = 0.3
 MOVING_DEG_S: Final = 0.05
 """Motor speed of the command above which it moves."""
 LEAST_SAMPLES: Final = 8
-SPECTRUM_SAMPLES: Final = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,30 +79,6 @@ class Row:
     def share(self) -> float:
         """The difference as a share of what was measured."""
         return self.difference / self.measured if self.measured else math.inf if self.difference else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """A signal of both records over time, for a picture."""
-
-    time_s: FloatArray
-    measured: FloatArray
-    simulated: FloatArray
-
-    @property
-    def difference(self) -> FloatArray:
-        """Measured less simulated."""
-        return self.measured - self.simulated
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Amplitude density by frequency, in the signal's unit per root hertz."""
-
-    frequency_hz: FloatArray
-    measured: FloatArray
-    simulated: FloatArray
-    difference: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +168,8 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     for kind, inside in groups.items():
         rows += _of_stops(kind, [stop for stop in stops if inside[stop.moved]], real.time_s)
     traces = {name: Trace(real.time_s, real.by_name[name], twin.by_name[name]) for name in shared}
-    spectra = {name: found for name in shared if (found := _spectrum(traces[name], parts)) is not None}
+    swings = (name for name in shared if name != TEMPERATURE)
+    spectra = {name: found for name in swings if (found := spectrum_of(traces[name], parts)) is not None}
     return Comparison(tuple(rows), traces, spectra)
 
 
@@ -202,9 +180,10 @@ def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> _Signals:
     for part in parts:
         error[part] -= np.mean(error[part])
     by_name = {LOAD_ERROR: error, FOLLOWING_ERROR: command - record.motor_position_deg}
-    torque = record.columns.get("motor_torque_nm")
-    if torque is not None:
-        by_name[MOTOR_TORQUE] = torque
+    for name, channel in ((MOTOR_TORQUE, Channel.MOTOR_TORQUE), (TEMPERATURE, Channel.TEMPERATURE)):
+        column = record.columns.get(channel.value)
+        if column is not None:
+            by_name[name] = column
     return _Signals(record.time_s, command, record.load_position_deg * ARCSEC_PER_DEG, by_name)
 
 
@@ -253,10 +232,13 @@ def _of_signal(
     if count := int(np.count_nonzero(inside)):
         apart = _rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
+        if name == TEMPERATURE:
+            # A replay begins at a reading: its own rounding and that one's are a step together, at most.
+            noise *= math.sqrt(12.0)
         yield Row(name, kind, unit, _rms(one[inside]), _rms(other[inside]), apart, noise, count)
     for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
         count = int(np.count_nonzero(which))
-        if count < LEAST_SAMPLES:
+        if count < LEAST_SAMPLES or name == TEMPERATURE:
             continue
         theirs, ours = noise_of(one, which, parts), noise_of(other, which, parts)
         apart = abs(theirs - ours)
@@ -358,39 +340,6 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
         yield Row(
             channel, kind, UNITS[channel], one, other, _rms(values[:, 0] - values[:, 1]), own, len(pairs)
         )
-
-
-def _spectrum(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
-    """Welch's estimate over the parts, on an even grid; None where all are too short."""
-    steps = np.concatenate([np.diff(trace.time_s[part]) for part in parts])
-    period_s = float(np.median(steps)) if len(steps) else 0.0
-    if period_s <= 0.0:
-        return None
-    longest = max(parts, key=lambda part: part.stop - part.start)
-    length = min(SPECTRUM_SAMPLES, longest.stop - longest.start)
-    if length < 4 * LEAST_SAMPLES:
-        return None
-    from scipy.signal import welch  # noqa: PLC0415 - takes a second to load
-
-    powers: list[FloatArray] = []
-    weights: list[int] = []
-    frequency = np.empty(0)
-    for part in parts:
-        time_s = trace.time_s[part]
-        if len(time_s) < length:
-            continue
-        grid = np.arange(time_s[0], time_s[-1], period_s)
-        if len(grid) < length:
-            continue
-        values = (trace.measured[part], trace.simulated[part], trace.difference[part])
-        even = np.stack([np.interp(grid, time_s, each) for each in values])
-        frequency, power = welch(even, 1.0 / period_s, nperseg=length, detrend="linear")
-        powers.append(power)
-        weights.append(len(grid))
-    if not powers:
-        return None
-    mean = np.average(np.stack(powers), axis=0, weights=weights)
-    return Spectrum(frequency, *np.sqrt(mean))
 
 
 def _rms(values: FloatArray) -> float:

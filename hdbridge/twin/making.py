@@ -20,6 +20,7 @@ from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import HELD_OUT, Twin
+from hdbridge.twin.thermal import with_warmth
 
 
 def fit_twin(
@@ -42,7 +43,9 @@ def fit_twin(
         (left,) = replays([fitted.truth])
         sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
         rest = unexplained(data, left, noise_in_motion(data))
-    truth = with_knowledge(fitted)
+    truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted))
+    if warmth is not None:
+        findings = (*findings, warmth)
     before, after = (_compared(whole, axis, each) for each in (start, truth))
     progress(1.0)
     return Twin(truth, findings, tuple(sets), rest, before, after)

@@ -6,10 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from hdbridge.twin.comparison import ALL, FOLLOWING_ERROR, LOAD_ERROR, MOTOR_TORQUE, TITLES, Comparison
+from hdbridge.twin.comparison import (
+    ALL,
+    FOLLOWING_ERROR,
+    LOAD_ERROR,
+    MOTOR_TORQUE,
+    TEMPERATURE,
+    TITLES,
+    Comparison,
+)
 from hdbridge.twin.result import HELD_OUT
 
-SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE)
+SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
 """Less than a hundredth off the differences, their mean ratio, is no gain: it changes with the noise."""
 WORSE: Final = 1.1
@@ -25,7 +33,8 @@ class Gain:
 
 
 def better(before: Comparison, after: Comparison) -> Gain:
-    """By the rms differences of load error, following error and torque; over all legs where none was held
+    """By the rms differences of load error, following error, torque and temperature, as far as they were
+    recorded; over all legs where none was held
     out.
     """
     kind = HELD_OUT if any(row.kind == HELD_OUT for row in after.rows) else ALL

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
@@ -36,10 +37,13 @@ NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 def recorded(seed: int = 0, count: int = 3, **changes: float) -> Recording:
     """Some long steps each way on the demo axis, with some of its values changed (by their names)."""
     values = {name.replace("_", " "): value for name, value in changes.items()}
-    truth = with_values(TRUTH, values) if values else TRUTH
+    return benched(AXIS, with_values(TRUTH, values) if values else TRUTH, seed, count)
+
+
+def benched(axis: AxisConfig, truth: Truth, seed: int, count: int) -> Recording:
     with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, seed) as (bus, clock, _),
-        Drive(bus, AXIS, clock) as drive,
+        simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
     ):
         drive.boot()
         return Bench(drive).run(Stepping(count, step_deg=150.0))
@@ -137,6 +141,19 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
     assert told.sentence == (
         "Nothing has changed since the twin was made. A change of current limit, warmth would not have shown."
     )
+
+
+def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
+    """By 20 K its friction falls by a fifth, which matters."""
+    sensor = ChannelSource(index=0x2100, type="int16", via="tpdo")
+    axis = AXIS.model_copy(update={"temperature": Temperature(source=sensor, celsius_per_count=0.1)})
+    grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
+    warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
+    told = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
+    known = twin().model_copy(update={"temperature": grows, "intervals": told})
+    found = check(benched(axis, warm, 3, 1), axis, known, workers=1)
+    assert found.changes == ()
+    assert "warmth" not in found.unseen
 
 
 def test_a_check_says_what_a_twin_that_knows_little_would_not_have_shown() -> None:

@@ -1,0 +1,346 @@
+"""The plant's thermal constants: what a recording tells of the temperature, against what warms the plant.
+
+The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`): a copper loss by the
+torque squared, and the work of the motor's friction. By the time that these constants are fitted all else is,
+so two replays tell the losses. The rest needs none: the temperature is linear in losses and surroundings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+from scipy.special import chdtrc
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import Channel, FloatArray
+from hdbridge.estimation.intervals import NORMAL_95
+from hdbridge.records.recording import Recording
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.covariance import sandwich
+from hdbridge.twin.least_squares import Fitted
+from hdbridge.twin.misfit import held_out_legs
+from hdbridge.twin.naming import Finding, finding
+from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
+from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.rivals import FALSE_ALARM
+from hdbridge.twin.stretches import continuous
+
+TEMPERATURE: Final = "temperature"
+"""The channel that these constants show in."""
+AMBIENT: Final = replace(BY_NAME["temperature"], name="ambient temperature")
+_WARM_UP = "a warm-up of half an hour and more, and a rest after it, with the temperature recorded"
+RESISTANCE: Final = Parameter(
+    "thermal resistance", ("temperature", "resistance_k_per_w"), "K/W", 1e-4, 1e3, 0.7, AMBIENT.cause,
+    (), _WARM_UP, 0.25,
+)  # fmt: skip
+TIME_CONSTANT: Final = Parameter(
+    "thermal time constant", ("temperature", "time_constant_s"), "s", 1.0, 1e6, 0.7, AMBIENT.cause,
+    (), _WARM_UP, 0.25,
+)  # fmt: skip
+RISE_K: Final = 100.0
+"""Warming of a winding at rated torque that its insulation allows (IEC 60034-1, class F, resistance method:
+105 K): motors are rated by it. The housing warms by less."""
+MATTERS_K: Final = 5.0
+"""Of that warming: as much as anybody would look for."""
+COPPER_LOSS: Final = Parameter(
+    "copper loss", ("temperature", "copper_loss_w"), "W", 0.0, 1e5, RISE_K, AMBIENT.cause, (), _WARM_UP,
+    MATTERS_K, linear=True,
+)  # fmt: skip
+"""Its spread and what matters of it are those at one kelvin per watt."""
+THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
+
+STEP_S: Final = 1.0
+"""Losses are taken as even over so long: a hundredth of the time constant of the smallest motor."""
+MINIMUM_STEPS: Final = 3
+LONGER: Final = 1e-4
+"""Step of the difference by the time constant's logarithm."""
+LARGE_S: Final = 1e6
+"""Time constant of a body at one kelvin per watt that hardly warms: in an hour at 10 W by 0.04 K."""
+LEAST_ERROR: Final = 1e-4
+"""Of the friction's work, relatively: less is no error."""
+START_K: Final = 1.0
+"""How far the body may be from the first reading of a part: a sensor lags behind it."""
+TOGETHER: Final = 0.25
+"""Share of the time constant over which goes together what one body does not show of a real axis."""
+PLACES: Final = (0.0, -1.4, 1.4)
+"""Logarithm of the time constants that a fit begins at, over the start's."""
+ROUNDS: Final = 3
+"""So often the size of what is left is taken anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Rows in one piece, at even times."""
+
+    friction_w: FloatArray
+    """Work of the friction, a mean of the step that ends at each time."""
+    torque_squares: FloatArray
+    """Of the torque over the rated one, a mean of the same step."""
+    weather_k: FloatArray
+    """By how much the truth's surroundings are warmer than at first."""
+    reading_c: FloatArray
+    rows: NDArray[np.intp]
+    """The times whose reading counts."""
+    firsts: NDArray[np.intp]
+    """Among them the first of each run of equal readings."""
+
+    def runs(self, column: FloatArray) -> FloatArray:
+        """Means over each run."""
+        counted = column[self.rows]
+        lengths = np.diff(np.append(self.firsts, len(counted)))
+        return np.asarray(np.add.reduceat(counted, self.firsts) / lengths, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Losses:
+    """What warms the body, added up from row to row."""
+
+    friction_j: FloatArray
+    torque_squares: FloatArray
+    """Of the torque over the rated one, times seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Coordinates of `THERMAL`, and how sure they are."""
+
+    place: FloatArray
+    covariance: FloatArray
+    left: tuple[float, float]
+    """Rms of what the readings have beyond the body's temperature, over their noise: before, and now."""
+
+
+def with_warmth(
+    recording: Recording, axis: AxisConfig, fitted: Fitted, truth: Truth
+) -> tuple[Truth, Finding | None]:
+    """The fitted truth with thermal constants and their intervals, and what is to be said of them.
+
+    As it was where the recording does not tell the temperature. What it does not show stays.
+    """
+    record = recording.record
+    if Channel.TEMPERATURE.value not in record.columns:
+        return truth, None
+    parts = _parts(recording, _losses(recording, axis, truth), truth)
+    if not parts:
+        return truth, None
+    step_k = _least_change(record.columns[Channel.TEMPERATURE.value])
+    found = _fit(parts, truth, step_k, _friction_error(recording, fitted))
+    heat = dict(zip((each.path[-1] for each in THERMAL), _values(found.place), strict=True))
+    if truth.temperature.friction_growth_per_k or truth.temperature.tooth_growth_per_k:
+        # The surroundings have another temperature; what has grown by it has not changed.
+        heat["reference_c"] = truth.temperature.unchanged_c
+    reach = NORMAL_95 * np.sqrt(np.diag(found.covariance))
+    intervals = {
+        ".".join(each.path): (each.value(float(at - r)), each.value(float(at + r)))
+        for each, at, r in zip(THERMAL, found.place, reach, strict=True)
+    }
+    after = truth.model_copy(
+        update={
+            "temperature": truth.temperature.model_copy(update=heat),
+            "intervals": {**truth.intervals, **intervals},
+        }
+    )
+    return after, _named(truth, after, found)
+
+
+def _named(before: Truth, after: Truth, found: _Fit) -> Finding | None:
+    """What is said where a constant was off by as much as matters, and by more than chance."""
+    off = found.place - np.array(coordinates(before, THERMAL))
+    spread = np.sqrt(np.diag(found.covariance))
+    least = np.array([each.least_change for each in _scaled(before)])
+    distance = float(off @ np.linalg.solve(found.covariance, off))
+    moved = (np.abs(off) > least) & (np.abs(off) > NORMAL_95 * spread)
+    if not np.any(moved) or float(chdtrc(len(off), distance)) > FALSE_ALARM:
+        return None
+    intervals = {each.name: after.intervals[".".join(each.path)] for each in THERMAL}
+    told = finding(THERMAL, before, after, intervals, distance, found.left)
+    return replace(told, shows_in=(TEMPERATURE,))
+
+
+def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: float) -> _Fit:
+    """Least squares of the constants, of the size of the friction's work, and of where each part begins.
+
+    A reading is worth one for each run of equal ones: what rounding has left of it lasts as long.
+    """
+    parameters = _scaled(truth)
+    count = len(parameters)
+    firsts = np.array([each.reading_c[0] for each in parts])
+    prior = np.concatenate([coordinates(truth, parameters), [0.0], firsts])
+    spread = np.concatenate(
+        [[each.spread for each in parameters], [friction_error], np.full(len(parts), START_K)]
+    )
+    low, high = np.full((2, len(prior)), [[-np.inf], [np.inf]])
+    low[:count], high[:count] = np.array([each.bounds for each in parameters]).T
+    read = np.concatenate([each.runs(each.reading_c) for each in parts])
+    noise_k = step_k / math.sqrt(12.0)
+
+    def left(place: FloatArray) -> FloatArray:
+        return np.asarray((_shown(parts, place)[0] - read) / noise_k, dtype=np.float64)
+
+    def slopes(place: FloatArray) -> FloatArray:
+        return np.asarray(_shown(parts, place)[1] / noise_k, dtype=np.float64)
+
+    for _ in range(ROUNDS):
+        fits = []
+        for shift in PLACES:
+            begin = prior.copy()
+            begin[2] = np.clip(begin[2] + shift, low[2], high[2])
+            inside = np.clip(begin, low + 1e-9, high - 1e-9)
+            fits.append(
+                least_squares(
+                    lambda place: np.append(left(place), (place - prior) / spread),
+                    inside,
+                    lambda place: np.concatenate([slopes(place), np.diag(1.0 / spread)]),
+                    (low, high),
+                    x_scale=spread,
+                )
+            )
+        place = min(fits, key=lambda each: float(each.cost)).x
+        rest_k = noise_k * float(np.sqrt(np.mean(np.square(left(place)))))
+        if rest_k <= noise_k:
+            break
+        noise_k = rest_k
+    numbers, goes_on = [], 0
+    together_s = TOGETHER * _values(place[:count])[2]
+    for each in parts:
+        number = (STEP_S * each.rows[each.firsts] // together_s).astype(np.intp)
+        numbers.append(goes_on + number)
+        goes_on += int(number[-1]) + 1
+    legs = np.concatenate(numbers).astype(np.float64)
+    covariance = sandwich(slopes(place), left(place), legs, spread)
+    before = np.concatenate([coordinates(truth, parameters), place[count:]])
+    sizes = [float(np.sqrt(np.mean(np.square(left(each))))) for each in (before, place)]
+    return _Fit(place[:count], covariance[:count, :count], (sizes[0], sizes[1]))
+
+
+def _values(place: FloatArray) -> list[float]:
+    return [each.value(float(at)) for each, at in zip(THERMAL, place, strict=True)]
+
+
+def _scaled(truth: Truth) -> list[Parameter]:
+    """`THERMAL`, with the copper loss's spread for as much warming per watt as the truth has."""
+    k_per_w = max(truth.temperature.resistance_k_per_w, RESISTANCE.least)
+    copper = replace(COPPER_LOSS, spread=RISE_K / k_per_w, least_change=MATTERS_K / k_per_w)
+    return [AMBIENT, RESISTANCE, TIME_CONSTANT, copper]
+
+
+def _shown(parts: Sequence[_Part], place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The body's temperature, a mean for each run, and its derivatives by the coordinates."""
+    count = len(THERMAL)
+    ambient_c, k_per_w, time_s, copper_w = _values(place[:count])
+    friction, starts = math.exp(place[count]), place[count + 1 :]
+    shown, tables = [], []
+    for number, (part, start_c) in enumerate(zip(parts, starts.tolist(), strict=True)):
+        rubbed_k, copper_k = k_per_w * friction * part.friction_w, k_per_w * part.torque_squares
+        goal_c = ambient_c + part.weather_k + rubbed_k + copper_w * copper_k
+        warm_c, none = _body(goal_c, start_c, time_s), np.zeros(len(goal_c))
+        slower_c = _body(goal_c, start_c, time_s * math.exp(LONGER))
+        columns = [
+            _body(none + 1.0, 0.0, time_s),
+            _body(rubbed_k + copper_w * copper_k, 0.0, time_s),
+            (slower_c - warm_c) / LONGER,
+            _body(copper_k, 0.0, time_s),
+            _body(rubbed_k, 0.0, time_s),
+        ]
+        shown.append(part.runs(warm_c))
+        table = np.zeros((len(shown[-1]), len(place)))
+        table[:, : len(columns)] = np.stack([part.runs(each) for each in columns], axis=1)
+        table[:, len(columns) + number] = part.runs(_body(none, 1.0, time_s))
+        tables.append(table)
+    return np.concatenate(shown), np.concatenate(tables)
+
+
+def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
+    """The temperature of a body that follows another one in this time."""
+    nearer = -math.expm1(-STEP_S / time_s)
+    way_c, _ = lfilter([nearer], [1.0, nearer - 1.0], goal_c[1:], zi=[(1.0 - nearer) * start_c])
+    return np.append(start_c, way_c)
+
+
+def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
+    """What follows in one piece, prepared; none of less than two steps, or where no reading counts."""
+    record, heat = recording.record, truth.temperature
+    counts = np.ones(len(record), dtype=np.bool_)
+    for leg in held_out_legs(recording):
+        counts &= (record.time_s < leg.start_s) | (record.time_s > leg.end_s)
+    found = []
+    for rows in continuous(record):
+        time_s = record.time_s[rows] - record.time_s[rows.start]
+        at_s = np.arange(0.0, time_s[-1] + 1e-9, STEP_S)
+        nearest = np.searchsorted(time_s, at_s + 1e-9, side="right") - 1
+        inside = np.flatnonzero(counts[rows][nearest])
+        if len(at_s) < MINIMUM_STEPS or not len(inside):
+            continue
+        reading_c = record.columns[Channel.TEMPERATURE.value][rows][nearest]
+        friction_w, torque_squares = (
+            np.append(0.0, np.diff(np.interp(at_s, time_s, each[rows])) / STEP_S)
+            for each in (losses.friction_j, losses.torque_squares)
+        )
+        weather_k = heat.ambient_k_per_hour * at_s / 3600.0
+        weather_k = weather_k + heat.ambient_swing_k * np.sin(math.tau * at_s / heat.ambient_period_s)
+        new = (np.diff(reading_c[inside]) != 0.0) | (np.diff(inside) > 1)
+        firsts = np.append(0, np.flatnonzero(new) + 1)
+        found.append(_Part(friction_w, torque_squares, weather_k, reading_c, inside, firsts))
+    return found
+
+
+def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
+    """By two replays, of a body that is so large that it hardly warms: how much tells what it has taken in.
+
+    The torque that a recording tells is that at the end of each cycle, and what heats is that within it. The
+    friction's work is that at the temperature that was told.
+    """
+    told_c = recording.record.columns[Channel.TEMPERATURE.value]
+    taken_j = []
+    for copper_w in (0.0, 1.0):
+        heat = truth.temperature.model_copy(
+            update={
+                "resistance_k_per_w": 1.0,
+                "time_constant_s": LARGE_S,
+                "copper_loss_w": copper_w,
+                "ambient_k_per_hour": 0.0,
+                "ambient_swing_k": 0.0,
+            }
+        )
+        record = replay_directly(recording, axis, truth.model_copy(update={"temperature": heat}))
+        warm_c, time_s = record.columns[Channel.TEMPERATURE.value], record.time_s
+        above_k = 0.5 * (warm_c[1:] + warm_c[:-1]) - heat.ambient_c
+        cooled_j = np.append(0.0, np.cumsum(above_k * np.diff(time_s)))
+        taken_j.append(LARGE_S * warm_c + cooled_j)
+    friction_j = np.diff(taken_j[0]) * (_grown(truth, told_c) / _grown(truth, warm_c))[1:]
+    return _Losses(np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0])
+
+
+def _grown(truth: Truth, warm_c: FloatArray) -> FloatArray:
+    """The friction at a temperature: so many times the truth file's, a twentieth at least."""
+    heat = truth.temperature
+    grown = 1.0 + heat.friction_growth_per_k * (warm_c - heat.unchanged_c)
+    return np.asarray(np.maximum(grown, 0.05), dtype=np.float64)
+
+
+def _friction_error(recording: Recording, fitted: Fitted) -> float:
+    """Relative standard deviation of the friction's work over a recording, by the covariance of a fit."""
+    record, motor = recording.record, fitted.truth.motor
+    turned = np.abs(np.radians(np.diff(record.motor_position_deg)))
+    speed = turned / np.maximum(np.diff(record.time_s), 1e-9)
+    works = {
+        "Coulomb friction": motor.coulomb_nm * float(np.sum(turned)),
+        "viscous friction": motor.viscous_nm_s_per_rad * float(np.sum(turned * speed)),
+    }
+    whole = sum(works.values())
+    share = np.array([works.get(each.name, 0.0) / whole if whole else 0.0 for each in fitted.parameters])
+    return max(math.sqrt(float(share @ fitted.covariance @ share)), LEAST_ERROR)
+
+
+def _least_change(values: FloatArray) -> float:
+    """The step of a reading; `START_K` of one that never changes."""
+    changes = np.abs(np.diff(values))
+    beyond = changes > 1e-9 * float(np.max(np.abs(values), initial=1.0))
+    return float(np.min(changes, where=beyond, initial=START_K))

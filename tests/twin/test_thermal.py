@@ -1,0 +1,131 @@
+"""Thermal constants are learned from a warm-up, and stay as they were where nothing shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.truth import TrueTemperature
+from hdbridge.twin.least_squares import Fitted, solve
+from hdbridge.twin.misfit import prepare
+from hdbridge.twin.parameters import BY_NAME, coordinates
+from hdbridge.twin.replays import Replays
+from hdbridge.twin.thermal import THERMAL, with_warmth
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS = AxisConfig.load(DEMO)
+TRUTH = Truth.load(DEMO)
+SENSOR_K = 0.1
+FRICTION = tuple(BY_NAME[name] for name in ("Coulomb friction", "viscous friction"))
+
+
+def warmed(heat: TrueTemperature, seed: int, minutes: float, rests: float = 0.25) -> Recording:
+    """The demo axis with another body, at work of two kinds and at rest, read in tenths of a kelvin."""
+    rng = np.random.default_rng(seed)
+    truth = TRUTH.model_copy(update={"temperature": heat})
+    machine = Machine(truth, seed, may_compile=True)
+    machine.torque_limit_permille = 10.0 * AXIS.limits.torque_percent
+    bench = Exercise(machine, cycle_s=0.02)
+    seconds = 60.0 * minutes
+    while (now_s := bench.samples * bench.cycle_s) < (1.0 - rests) * seconds:
+        fast = rng.random() < 0.5
+        until_s = now_s + float(rng.uniform(0.03, 0.1)) * seconds
+        while bench.samples * bench.cycle_s < until_s:
+            way = float(rng.choice([-1.0, 1.0]))
+            bench.move(way * 400.0, 5000.0, 60_000.0) if fast else bench.move(way * 2000.0, 2500.0, 9000.0)
+            bench.hold(0.2)
+    bench.hold(rests * seconds)
+    told = bench.readings()
+    return Recording(
+        Record(
+            {
+                "time_s": told.time_s,
+                "motor_target_deg": told.target_deg,
+                "motor_position_deg": told.motor_deg,
+                "load_position_deg": told.load_deg,
+                "motor_torque_nm": told.motor_torque_nm,
+                "temperature_c": SENSOR_K * np.round(told.temperature_c / SENSOR_K),
+            }
+        )
+    )
+
+
+def fitted(recording: Recording) -> Fitted:
+    """Its friction, where it is, and how sure a fit of it is."""
+    few = recording.record.rows(0, 500)
+    with Replays(prepare(Recording(few), AXIS, TRUTH), 1) as replays:
+        return solve(replays, TRUTH, FRICTION, np.array(coordinates(TRUTH, FRICTION)), 0)
+
+
+HEATS = (
+    TrueTemperature(
+        ambient_c=26.0, start_c=24.0, resistance_k_per_w=3.0, time_constant_s=250.0, copper_loss_w=20.0
+    ),
+    TrueTemperature(
+        ambient_c=18.0, start_c=16.0, resistance_k_per_w=2.0, time_constant_s=400.0, copper_loss_w=5.0
+    ),
+)
+
+
+@pytest.mark.parametrize("seed", range(len(HEATS)))
+def test_constants_that_are_off_by_factors_are_learned_from_a_warm_up(seed: int) -> None:
+    recording = warmed(HEATS[seed], seed, 10.0)
+    after, told = with_warmth(recording, AXIS, fitted(recording), TRUTH)
+    assert told is not None
+    assert told.cause == "warmth"
+    assert told.gain[1] < 1.5 < told.gain[0]
+    for each in THERMAL:
+        lower, upper = after.intervals[".".join(each.path)]
+        assert lower <= getattr(HEATS[seed], each.path[-1]) <= upper, each.name
+    assert after.temperature.time_constant_s == pytest.approx(HEATS[seed].time_constant_s, rel=0.15)
+    assert after.temperature.resistance_k_per_w == pytest.approx(HEATS[seed].resistance_k_per_w, rel=0.15)
+
+
+def test_seconds_leave_them_as_they_were_and_say_so() -> None:
+    heat = TrueTemperature(ambient_c=23.0, resistance_k_per_w=2.0, time_constant_s=600.0, copper_loss_w=5.0)
+    recording = warmed(heat, 0, 0.1, rests=0.0)
+    after, told = with_warmth(recording, AXIS, fitted(recording), TRUTH)
+    assert told is None
+    assert after.temperature.ambient_c == pytest.approx(22.0, abs=3.0)
+    for each in THERMAL[1:3]:
+        lower, upper = after.intervals[".".join(each.path)]
+        usual = getattr(TRUTH.temperature, each.path[-1])
+        assert getattr(after.temperature, each.path[-1]) == pytest.approx(usual, rel=0.2), each.name
+        assert lower < 0.5 * usual < 2.0 * usual < upper, each.name
+
+
+def test_what_happened_between_two_parts_is_not_guessed() -> None:
+    """Two parts of a warm-up that follow by one row when put together: the second has its own reading."""
+    whole = warmed(HEATS[0], 2, 12.0).record
+    parts = [Recording(whole.rows(0, len(whole) // 3)), Recording(whole.rows(len(whole) // 2, len(whole)))]
+    recording = Recording.joined(parts)
+    after, _ = with_warmth(recording, AXIS, fitted(recording), TRUTH)
+    lower, upper = after.intervals["temperature.time_constant_s"]
+    assert lower <= HEATS[0].time_constant_s <= upper
+
+
+def test_without_the_temperature_a_truth_stays_what_it_is() -> None:
+    recording = warmed(HEATS[0], 0, 0.3, rests=0.0)
+    columns = {name: each for name, each in recording.record.columns.items() if name != "temperature_c"}
+    assert with_warmth(Recording(Record(columns)), AXIS, fitted(recording), TRUTH) == (TRUTH, None)
+
+
+def test_what_grows_with_the_warmth_does_so_from_where_it_did() -> None:
+    """Its reference was the ambient temperature, which has become another one."""
+    grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01})
+    start = TRUTH.model_copy(update={"temperature": grows})
+    heat = HEATS[0].model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
+    recording = warmed(heat, 3, 8.0)
+    after, _ = with_warmth(recording, AXIS, fitted(recording), start)
+    assert after.temperature.ambient_c == pytest.approx(26.0, abs=0.3)
+    assert after.temperature.unchanged_c == 22.0
+    lower, upper = after.intervals["temperature.resistance_k_per_w"]
+    assert lower <= 3.0 <= upper
