@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.defaults import with_sections
+from hdbridge.twin.earned import EARNED, with_last, with_limit, with_loop
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
+from hdbridge.twin.loop_laws import LAWS
 from hdbridge.twin.minima import elsewhere, exchanged, lags, springs
 from hdbridge.twin.misfit import CHANNELS, Data
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
-    BY_NAME,
     LOAD,
     PARAMETERS,
     Parameter,
@@ -31,16 +31,6 @@ from hdbridge.twin.scales import Loops, Scales, scales
 FIT_S = 60.0
 """A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
 there is time: a thousand replays of a quarter of an hour would take hours."""
-LAST = (("velocity feed-forward",), ("friction's rise at rest", "Stribeck speed"))
-"""Fitted last, if that earns it. Most drives feed the whole speed forward, and otherwise it looks like a dead
-time until all else is right; friction near rest is told from Coulomb friction by few rows."""
-EARNED = 8.0
-"""Half the drop of the scaled squares that these have to bring, and a place that is not the start's to be
-gone on from: exp(8) to one."""
-SURE = 4.0
-"""... and the first one's distance from where it was, in standard deviations."""
-LAST_STEPS = 6
-"""Steps that show whether they are: how fast friction falls off is seen only once it is known to."""
 FIRST_STEPS = 6
 """From each of the starts a fit goes so many steps, as many more from the first and the best of the others,
 and as many from the better of these with its gains exchanged;"""
@@ -100,6 +90,12 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
     progress(0.6)
     best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
+    for _ in LAWS:
+        other = with_loop(replays, best, prior)
+        if other is None:
+            break
+        prior = other.prior
+        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most)
     while True:
         if _leaves_more(data, best):
             for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
@@ -110,6 +106,11 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         if wider is best:
             break
         best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+    limited = with_limit(replays, best, prior, start)
+    best = replace(best, truth=limited.truth)
+    if limited.parameters != best.parameters:
+        prior = limited.prior
+        best = solve(replays, best.truth, limited.parameters, prior, STEPS, most=most)
     progress(0.85)
     for _ in range(ROUNDS):
         last, loops = best, loops_about(replays, best)
@@ -161,23 +162,6 @@ def better_places(
             if reached.loss + EARNED < own.loss:
                 found.append(reached.truth)
     return found
-
-
-def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
-    """A fit with those of `LAST` that earn it, not yet led to the minimum, and what its prior is about."""
-    for names in LAST:
-        extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
-        if not extra:
-            continue
-        wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
-        around = np.append(prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, around, LAST_STEPS, known=best.scales)
-        new = len(best.parameters)
-        off = abs(float(tried.place[new] - around[new]))
-        sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
-        if sure and best.cost - tried.cost > EARNED * best.inflation:
-            best, prior = tried, around
-    return best, prior
 
 
 def loops_about(replays: Replays, fitted: Fitted) -> Loops:

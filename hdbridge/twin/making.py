@@ -13,6 +13,7 @@ from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.fitting import FIT_S, fit
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
+from hdbridge.twin.loop_laws import by_law_of
 from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
 from hdbridge.twin.naming import alike, name_causes, unexplained
 from hdbridge.twin.noise import noise_in_motion, with_load_noise
@@ -39,7 +40,8 @@ def fit_twin(
     data = coarse(prepare(whole, axis, start), FIT_S)
     with Replays(data, workers) as replays:
         fitted = fit(replays, lambda share: progress(0.9 * share))
-        findings, rivals = name_causes(replays, with_sections(start, fitted.parameters), fitted)
+        like = by_law_of(with_sections(start, fitted.parameters), fitted.truth)
+        findings, rivals = name_causes(replays, like, fitted)
         (left,) = replays([fitted.truth])
         sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
         rest = unexplained(data, left, noise_in_motion(data))

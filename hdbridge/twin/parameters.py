@@ -62,10 +62,12 @@ _SPEEDS = "motion at constant speed, at three speeds at least"
 _REVERSALS = "slow reversals"
 _SINES = "sines of several frequencies up to the bandwidth of the loops"
 _FULL = "an acceleration at which the drive reaches its torque limit"
+_LOOPS = "slow sines of several amplitudes, some smaller than the width"
 
 FRICTION: Final = "friction"
 SERVO: Final = "servo gains"
 FEEDFORWARD: Final = "feed-forward"
+ELASTIC: Final = "elastic loop"
 
 PARAMETERS: Final[tuple[Parameter, ...]] = (
     Parameter(
@@ -157,6 +159,22 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         (TORQUE, FOLLOWING), _FULL, 0.05,
     ),
     Parameter(
+        "loop offset", ("gear", "hysteresis", "offset_arcsec"), "arcsec", 0.01, 3.6e4, 0.3, ELASTIC,
+        (LOAD,), _LOOPS, 0.05,
+    ),
+    Parameter(
+        "loop width", ("gear", "hysteresis", "width_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
+        (LOAD,), _LOOPS, 0.15,
+    ),
+    Parameter(
+        "loop yield", ("gear", "hysteresis", "yield_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
+        (LOAD,), _LOOPS, 0.15,
+    ),
+    Parameter(
+        "loop exponent", ("gear", "hysteresis", "exponent"), "", 1.0, 5.0, 0.5, ELASTIC,
+        (LOAD,), _LOOPS, 0.20,
+    ),
+    Parameter(
         "load friction", ("load", "coulomb_nm"), "Nm", 0.0, 1e4, 5.0, "load friction",
         (LOAD, TORQUE), _REVERSALS, 0.5, linear=True,
     ),
@@ -171,10 +189,10 @@ BY_NAME: Final[Mapping[str, Parameter]] = {each.name: each for each in PARAMETER
 
 
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
-    """What a truth file has; None where the section that it belongs to is not there."""
+    """What a truth file has; None where the section that it belongs to is not there, or the law has none."""
     place: Any = truth
     for key in parameter.path:
-        place = getattr(place, "load_" if key == "load" else key)
+        place = getattr(place, "load_" if key == "load" else key, None)
         if place is None:
             return None
     return float(place)

@@ -5,7 +5,8 @@ sign of the speed and viscous friction by the speed, whatever the spring and the
 taken from its own encoder: near its resonance it does not do what the command says. The motor's part is
 needed, but not used: a drive takes in a new demand in each cycle, so the motor accelerates in the first
 milliseconds of a cycle, and its torque is told at the end. The following error at a constant speed is
-that speed times the age of the demand.
+that speed times the age of the demand. A torque that is the highest and stays there for rows on end may be
+all that the drive has.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import Data, Piece, demand_deg
+from hdbridge.twin.misfit import Data, Piece, demand_deg, rounding
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_values
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -25,6 +26,8 @@ SMOOTHED_S = 0.03
 """All that is compared is averaged over so long: an angle in whole counts has no acceleration of its own."""
 MOVING_DEG_S = 5.0
 """Motor speed above which the direction of friction is beyond doubt."""
+HELD_ROWS = 3
+"""A torque that only goes through its highest value is there for a row, or for two about it."""
 LEAST_ROWS = 50
 LEAST_SHARE = 0.15
 """A coefficient that is known no better than this, relatively, is not used: a fifth of what the prior leaves
@@ -40,11 +43,13 @@ class Readings:
     load_inertia_kg_m2: float | None
     coulomb_nm: float | None
     viscous_nm_s_per_rad: float | None
+    held_nm: float | None
+    """The motor's highest torque, where it stays there while the motor moves."""
 
 
 def read_off(data: Data) -> Readings:
     """The regressions over all pieces."""
-    return Readings(_lag_s(data), *_mechanics(data))
+    return Readings(_lag_s(data), *_mechanics(data), _held_nm(data))
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
@@ -62,6 +67,10 @@ def start_of(truth: Truth, data: Data) -> Truth:
         values["Coulomb friction"] = found.coulomb_nm
     if found.viscous_nm_s_per_rad is not None:
         values["viscous friction"] = found.viscous_nm_s_per_rad
+    if found.held_nm is not None:
+        held_percent = 100.0 * found.held_nm / truth.motor.rated_torque_nm
+        if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
+            values["current limit"] = held_percent
     if found.lag_s is not None:
         filtered_ms = 2.0 * servo.command_filter_ms
         dead_ms = 1e3 * found.lag_s - filtered_ms
@@ -121,6 +130,18 @@ def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
     counts[:width] = counts[-width:] = 0.0
     whole = _smoothed(counts, width + 2) > 1.0 - 1e-9
     return np.stack(columns, axis=1)[whole], _smoothed(torque, width)[whole]
+
+
+def _held_nm(data: Data) -> float | None:
+    """The highest torque where it is told in some rows on end; standing motors may be held by any."""
+    told = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
+    highest = max(float(np.max(each)) for each in told)
+    for each in told:
+        there = np.concatenate([[0.0], each > highest - 0.5 * rounding(data.axis)[TORQUE], [0.0]])
+        first, end = np.flatnonzero(np.diff(there) > 0.0), np.flatnonzero(np.diff(there) < 0.0)
+        if highest > 0.0 and np.any(end - first >= HELD_ROWS):
+            return highest
+    return None
 
 
 def _lag_s(data: Data) -> float | None:

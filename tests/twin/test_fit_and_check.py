@@ -18,7 +18,6 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
-from hdbridge.twin.fitting import with_last
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
@@ -102,25 +101,6 @@ def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
     for each in parameters:
         true, found = value_in(TRUTH, each), value_in(fitted.truth, each)
         assert found == pytest.approx(true, rel=0.03, abs=0.05), each.name
-
-
-@pytest.mark.parametrize("rise", [0.0, 0.5])
-def test_friction_near_rest_is_taken_in_where_the_axis_has_it(rise: float) -> None:
-    sticks = {"friction's rise at rest": rise, "Stribeck speed": 8.0}
-    recording = recorded(count=1, **sticks)
-    parameters = tuple(BY_NAME[name] for name in NAMES)
-    prior = np.array(coordinates(TRUTH, parameters))
-    with Replays(prepare(recording, AXIS, TRUTH), 1) as replays:
-        fitted, around = with_last(replays, solve(replays, TRUTH, parameters, prior, 2), prior)
-        if not rise:
-            assert fitted.parameters == parameters
-            return
-        assert {each.name for each in fitted.parameters} == {*NAMES, *sticks}
-        fitted = solve(replays, fitted.truth, fitted.parameters, around, 3, near=fitted)
-    assert fitted.truth.motor.stribeck is not None
-    assert fitted.truth.motor.stribeck.rise == pytest.approx(rise, rel=0.1)
-    assert fitted.truth.motor.stribeck.speed_rad_s == pytest.approx(8.0, rel=0.2)
-    assert fitted.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
 
 
 def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> None:

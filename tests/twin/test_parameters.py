@@ -8,6 +8,7 @@ import pytest
 
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.defaults import with_sections
+from hdbridge.twin.loop_laws import by_each_law
 from hdbridge.twin.parameters import (
     BY_NAME,
     PARAMETERS,
@@ -19,22 +20,27 @@ from hdbridge.twin.parameters import (
 )
 
 DEMO = with_sections(Truth.load(Path(__file__).parents[2] / "profiles" / "demo"), PARAMETERS)
+DAHL = by_each_law(DEMO)[-1]
+"""With a loop that has a yield in place of a width."""
 
 
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda each: each.name)
 def test_each_row_names_a_value_of_the_truth_file_within_its_bounds(parameter: Parameter) -> None:
-    value = value_in(DEMO, parameter)
+    truth = DEMO if value_in(DEMO, parameter) is not None else DAHL
+    value = value_in(truth, parameter)
     assert value is not None
     assert parameter.least <= value <= parameter.most
     assert parameter.value(parameter.coordinate(value)) == pytest.approx(value)
     other = 0.9 * value + 0.001
-    assert value_in(with_values(DEMO, {parameter.name: other}), parameter) == pytest.approx(other)
+    assert value_in(with_values(truth, {parameter.name: other}), parameter) == pytest.approx(other)
 
 
-def test_coordinates_lead_there_and_back() -> None:
-    place = coordinates(DEMO, PARAMETERS)
-    again = at_coordinates(DEMO, PARAMETERS, place)
-    assert coordinates(again, PARAMETERS) == pytest.approx(place)
+@pytest.mark.parametrize("truth", [DEMO, DAHL], ids=["demo", "dahl"])
+def test_coordinates_lead_there_and_back(truth: Truth) -> None:
+    parameters = [each for each in PARAMETERS if value_in(truth, each) is not None]
+    place = coordinates(truth, parameters)
+    again = at_coordinates(truth, parameters, place)
+    assert coordinates(again, parameters) == pytest.approx(place)
 
 
 def test_a_section_that_a_parameter_needs_is_as_good_as_none() -> None:

@@ -24,7 +24,7 @@ class RollingFriction(Part):
     law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
     width_deg: float = Field(gt=0, le=36_000, description="motor travel of the crossing")
-    exponent: float = Field(gt=1, le=10, description="shape of the crossing, n")
+    exponent: float = Field(ge=1, le=10, description="shape of the crossing, n; at 1 it jumps across")
     start_arcsec: float = Field(0.0, description="error at the start")
 
     @model_validator(mode="after")

@@ -1,0 +1,152 @@
+"""What a fit takes in only where the recording shows it: friction near rest, another loop, a torque limit."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.effects import FloatArray
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.recording import Recording
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.earned import with_last, with_limit, with_loop
+from hdbridge.twin.least_squares import Fitted, solve
+from hdbridge.twin.loop_laws import LAWS, by_each_law, by_law_of, loop_parameters
+from hdbridge.twin.misfit import prepare
+from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
+from hdbridge.twin.regressions import read_off, start_of
+from hdbridge.twin.replays import Replays
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+_DEMO = AxisConfig.load(DEMO)
+AXIS = _DEMO.model_copy(update={"drive": _DEMO.drive.model_copy(update={"following_error_deg": 60.0})})
+"""A limited drive falls behind."""
+TRUTH = Truth.load(DEMO)
+NAMES = ("Coulomb friction", "load inertia", "servo dead time")
+LIMIT = "current limit"
+LIMIT_PERCENT = 15.0
+"""The demo axis needs 19 % for the steps."""
+PARAMETERS = tuple(BY_NAME[name] for name in NAMES)
+
+
+def recorded(truth: Truth = TRUTH) -> Recording:
+    """Steps there and back on an axis."""
+    return _recorded(truth.model_dump_json(by_alias=True, exclude_none=True))
+
+
+@cache
+def _recorded(truth: str) -> Recording:
+    with (
+        simulated_bench(Truth.from_text(truth), AXIS.eds_path, AXIS.drive.node_id, 0) as (bus, clock, _),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        return Bench(drive).run(Stepping(1, step_deg=150.0))
+
+
+def fitted(replays: Replays, start: Truth, steps: int = 2) -> Fitted:
+    return solve(replays, start, PARAMETERS, prior(start), steps)
+
+
+def prior(start: Truth = TRUTH) -> FloatArray:
+    return np.array(coordinates(start, PARAMETERS))
+
+
+@pytest.mark.parametrize("rise", [0.0, 0.5])
+def test_friction_near_rest_is_taken_in_where_the_axis_has_it(rise: float) -> None:
+    sticks = {"friction's rise at rest": rise, "Stribeck speed": 8.0}
+    with Replays(prepare(recorded(with_values(TRUTH, sticks)), AXIS, TRUTH), 1) as replays:
+        found, around = with_last(replays, fitted(replays, TRUTH), prior())
+        if not rise:
+            assert found.parameters == PARAMETERS
+            return
+        assert {each.name for each in found.parameters} == {*NAMES, *sticks}
+        found = solve(replays, found.truth, found.parameters, around, 3, near=found)
+    assert found.truth.motor.stribeck is not None
+    assert found.truth.motor.stribeck.rise == pytest.approx(rise, rel=0.1)
+    assert found.truth.motor.stribeck.speed_rad_s == pytest.approx(8.0, rel=0.2)
+    assert found.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
+
+
+def test_a_torque_limit_is_read_off_where_the_motor_stays_at_it() -> None:
+    limited = with_values(TRUTH, {LIMIT: LIMIT_PERCENT})
+    begun = start_of(TRUTH, prepare(recorded(limited), AXIS, TRUTH))
+    assert begun.servo.torque_limit_percent == pytest.approx(LIMIT_PERCENT, rel=0.01)
+    assert read_off(prepare(recorded(), AXIS, TRUTH)).held_nm is None
+
+
+def test_a_torque_limit_is_fitted_where_a_replay_without_it_leaves_more() -> None:
+    limited = with_values(TRUTH, {LIMIT: LIMIT_PERCENT})
+    with Replays(prepare(recorded(limited), AXIS, TRUTH), 1) as replays:
+        read = start_of(TRUTH, replays.data).servo.torque_limit_percent
+        found = fitted(replays, with_values(TRUTH, {LIMIT: read}))
+        limited = with_limit(replays, found, prior(), TRUTH)
+        assert [each.name for each in limited.parameters] == [*NAMES, LIMIT]
+        found = solve(replays, limited.truth, limited.parameters, limited.prior, 3)
+    lower, upper = found.intervals()[LIMIT]
+    assert lower < LIMIT_PERCENT < upper
+    assert upper - lower < 0.05 * LIMIT_PERCENT
+
+
+def test_a_highest_torque_that_was_all_that_was_needed_is_no_limit() -> None:
+    with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
+        highest_nm = max(float(np.max(np.abs(each.measured["motor torque"]))) for each in replays.data.pieces)
+        within = with_values(TRUTH, {LIMIT: 100.0 * highest_nm / TRUTH.motor.rated_torque_nm})
+        usual = with_limit(replays, fitted(replays, within), prior(), TRUTH)
+    assert usual.parameters == PARAMETERS
+    assert usual.truth.servo.torque_limit_percent == TRUTH.servo.torque_limit_percent
+
+
+def test_another_law_of_the_loop_is_taken_in_where_the_load_shows_it() -> None:
+    dahl = by_each_law(TRUTH)[-1]
+    assert dahl.gear.hysteresis is not None
+    assert dahl.gear.hysteresis.law == "dahl"
+    assert TRUTH.gear.hysteresis is not None
+    assert TRUTH.gear.hysteresis.law != "dahl"
+    # As a calibration by one law tells it: too low, and crossed elsewhere.
+    wrong = with_values(TRUTH, {"loop offset": 0.93 * TRUTH.gear.hysteresis.offset_arcsec})
+    with Replays(prepare(recorded(dahl), AXIS, wrong), 1) as replays:
+        other = with_loop(replays, fitted(replays, wrong), prior(wrong))
+        assert other is not None
+        assert other.truth.gear.hysteresis is not None
+        assert other.truth.gear.hysteresis.law == "dahl"
+        found = solve(replays, other.truth, other.parameters, other.prior, 4)
+        assert with_loop(replays, found, other.prior) is None
+    for name in ("loop offset", "loop yield"):
+        assert value_in(found.truth, BY_NAME[name]) == pytest.approx(value_in(dahl, BY_NAME[name]), rel=0.03)
+
+
+def test_a_loop_that_explains_the_load_stays_as_it_is() -> None:
+    with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
+        assert with_loop(replays, fitted(replays, TRUTH), prior()) is None
+
+
+@pytest.mark.parametrize("law", [each["law"] for each in LAWS])
+def test_a_loop_by_another_law_is_as_high_and_crossed_half_after_the_same_travel(law: str) -> None:
+    there = next(
+        each for each in by_each_law(TRUTH) if each.gear.hysteresis and each.gear.hysteresis.law == law
+    )
+    assert {each.name for each in loop_parameters(there)} >= {"loop offset", "loop exponent"}
+    back = by_law_of(there, TRUTH)
+    own = TRUTH.gear.hysteresis
+    assert own is not None
+    assert back.gear.hysteresis is not None
+    assert value_in(back, BY_NAME["loop offset"]) == pytest.approx(own.offset_arcsec)
+    again = by_law_of(back, there)
+    assert again.gear.hysteresis is not None
+    for each in loop_parameters(there):
+        assert value_in(again, each) == pytest.approx(value_in(there, each), rel=1e-6)
+
+
+def test_a_gear_without_a_loop_has_none_by_another_law() -> None:
+    gear = TRUTH.gear.model_copy(update={"hysteresis": None})
+    bare = TRUTH.model_copy(update={"gear": gear})
+    assert by_each_law(bare) == []
+    assert by_law_of(bare, TRUTH) is bare
