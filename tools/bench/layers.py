@@ -6,7 +6,8 @@ left at the end is SYNC, two TPDOs and the RPDO over the lockstep bus and nothin
 are compiled where numba is installed.
 
 Processor time of the thread per cycle; blocks of all variants in turn, and of each the lower decile, because
-what another program takes of a shared processor only ever adds.
+what another program takes of a shared processor only ever adds. The median beside it has that in it, as the
+sum over a whole procedure has (`speed.py`): the two are to be compared with each other.
 """
 
 from __future__ import annotations
@@ -202,7 +203,8 @@ def main() -> None:
         decile = statistics.quantiles(each, n=10)[0]
         print(
             f"without {name:<22} {decile:6.1f} us per cycle"
-            + ("" if math.isnan(before) else f" ({before - decile:+.1f})")
+            + ("         " if math.isnan(before) else f" ({before - decile:+5.1f}) ")
+            + f" median {statistics.median(each):6.1f}"
         )
         before = decile
 
