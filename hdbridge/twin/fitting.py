@@ -12,7 +12,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.earned import EARNED, with_last, with_limit, with_loop
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
-from hdbridge.twin.loop_laws import LAWS
+from hdbridge.twin.loop_laws import LAWS, LOOP
 from hdbridge.twin.minima import elsewhere, exchanged, lags, springs
 from hdbridge.twin.misfit import CHANNELS, Data
 from hdbridge.twin.noise import expected
@@ -48,8 +48,11 @@ ROUNDS = 3
 """So often at most that is looked at anew, where the fit has gone;"""
 SAME = 0.3
 """... that is, by more than so many standard deviations."""
-OPTIONAL = ("velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay")
-"""Not fitted unless asked for: the ordinary motion does not show them, or others can take their place."""
+OPTIONAL = (
+    "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay", *LOOP,
+)  # fmt: skip
+"""Not fitted unless asked for or earned: the ordinary motion does not show them, others can take their
+place, or a calibration has told them."""
 
 
 def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, ...]:

@@ -17,8 +17,9 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.earned import with_last, with_limit, with_loop
+from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.least_squares import Fitted, solve
-from hdbridge.twin.loop_laws import LAWS, by_each_law, by_law_of, loop_parameters
+from hdbridge.twin.loop_laws import LAWS, LOOP, by_each_law, by_law_of, loop_parameters
 from hdbridge.twin.misfit import prepare
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off, start_of
@@ -150,3 +151,15 @@ def test_a_gear_without_a_loop_has_none_by_another_law() -> None:
     bare = TRUTH.model_copy(update={"gear": gear})
     assert by_each_law(bare) == []
     assert by_law_of(bare, TRUTH) is bare
+
+
+def test_a_fit_may_make_a_loop_lower_than_where_it_began() -> None:
+    assert TRUTH.gear.hysteresis is not None
+    assert TRUTH.gear.hysteresis.law == "rolling_friction"
+    assert TRUTH.gear.hysteresis.start_arcsec == -9.0
+    lower = with_values(by_each_law(TRUTH)[0], {"loop offset": 5.0})
+    assert value_in(lower, BY_NAME["loop offset"]) == 5.0
+
+
+def test_the_loop_is_a_calibrations_unless_it_is_earned() -> None:
+    assert not {*LOOP} & {each.name for each in free_parameters(TRUTH)}
