@@ -233,8 +233,11 @@ def _of_signal(
         apart = _rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
         if name == TEMPERATURE:
-            # A replay begins at a reading: its own rounding and that one's are a step together, at most.
+            # A replay begins at a reading: its own rounding and that one's are a step together, at most. A
+            # reading that stays the same says nothing of how long its step is.
             noise *= math.sqrt(12.0)
+            if not noise:
+                return
         yield Row(name, kind, unit, _rms(one[inside]), _rms(other[inside]), apart, noise, count)
     for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
         count = int(np.count_nonzero(which))

@@ -1,7 +1,8 @@
 """What a fit takes in where the recording shows it, once all else is known: parameters that earn their place.
 
 Most drives feed the whole speed forward, and otherwise it looks like a dead time until all else is right;
-friction near rest is told from Coulomb friction by few rows. The gear's loop is the model's, and stays so
+friction near rest is told from Coulomb friction by few rows, and how friction falls with warmth only where
+parts were at different temperatures. The gear's loop is the model's, and stays so
 unless the load's angle says otherwise. A torque limit shows only where it is reached.
 """
 
@@ -17,6 +18,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.least_squares import Fitted, fitted_rows, solve, told
 from hdbridge.twin.loop_laws import by_each_law, loop_parameters
+from hdbridge.twin.misfit import Data
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
     BY_NAME,
@@ -29,7 +31,8 @@ from hdbridge.twin.parameters import (
 )
 from hdbridge.twin.replays import Replays
 
-LAST: Final = (("velocity feed-forward",), ("friction's rise at rest", "Stribeck speed"))
+GROWTH: Final = "friction growth"
+LAST: Final = (("velocity feed-forward",), (GROWTH,), ("friction's rise at rest", "Stribeck speed"))
 """Taken in together or not at all."""
 LIMIT: Final = BY_NAME["current limit"]
 EARNED = 8.0
@@ -56,7 +59,7 @@ def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted
     """A fit with those of `LAST` that earn it, not yet led to the minimum, and what its prior is about."""
     for names in LAST:
         extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
-        if not extra:
+        if not extra or (GROWTH in names and not _warms(replays.data)):
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
         around = np.append(prior, coordinates(there, extra))
@@ -67,6 +70,13 @@ def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted
         if sure and best.cost - tried.cost > EARNED * best.inflation:
             best, prior = tried, around
     return best, prior
+
+
+def _warms(data: Data) -> bool:
+    """Whether the pieces began at temperatures that differ by as much as matters."""
+    begun = [each.commands.start_c for each in data.pieces]
+    known_c = [each for each in begun if each is not None]
+    return len(known_c) == len(begun) and max(known_c) - min(known_c) > BY_NAME["temperature"].least_change
 
 
 def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | None:

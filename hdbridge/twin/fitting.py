@@ -49,7 +49,8 @@ ROUNDS = 3
 SAME = 0.3
 """... that is, by more than so many standard deviations."""
 OPTIONAL = (
-    "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay", *LOOP,
+    "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
+    "friction growth", *LOOP,
 )  # fmt: skip
 """Not fitted unless asked for or earned: the ordinary motion does not show them, others can take their
 place, or a calibration has told them."""

@@ -134,12 +134,14 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
 
 
 def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
-    """Pieces that take the axis about ``wanted_s``: as many kinds of motion as there is time for."""
+    """Pieces that take the axis about ``wanted_s``: as many kinds of motion as there is time for, and then
+    as different temperatures.
+    """
     left = sorted(data.pieces, key=lambda each: len(each.commands.counts))
     taken: list[Piece] = []
     duration_s, kinds = 0.0, set[str]()
     for again in range(2):
-        for piece in left:
+        for piece in _by_warmth(left, taken) if again else left:
             length_s = len(piece.commands.counts) * piece.commands.cycle_s
             new = not kinds.union(WITHOUT_MOTION).issuperset(piece.kind)
             if any(piece is each for each in taken) or (taken and duration_s + length_s > wanted_s):
@@ -149,6 +151,23 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
                 duration_s += length_s
                 kinds.update(piece.kind)
     return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
+
+
+def _by_warmth(pieces: list[Piece], taken: Sequence[Piece]) -> list[Piece]:
+    """Each next piece is as far from those before it, and from those taken, as its temperature can be."""
+    warm_c = np.array([each.commands.start_c for each in pieces], dtype=np.float64)
+    if np.isnan(warm_c).any():
+        return pieces
+    near_k = np.full(len(pieces), np.inf)
+    for number, piece in enumerate(pieces):
+        if any(piece is each for each in taken):
+            near_k = np.minimum(near_k, np.abs(warm_c - warm_c[number]))
+    left, order = list(range(len(pieces))), []
+    while left:
+        farthest = left.pop(int(np.argmax(near_k[left])))
+        order.append(pieces[farthest])
+        near_k = np.minimum(near_k, np.abs(warm_c - warm_c[farthest]))
+    return order
 
 
 def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, FloatArray]]:

@@ -61,6 +61,7 @@ _STEPS = "steps at the axis's full acceleration, the load left to ring after eac
 _SPEEDS = "motion at constant speed, at three speeds at least"
 _REVERSALS = "slow reversals"
 _SINES = "sines of several frequencies up to the bandwidth of the loops"
+_WARM = "the same motion cold and warm, with the temperature recorded"
 _FULL = "an acceleration at which the drive reaches its torque limit"
 _LOOPS = "slow sines of several amplitudes, some smaller than the width"
 
@@ -89,6 +90,10 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
     Parameter(
         "Stribeck speed", ("motor", "stribeck", "speed_rad_s"), "rad/s", 0.01, 1e3, 0.7, FRICTION,
         (TORQUE, FOLLOWING), _SPEEDS, 0.5,
+    ),
+    Parameter(
+        "friction growth", ("temperature", "friction_growth_per_k"), "1/K", -0.1, 0.1, 0.01, FRICTION,
+        (TORQUE,), _WARM, 0.005, linear=True,
     ),
     Parameter(
         "load inertia", ("load", "inertia_kg_m2"), "kg m2", 1e-7, 1e5, 0.7, "load inertia",

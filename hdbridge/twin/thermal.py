@@ -334,7 +334,10 @@ def _friction_error(recording: Recording, fitted: Fitted) -> float:
         "Coulomb friction": motor.coulomb_nm * float(np.sum(turned)),
         "viscous friction": motor.viscous_nm_s_per_rad * float(np.sum(turned * speed)),
     }
-    whole = sum(works.values())
+    whole, heat = sum(works.values()), fitted.truth.temperature
+    warm_c = record.columns[Channel.TEMPERATURE.value][1:]
+    force_nm = motor.coulomb_nm + motor.viscous_nm_s_per_rad * speed
+    works["friction growth"] = float(np.sum(force_nm * turned * (warm_c - heat.unchanged_c)))
     share = np.array([works.get(each.name, 0.0) / whole if whole else 0.0 for each in fitted.parameters])
     return max(math.sqrt(float(share @ fitted.covariance @ share)), LEAST_ERROR)
 

@@ -44,14 +44,20 @@ def better(before: Comparison, after: Comparison) -> Gain:
         for name in SIGNALS
         if (was := before.row(name, kind)) is not None and (now := after.row(name, kind)) is not None
     }
+    # A replay begins at a reading, and may be off by a step from there on: within it none is nearer.
+    step_k = max((each.noise for each in pairs.get(TEMPERATURE, ())), default=0.0)
+    if max((each.difference for each in pairs.get(TEMPERATURE, ())), default=0.0) <= step_k:
+        pairs.pop(TEMPERATURE, None)
     worse = [
         f"{TITLES[name]} differs by {now.difference:.3g} {now.unit}, before by {was.difference:.3g}"
         for name, (was, now) in pairs.items()
         if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
     ]
     # What is noise is in both differences. What they are less than is none: rounding, a jerk.
+    least = {name: step_k if name == TEMPERATURE else 1e-12 for name in pairs}
     ratios = [
-        math.log(max(now.difference, 1e-12) / max(was.difference, 1e-12)) for was, now in pairs.values()
+        math.log(max(now.difference, least[name]) / max(was.difference, least[name]))
+        for name, (was, now) in pairs.items()
     ]
     gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
     if worse:

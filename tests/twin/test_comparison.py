@@ -82,6 +82,19 @@ def test_more_friction_shows_in_the_torque(measured: Record) -> None:
     assert load.difference < 1.5
 
 
+def test_a_temperature_is_compared_where_its_reading_tells_its_step(measured: Record) -> None:
+    warm_c = 20.0 + 0.1 * np.floor(measured.time_s)
+    theirs, ours = (Record({**measured.columns, "temperature_c": each}) for each in (warm_c, warm_c + 0.07))
+    compared = compare(theirs, ours, legs_of(measured), N)
+    row = compared.row("temperature")
+    assert row is not None
+    assert row.noise == pytest.approx(0.1)
+    assert row.difference == pytest.approx(0.07)
+    assert "temperature" not in compared.spectra
+    same = Record({**measured.columns, "temperature_c": np.full(len(measured), 20.0)})
+    assert compare(same, ours, legs_of(measured), N).row("temperature") is None
+
+
 def test_a_softer_spring_settles_later_and_beyond(measured: Record) -> None:
     comparison = against(
         measured, changed(gear={"stiffness_nm_per_rad": 7000.0, "damping_nm_s_per_rad": 6.0})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import FloatArray
 from hdbridge.procedures.stepping import Stepping
+from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
@@ -73,6 +75,26 @@ def test_friction_near_rest_is_taken_in_where_the_axis_has_it(rise: float) -> No
     assert found.truth.motor.stribeck is not None
     assert found.truth.motor.stribeck.rise == pytest.approx(rise, rel=0.1)
     assert found.truth.motor.stribeck.speed_rad_s == pytest.approx(8.0, rel=0.2)
+    assert found.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
+
+
+@pytest.mark.parametrize("per_k", [0.0, -0.012])
+def test_how_friction_falls_with_warmth_is_taken_in_where_parts_show_it(per_k: float) -> None:
+    heat = TRUTH.temperature.model_copy(update={"reference_c": 22.0})
+    start = TRUTH.model_copy(update={"temperature": heat})
+    parts = []
+    for warm_c in (22.0, 37.0):
+        warm = heat.model_copy(update={"friction_growth_per_k": per_k, "start_c": warm_c})
+        part = recorded(TRUTH.model_copy(update={"temperature": warm}))
+        told_c = np.full(len(part.record), warm_c)
+        parts.append(replace(part, record=Record({**part.record.columns, "temperature_c": told_c})))
+    with Replays(prepare(Recording.joined(parts), AXIS, start), 1) as replays:
+        found, _ = with_last(replays, fitted(replays, start), prior())
+    if not per_k:
+        assert found.parameters == PARAMETERS
+        return
+    assert [each.name for each in found.parameters] == [*NAMES, "friction growth"]
+    assert found.truth.temperature.friction_growth_per_k == pytest.approx(per_k, rel=0.1)
     assert found.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
 
 

@@ -29,6 +29,8 @@ from hdbridge.twin.scales import noise_floor
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
 TRUTH = Truth.load(DEMO)
+SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
+WITH_SENSOR = AXIS.model_copy(update={"temperature": Temperature(source=SENSOR, celsius_per_count=0.1)})
 NAMES = ("Coulomb friction", "load inertia", "servo dead time")
 
 
@@ -125,13 +127,11 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
 
 def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
     """By 20 K its friction falls by a fifth, which matters."""
-    sensor = ChannelSource(index=0x2100, type="int16", via="tpdo")
-    axis = AXIS.model_copy(update={"temperature": Temperature(source=sensor, celsius_per_count=0.1)})
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
     told = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
     known = twin().model_copy(update={"temperature": grows, "intervals": told})
-    found = check(benched(axis, warm, 3, 1), axis, known, workers=1)
+    found = check(benched(WITH_SENSOR, warm, 3, 1), WITH_SENSOR, known, workers=1)
     assert found.changes == ()
     assert "warmth" not in found.unseen
 

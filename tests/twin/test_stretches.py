@@ -52,6 +52,21 @@ def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
     assert data.duration_s > 130.0
 
 
+def test_a_fit_takes_pieces_of_a_warm_up_at_both_its_ends() -> None:
+    record = recorded().record
+    warm_c = 20.0 + 0.1 * np.floor(record.time_s)
+    warms = Recording(Record({**record.columns, "temperature_c": warm_c}), LEGS, ratio=50.0)
+    axis, truth = AxisConfig.load(DEMO), Truth.load(DEMO)
+    apart_k = {}
+    for name, each in {"untold": recorded(), "told": warms}.items():
+        whole, taken = prepare(each, axis, truth), coarse(prepare(each, axis, truth), 60.0)
+        begun_c = [20.0 + 0.1 * float(piece.commands.time_s[0]) for piece in taken.pieces]
+        apart_k[name] = max(begun_c) - min(begun_c)
+        assert whole.duration_s > 130.0
+    assert apart_k["untold"] < apart_k["told"]
+    assert apart_k["told"] > 11.0
+
+
 def test_a_stretch_that_begins_in_motion_does_not_rest_in_its_first_row() -> None:
     """This axis never stands; the zero of a command is told by where it does."""
     data = prepare(recorded(), AxisConfig.load(DEMO), Truth.load(DEMO))

@@ -8,7 +8,7 @@ from hdbridge.twin.comparison import ALL, Comparison, Row
 from hdbridge.twin.result import HELD_OUT
 from hdbridge.twin.verdict import better
 
-UNITS = {"load_error": "arcsec", "following_error": "motor deg", "motor_torque": "Nm"}
+UNITS = {"load_error": "arcsec", "following_error": "motor deg", "motor_torque": "Nm", "temperature": "K"}
 
 
 def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
@@ -49,6 +49,16 @@ def test_below_what_counts_as_noise_there_may_be_much_to_gain() -> None:
     gain = better(comparison(motor_torque=0.08), comparison(motor_torque=0.02))
     assert gain.better
     assert "75 % smaller" in gain.text
+
+
+def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
+    """Of 0.1 K here."""
+    cold, near = comparison(load_error=4.0, temperature=0.05), comparison(load_error=1.0, temperature=0.09)
+    assert "75 % smaller" in better(cold, near).text
+    far = comparison(load_error=1.0, temperature=0.4)
+    assert "temperature differs by 0.4 K, before by 0.05" in better(cold, far).text
+    # Each a quarter: of the temperature 0.4 to 0.1, for what is within a step is none.
+    assert "75 % smaller" in better(comparison(load_error=4.0, temperature=0.4), near).text
 
 
 def test_without_held_out_legs_all_of_them_count_and_it_is_said() -> None:
