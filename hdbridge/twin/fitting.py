@@ -94,12 +94,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
     progress(0.6)
     best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
-    for _ in LAWS:
-        other = with_loop(replays, best, prior)
-        if other is None:
-            break
-        prior = other.prior
-        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most)
+    laws = len(LAWS)  # so often at most another one is taken
     while True:
         if _leaves_more(data, best):
             for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
@@ -107,9 +102,15 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         # A rough fit knows little of what the two gains do at rest, where only they differ.
         best = _better(replays, best, exchanged(best.truth), prior, most)
         wider, prior = with_last(replays, best, prior)
-        if wider is best:
+        if wider is not best:
+            best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+            continue
+        # What a wrong spring leaves of the load's angle is no matter of the loop: that is asked last.
+        other = with_loop(replays, best, prior) if laws else None
+        if other is None:
             break
-        best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+        laws, prior = laws - 1, other.prior
+        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most)
     limited = with_limit(replays, best, prior, start)
     best = replace(best, truth=limited.truth)
     if limited.parameters != best.parameters:
