@@ -217,6 +217,7 @@ def _check(
             "twin": str(files.twin),
             "sentence": found.sentence,
             "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
+            "unexplained": found.unexplained,
             "unseen": list(found.unseen),
         },
     )

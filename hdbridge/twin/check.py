@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
-from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve, told
+from hdbridge.twin.least_squares import SOFT, fitted_rows, legs_of_rows, solve, told
 from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
 from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
@@ -34,7 +35,7 @@ from hdbridge.twin.scales import Scales, noise_floor
 
 CHECK_S = 20.0
 """A longer recording is checked on pieces that take about so long."""
-SIZES = (1.0, 2.5, 6.0)
+SIZES = (1.0, 2.5, 4.0, 6.0)
 """Each parameter is moved by so many of the changes that matter, either way: what a spring or a load rings by
 goes out of step at a small share of a larger change already, and slopes say nothing of it."""
 CONTENDERS = 2
@@ -76,11 +77,22 @@ class Check:
     @property
     def sentence(self) -> str:
         """One sentence for somebody at the bench; a second one of what would not have shown."""
-        found = "Nothing has changed since the twin was made"
+        found = ["Nothing has changed since the twin was made"]
         if self.changes:
-            found = f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"
-        rest = f" A change of {', '.join(self.unseen)} would not have shown." if self.unseen else ""
-        return f"{found}.{rest}"
+            found = [f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"]
+        elif self.unexplained:
+            found = ["Something has changed since the twin was made that no change of a cause explains"]
+        found += [
+            f"Unexplained: {name}, {times:.0f} times what the twin was off by when it was made"
+            for name, times in self.unexplained.items()
+        ]
+        found += [f"A change of {', '.join(self.unseen)} would not have shown"] if self.unseen else []
+        return f"{'. '.join(found)}."
+
+    @property
+    def unexplained(self) -> dict[str, float]:
+        """What is left with the changes of the channels that are beyond doubt off, as `misfit_after`."""
+        return {name: times for name, times in self.misfit_after.items() if times > SOFT}
 
 
 def check(
@@ -103,10 +115,14 @@ def check(
         (before,) = replays([twin])
         best = search.found(progress)
         (after,) = replays([best.truth])
+        was, now = _in_scales(before, scale), _in_scales(after, scale)
+        if any(now[name] > max(was[name], SOFT) for name in CHANNELS):
+            # What makes one channel better at the cost of another is none of what has changed.
+            best, after, now = search.unchanged, before, was
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
-    return Check(changes, _in_scales(before, scale), _in_scales(after, scale), search.unseen(best))
+    return Check(changes, was, now, search.unseen(best))
 
 
 def _own(data: Data, twin: Truth) -> list[str]:
@@ -188,10 +204,18 @@ class _Search:
         slopes, mean = here.jacobian / apart[:, None], np.mean(left, axis=0) / apart
         return _Place(causes, truth, here.place - twin, slopes, mean, apart)
 
+    @cached_property
+    def unchanged(self) -> _Place:
+        """The twin as it was made."""
+        return self.at((), self._twin)
+
     def found(self, progress: Callable[[float], None]) -> _Place:
         """The causes without which the recording cannot be told, and what they have come to."""
-        unchanged = self.at((), self._twin)
+        unchanged = self.unchanged
         suspects = [cause for cause in self._causes if self._suspect(cause, unchanged)]
+        if np.any(self._squares(unchanged.left) > SOFT**2):
+            # So far off slopes say nothing: a load that rings at another frequency is out of step.
+            suspects = list(self._causes)
         if not suspects:
             return unchanged
         starts = self._contenders(unchanged, suspects)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hdbridge.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.check import check
+from hdbridge.twin.check import Check, check
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
@@ -156,6 +157,30 @@ def test_a_check_names_what_has_changed_and_not_what_a_twin_is_off_by() -> None:
     (inertia,) = told.changes[0].parameters
     assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
     assert "load inertia" in told.sentence
+
+
+def test_a_load_that_rings_out_of_step_has_changed() -> None:
+    """By half as much inertia again, at 8 Hz: what the twin leaves is so large that slopes say nothing."""
+    gear, stiffness = TRUTH.gear, TRUTH.load_.whole_inertia_kg_m2 * (math.tau * 8.0) ** 2
+    damping = 0.3 * gear.damping_nm_s_per_rad * math.sqrt(stiffness / gear.stiffness_nm_per_rad)
+    soft = {"gear stiffness": stiffness, "gear damping": damping}
+    heavier = with_values(TRUTH, {**soft, "load inertia": 1.5 * TRUTH.load_.inertia_kg_m2})
+    told = check(benched(AXIS, heavier, 2, 1), AXIS, with_values(twin(), soft), workers=1)
+    assert [each.cause for each in told.changes] == ["load inertia"]
+    (inertia,) = told.changes[0].parameters
+    assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
+    assert told.unexplained == {}
+
+
+def test_what_no_cause_explains_is_no_nothing() -> None:
+    before = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
+    told = Check((), before, before, ("warmth",))
+    assert told.sentence == (
+        "Something has changed since the twin was made that no change of a cause explains. "
+        "Unexplained: motor torque, 21 times what the twin was off by when it was made. "
+        "Unexplained: load error, 242 times what the twin was off by when it was made. "
+        "A change of warmth would not have shown."
+    )
 
 
 def test_a_check_needs_a_twin_that_was_fitted() -> None:
