@@ -26,7 +26,7 @@ from hdbridge.twin.parameters import (
 )
 from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
-from hdbridge.twin.scales import Loops, Scales, scales
+from hdbridge.twin.scales import Loops, Scales, least_deviation, scales
 
 FIT_S = 60.0
 """A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
@@ -48,6 +48,12 @@ ROUNDS = 3
 """So often at most that is looked at anew, where the fit has gone;"""
 SAME = 0.3
 """... that is, by more than so many standard deviations."""
+MORE = 1.1
+"""So many times what the true axis would leave is more: a scale of some hundred rows is known no better."""
+NEAREST = 2
+"""So many of the places of a kind are looked at more closely."""
+APART = 0.1
+"""In spreads of a parameter: fits that have come closer than this are on their way to the same place."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "friction growth", *LOOP,
@@ -86,8 +92,9 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
         # that tells it from the right one.
         if each.inflation < SOFT**2:
-            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each)
-            ends.append(solve(replays, near.truth, parameters, prior, STEPS, most=most, near=near))
+            about = loops_about(replays, each)
+            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each, about)
+            ends.append(_ended(replays, near, prior, most))
     if not ends:
         # This axis has what no simulation has, in the channel that led the way. By the noise, however
         # tempered, the others had no say; by what each of them is left with they have.
@@ -103,51 +110,63 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         best = _better(replays, best, exchanged(best.truth), prior, most)
         wider, prior = with_last(replays, best, prior)
         if wider is not best:
-            best = solve(replays, wider.truth, wider.parameters, prior, STEPS, most=most, near=wider)
+            best = _ended(replays, wider, prior, most)
             continue
         # What a wrong spring leaves of the load's angle is no matter of the loop: that is asked last.
         other = with_loop(replays, best, prior) if laws else None
         if other is None:
             break
         laws, prior = laws - 1, other.prior
-        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most)
+        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most, loops=best.scales.loops)
     limited = with_limit(replays, best, prior, start)
     best = replace(best, truth=limited.truth)
     if limited.parameters != best.parameters:
         prior = limited.prior
-        best = solve(replays, best.truth, limited.parameters, prior, STEPS, most=most)
+        best = solve(
+            replays, best.truth, limited.parameters, prior, STEPS, most=most, loops=best.scales.loops
+        )
     progress(0.85)
     for _ in range(ROUNDS):
-        last, loops = best, loops_about(replays, best)
-        best = solve(replays, best.truth, best.parameters, prior, STEPS, most=most, near=best, loops=loops)
+        last = best
+        best = _ended(replays, best, prior, most)
         if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
             break
     # So much longer differences are no guide to a minimum: next to it the loops may be unstable.
-    best = solve(replays, best.truth, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
+    loops, there = best.scales.loops, best.truth
+    best = solve(replays, there, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
     progress(1.0)
-    return best
+    # What the loops do is told by the recording's rows; those who ask further have others.
+    return replace(best, scales=replace(best.scales, loops=None))
 
 
 def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
     """The fit from another place, if that is beyond doubt better."""
-    other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most)
+    loops = best.scales.loops
+    other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most, loops=loops)
     if other.loss + EARNED >= best.loss:
         return best
-    return solve(replays, other.truth, best.parameters, prior, STEPS, most=most, near=other)
+    return _ended(replays, other, prior, most)
+
+
+def _ended(replays: Replays, near: Fitted, prior: FloatArray, most: Scales) -> Fitted:
+    """The minimum next to a fit, by rows as they count there."""
+    loops = loops_about(replays, near)
+    return solve(replays, near.truth, near.parameters, prior, STEPS, most=most, near=near, loops=loops)
 
 
 def _leaves_more(data: Data, best: Fitted) -> bool:
-    """Whether a fit leaves more of any channel than the true axis would."""
-    noise = expected(data).deviation
-    return any(best.scales.deviation[name] > noise[name] for name in CHANNELS)
+    """Whether a fit leaves more of any channel, beyond its rounding, than the true axis would."""
+    least = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
+    return any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS)
 
 
 def better_places(
     roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth, prior: FloatArray
 ) -> list[Truth]:
-    """Of each kind of places the one that is led to a better fit of a few legs, if one is.
+    """Where fits of a few legs end that begin at the best places of each kind, if as good; the best first.
 
-    The other parameters are known by now: where the fit began, each of these was as good as any other.
+    The other parameters are known by now: where the fit began, each of these was as good as any other. A few
+    legs seldom say which of two minima is the true one: they may only rule one out.
     """
     (before,) = roughly([begun])
     most = scales(roughly.data, before)
@@ -158,15 +177,21 @@ def better_places(
     def loss(fitted: Fitted) -> float:
         return fitted.loss
 
-    own = led(best.truth, FEW_STEPS + FIRST_STEPS)
-    found = []
+    ends = [led(best.truth, STEPS)]
     for places in kinds:
-        if places:
-            nearest = min((led(each, FEW_STEPS) for each in places), key=loss)
-            reached = led(nearest.truth, FIRST_STEPS, nearest)
-            if reached.loss + EARNED < own.loss:
-                found.append(reached.truth)
-    return found
+        others = [each for each in (led(place, FEW_STEPS) for place in places) if _apart(each, ends[0])]
+        for near in sorted(others, key=loss)[:NEAREST]:
+            reached = led(near.truth, STEPS, near)
+            if all(_apart(reached, each) for each in ends):
+                ends.append(reached)
+    least = min(map(loss, ends))
+    return [each.truth for each in sorted(ends[1:], key=loss) if each.loss < least + EARNED]
+
+
+def _apart(one: Fitted, other: Fitted) -> bool:
+    """Whether two fits of the same parameters have come to different places."""
+    spread = np.array([each.spread for each in one.parameters])
+    return bool(np.any(np.abs(one.place - other.place) > APART * spread))
 
 
 def loops_about(replays: Replays, fitted: Fitted) -> Loops:
@@ -193,9 +218,10 @@ def _led(
     start: Truth,
     steps: int,
     near: Fitted | None = None,
+    loops: Loops | None = None,
 ) -> Fitted:
     """So many steps from a place towards the minimum, by the noise that is expected."""
-    noise = expected(replays.data)
+    noise = replace(expected(replays.data), loops=loops)
     return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
 
 

@@ -49,8 +49,9 @@ ALONG = ((1.0,), (0.4, 0.15))
 """How far along each of these steps to go; less far only where that brings nothing."""
 PROBED = 0.1
 """How far along each of them its second derivative is taken."""
-SETTLED = 2
-"""So many steps in a row that bring no more end a fit: the differences of the second are made anew."""
+SETTLED = 3
+"""So many steps in a row that bring no more end a fit. Each time the differences are made `WIDE` times as
+long: where a motor sticks, short ones are no guide (implicit filtering; Kelley, SIAM 2011)."""
 WORTH = 1.0
 """A drop of half the squares by less is no evidence of anything."""
 SOFT = 4.0
@@ -158,10 +159,12 @@ def solve(
         left, off = told(found, scale, rows), (place - prior) / spread
         return 0.5 * float(left @ left + off @ off)
 
-    moves = np.diag(STEP * spread) if near is None else _moves(near.jacobian, spread)
+    along = None if near is None else near.jacobian
     idle = done = 0
     while True:
         last = done == steps or idle == SETTLED
+        longer = 1.0 if last else WIDE**idle
+        moves = np.diag(STEP * spread) if along is None else _moves(along, spread, longer)
         if known is not None and tempered:
             scale = known if last else _tempered(known, found, rows)
         now = scale.scaled(found)[rows]
@@ -170,7 +173,6 @@ def solve(
         slopes *= weights[:, None]
         if last:
             break
-        moves = _moves(slopes, spread)
         damped = _damped_steps(slopes, left, place, prior, spread, (low, high))
         probes = led([np.clip(place + PROBED * each.step, low, high) for each in damped])
         paths = []
@@ -191,14 +193,13 @@ def solve(
                 place, found, after = tried[best], reached[best], costs[best]
             if before - after >= WORTH:
                 break
-        idle = idle + 1 if before - after < WORTH else 0
+        idle, along = idle + 1 if before - after < WORTH else 0, slopes
         done += 1
         if known is None:
             scale = _capped(scales(data, found, loops), most)
         progress(done / steps)
     truth = at_coordinates(start, parameters, place.tolist())
     covariance = sandwich(slopes, left, legs_of_rows(data, rows), spread)
-    scale = replace(scale, loops=None)
     return Fitted(truth, parameters, place, covariance, scale, found, rows, left, slopes)
 
 
@@ -330,10 +331,13 @@ def slopes_at(
     return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
-def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Along the principal directions of the information, each as far as residuals change by `RESPONSE`."""
+def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
+    """Along the principal directions of the information, as far as residuals change by `RESPONSE`.
+
+    ``times``: so many times as far.
+    """
     worth, directions = eigen(slopes, spread)
-    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
+    far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
 

@@ -55,22 +55,24 @@ def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArra
     return np.asarray(-np.logaddexp(np.where(inner < -1.0, near, beyond), anyhow), dtype=np.float64)
 
 
-def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]:
+def deviation(
+    off: FloatArray, step: float, least: float, spread: FloatArray | None = None
+) -> tuple[float, float]:
     """The standard deviation of a simulation, by readings in steps: the most likely, ``least`` at least.
 
-    In addition the probability of a reading in spite of all.
+    ``spread`` is what each reading is known to be off by in addition. With it the probability of a reading in
+    spite of all.
     """
-    size = np.abs(off)
+    size, known = np.abs(off), np.zeros_like(off) if spread is None else spread
     farthest = max(float(np.max(size)), least)
     stray = STRAY / (1.0 - STRAY) * step / (2.0 * farthest + step)
 
     def cost(log_deviation: float) -> float:
-        half = 0.5 * step / np.exp(log_deviation)
-        rounded = np.full_like(size, max(half, FINE))
-        times = min(1.0, half / FINE)
-        strays = np.full_like(size, stray / times)
+        each = np.hypot(np.exp(log_deviation), known)
+        half = 0.5 * step / each
+        times = np.minimum(1.0, half / FINE)
         return float(
-            np.sum(surprise(size / np.exp(log_deviation), rounded, strays)) - len(size) * np.log(times)
+            np.sum(surprise(size / each, np.maximum(half, FINE), stray / times)) - np.sum(np.log(times))
         )
 
     bounds = (np.log(least), np.log(2.0 * farthest))

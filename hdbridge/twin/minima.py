@@ -14,7 +14,7 @@ from hdbridge.twin.parameters import with_values
 
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where a resonance of the load is looked for: a fit finds only the nearest of its minima."""
-FILTER_SHARES = (0.25, 0.9)
+FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
 """Shares of the lag that may be the command filter's."""
 
 

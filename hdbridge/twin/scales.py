@@ -71,11 +71,14 @@ class Scales:
 
 def noise_floor(data: Data) -> dict[str, float]:
     """Least noise of each channel: its rounding, and what its encoder's rounding makes of the torque."""
-    return Scales(_least(data), rounding(data.axis)).noise
+    return Scales(least_deviation(data), rounding(data.axis)).noise
 
 
-def _least(data: Data) -> dict[str, float]:
-    """What a smooth replay of the true axis is off by: the steps of the loops' encoder, the load's noise."""
+def least_deviation(data: Data) -> dict[str, float]:
+    """By channel: what a smooth replay of the true axis is off by, beyond its readings' rounding.
+
+    That is the steps of the encoder that the loops go by, and the load encoder's noise.
+    """
     truth = data.base
     encoder = truth.motor.encoder
     fine_deg = 360.0 / (encoder.counts_per_turn * encoder.interpolation)
@@ -105,14 +108,17 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
 
     Not of those at rest: where a recording rests half of the time, they would be the scale.
     """
-    least, counts, steps = _least(data), counted(data), rounding(data.axis)
+    least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
     found = found if loops is None else loops.taken_off(found)
     moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
+    unsteady = None if loops is None else loops.spread
     given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
     for name in CHANNELS:
-        inside = found[name][moving & (counts[name] > 0.0)]
+        rows = moving & (counts[name] > 0.0)
+        inside = found[name][rows]
         if len(inside):
             # Half of the readings in motion are no strays, however many there are.
             typical = MAD_TO_SIGMA * float(np.median(np.abs(beyond(inside, 0.5 * steps[name]))))
-            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical))
+            spread = None if unsteady is None else unsteady[name][rows]
+            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
     return Scales(given, steps, stray, loops)

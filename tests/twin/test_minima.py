@@ -48,12 +48,21 @@ def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_th
     with Replays(data(), 1) as replays:
         there = solve(replays, begun, parameters, prior, 3)
         assert free_value(there.truth, parameters[2]) < 40.0, "a minimum of its own"
-        (place,) = better_places(replays, there, [feedforwards(there.truth, begun)], begun, prior)
+        place, *_ = better_places(replays, there, [feedforwards(there.truth, begun)], begun, prior)
         found, true = (solve(replays, each, parameters, prior, 3) for each in (place, TRUTH))
     assert found.loss < there.loss
     assert free_value(found.truth, parameters[2]) == pytest.approx(
         free_value(true.truth, parameters[2]), rel=0.1
     )
+
+
+def test_a_place_that_leads_back_to_the_same_minimum_is_no_other() -> None:
+    late = (BY_NAME["servo dead time"],)
+    prior = np.array(coordinates(TRUTH, late))
+    begun = with_values(TRUTH, {"servo dead time": 1.0})
+    with Replays(data(), 1) as replays:
+        best = solve(replays, TRUTH, late, prior, 3)
+        assert better_places(replays, best, [[begun]], begun, prior) == []
 
 
 def test_springs_ring_elsewhere_and_as_long() -> None:
