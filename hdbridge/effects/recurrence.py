@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
+from scipy.linalg.blas import dtbsv
 
 from hdbridge.effects.base import FloatArray
 
@@ -12,30 +11,16 @@ from hdbridge.effects.base import FloatArray
 def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray:
     """y[0] = first, y[i] = decay[i] y[i-1] + drive[i]; shape (n,), linear time, any decay in [0, 1].
 
-    Done in about sqrt(n) blocks side by side, then the blocks are carried on: no loop over samples, and
-    none of the overflow of the closed form with cumulative products.
+    That is a system of equations with two diagonals, the main one of ones: forward substitution (BLAS).
     """
-    count = len(decay)
-    if not count:
+    if not len(decay):
         return np.empty(0)
-    width = max(1, math.isqrt(count))
-    rows = -(-count // width)
-    factors = np.ones(rows * width)
-    terms = np.zeros(rows * width)
-    factors[:count], terms[:count] = decay, drive
-    factors[0], terms[0] = 0.0, first
-    # one row per step within the blocks, so that each step is a vector operation over all blocks
-    a, b = factors.reshape(rows, width).T.copy(), terms.reshape(rows, width).T.copy()
-    for step in range(1, width):
-        b[step] += a[step] * b[step - 1]
-        a[step] *= a[step - 1]
-    carry = np.empty(rows)
-    value = 0.0
-    for row, (whole, added) in enumerate(zip(a[-1].tolist(), b[-1].tolist(), strict=True)):
-        carry[row] = value
-        value = whole * value + added
-    result: FloatArray = (b + a * carry).T.reshape(-1)[:count]
-    return result
+    diagonals = np.ones((2, len(decay)), order="F")
+    diagonals[1, :-1] = -decay[1:]
+    right = np.array(drive, dtype=np.float64)
+    right[0] = first
+    solved: FloatArray = dtbsv(1, diagonals, right, lower=1, diag=1, overwrite_x=1)
+    return solved
 
 
 def lagged(values: FloatArray, time_s: FloatArray, tau_s: float) -> FloatArray:
