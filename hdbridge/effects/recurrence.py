@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dtbsv
 
 from hdbridge.effects.base import FloatArray
 
@@ -13,6 +12,8 @@ def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray
 
     That is a system of equations with two diagonals, the main one of ones: forward substitution (BLAS).
     """
+    from scipy.linalg.blas import dtbsv  # what asks for a model without fitting one does not wait for scipy
+
     if not len(decay):
         return np.empty(0)
     diagonals = np.ones((2, len(decay)), order="F")
