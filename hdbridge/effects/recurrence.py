@@ -12,7 +12,7 @@ def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray
 
     That is a system of equations with two diagonals, the main one of ones: forward substitution (BLAS).
     """
-    from scipy.linalg.blas import dtbsv  # what asks for a model without fitting one does not wait for scipy
+    from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - a model is read and compensated without scipy
 
     if not len(decay):
         return np.empty(0)
