@@ -25,7 +25,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
-from hdbridge.twin.least_squares import SOFT, fitted_rows, legs_of_rows, solve, told
+from hdbridge.twin.least_squares import SOFT, Fitted, fitted_rows, legs_of_rows, solve, told
 from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
 from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
@@ -41,6 +41,11 @@ goes out of step at a small share of a larger change already, and slopes say not
 CONTENDERS = 2
 """So many such places a fit begins at, in addition to the twin's own."""
 STEPS = 8
+"""From each start a fit goes so many steps over all samples,"""
+MORE_STEPS = 8
+"""... and so many without the samples that are still too far off."""
+LOST = 0.25
+"""A channel of which a larger share of the samples has come to be beyond `SOFT` has become worse."""
 ROUNDS = 3
 """So often the causes that are drawn away are set free. In the first round they are nearly always all."""
 DRAWS = 8
@@ -115,10 +120,9 @@ def check(
         (before,) = replays([twin])
         best = search.found(progress)
         (after,) = replays([best.truth])
+        if search.worsens(best):
+            best, after = search.unchanged, before
         was, now = _in_scales(before, scale), _in_scales(after, scale)
-        if any(now[name] > max(was[name], SOFT) for name in CHANNELS):
-            # What makes one channel better at the cost of another is none of what has changed.
-            best, after, now = search.unchanged, before, was
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
@@ -178,6 +182,7 @@ class _Search:
         self._causes = tuple(dict.fromkeys(each.cause for each in parameters))
         tolerated = TOLERANCE / NORMAL_95 * np.array([each.least_change for each in parameters])
         self._known = known.root(parameters)
+        self._reached: list[_Place] = []
         self._root = np.hstack([self._known, np.diag(tolerated)])
         self._rows = fitted_rows(replays.data, everything=True)
         self._legs = legs_of_rows(replays.data, self._rows)
@@ -218,47 +223,90 @@ class _Search:
             suspects = list(self._causes)
         if not suspects:
             return unchanged
+        self._reached.append(unchanged)
         starts = self._contenders(unchanged, suspects)
-        best = self._settled((), self._twin, unchanged)
+        self._settle((), self._twin, unchanged)
+        best = self._as(())
         for done in range(ROUNDS):
             progress((done + 0.5) / ROUNDS)
             pulled = [each for each in self._causes if each not in best.causes and self._pulled(each, best)]
             if not pulled and best.causes:
                 break
             more = tuple(dict.fromkeys([*best.causes, *pulled, *(cause for cause, _ in starts)]))
-            fits = [
-                self._settled(more, start, best) for start in (best.truth, *(start for _, start in starts))
-            ]
-            step = self._needed(min(fits, key=self._evidence))
-            if not step.causes or not self._explains_more(step, best):
+            for start in (best.truth, *(start for _, start in starts)):
+                self._settle(more, start, best)
+            step, last = self._needed(more), self._as(best.causes)
+            if not step.causes or self._evidence(last) <= self._evidence(step):
+                best = last
                 break
             best, starts = step, []
         return best if best.causes else unchanged
 
-    def _needed(self, best: _Place) -> _Place:
+    def worsens(self, place: _Place) -> bool:
+        """Whether one channel is better at the cost of another: that is none of what has changed."""
+        now, was = (
+            self._squares(np.minimum(np.abs(each.left), SOFT)) / SOFT**2 for each in (place, self.unchanged)
+        )
+        return bool(np.any(now > np.maximum(was, LOST)))
+
+    def _needed(self, causes: tuple[str, ...]) -> _Place:
         """The place without the causes that others, and what the twin leaves open, make up for."""
-        tried: set[str] = set()
+        best, tried = self._as(causes), set[str]()
         while rest := sorted(set(best.causes) - tried, key=lambda cause: self._moved(cause, best).distance):
             cause = rest[0]
             kept = tuple(each for each in best.causes if each != cause)
-            without = self._settled(kept, self._put_back(cause, best.truth), best)
+            self._settle(kept, self._without(cause, kept, best), best)
+            best, without = self._as(best.causes), self._as(kept)
             idle = not self._significant(cause, best) or not self._matters(cause, best)
-            if idle or self._explains_more(without, best):
+            if idle or self._evidence(without) < self._evidence(best):
                 best = without
             else:
                 tried.add(cause)
         return best
 
-    def _settled(self, causes: tuple[str, ...], start: Truth, near: _Place) -> _Place:
-        """The place of some causes, all other parameters along within what the twin leaves open."""
-        spread = np.sqrt(np.sum(np.square(self._root), axis=1))
+    def _settle(self, causes: tuple[str, ...], start: Truth, near: _Place) -> None:
+        """Reach the place of some causes, all other parameters along within what the twin leaves open."""
         parameters = tuple(
-            each if each.cause in causes else replace(each, spread=min(each.spread, float(most)))
-            for each, most in zip(self._every, spread, strict=True)
+            replace(each, spread=float(spread))
+            for each, spread in zip(self._every, self._spreads(causes), strict=True)
         )
-        prior, known = np.array(coordinates(self._twin, parameters)), Scales(self._scale_at(near))
-        fit = solve(self._replays, start, parameters, prior, STEPS, known=known, everything=True)
-        return self.at(causes, fit.truth)
+        prior, apart = np.array(coordinates(self._twin, parameters)), near.apart
+        fit: Fitted | None = None
+        for steps in (STEPS, MORE_STEPS):
+            known = Scales(self._scales_of(apart))
+            fit = solve(
+                self._replays, start, parameters, prior, steps, known=known, everything=True, near=fit
+            )
+            # Those that are still beyond `SOFT` would draw all parameters along, which none can tell.
+            start, apart = fit.truth, np.where(np.abs(fit.vector) > SOFT, np.inf, apart)
+        self._reached.append(self.at(causes, start))
+
+    def _spreads(self, causes: tuple[str, ...]) -> FloatArray:
+        """By parameter, how far it may be from the twin's where these causes have changed."""
+        open_by = np.sqrt(np.sum(np.square(self._root), axis=1))
+        return np.array(
+            [
+                each.spread if each.cause in causes else min(each.spread, float(most))
+                for each, most in zip(self._every, open_by, strict=True)
+            ]
+        )
+
+    def _without(self, cause: str, kept: tuple[str, ...], at: _Place) -> Truth:
+        """Where the slopes say that all others go if a cause is put back.
+
+        Left where they are, they would make up for a change that there is no more: so far off that a fit
+        from there may never come back.
+        """
+        own = np.array([each.cause == cause for each in self._every])
+        weak = np.diag(1.0 / self._spreads(kept)[~own])
+        rows = np.vstack([at.slopes[:, ~own], weak])
+        # As if from the twin's values on, so that the prior is about nothing.
+        left = np.concatenate([at.left - at.slopes @ at.off, np.zeros(len(weak))])
+        others = [each for each in self._every if each.cause != cause]
+        off = -np.linalg.lstsq(rows, left, rcond=None)[0]
+        low, high = np.array([each.bounds for each in others]).T
+        there = np.clip(np.array(coordinates(self._twin, others)) + off, low, high)
+        return at_coordinates(self._put_back(cause, at.truth), others, there.tolist())
 
     def _put_back(self, cause: str, truth: Truth) -> Truth:
         """A truth with a cause's parameters as the twin has them."""
@@ -308,7 +356,7 @@ class _Search:
             for way in (-1.0, 1.0)
         ]
         truths = [self._twin, *(_shifted(self._twin, each, by) for each, by in moves)]
-        scale = self._scale_at(best)
+        scale = self._scales_of(best.apart)
         here, *costs = (self._cost(found, scale) for found in self._replays(truths))
         nearest: dict[str, tuple[float, Truth]] = {}
         for (each, _), cost, there in zip(moves, costs, truths[1:], strict=True):
@@ -322,10 +370,10 @@ class _Search:
         left = told(found, Scales(scale), self._rows)
         return 0.5 * float(left @ left)
 
-    def _scale_at(self, near: _Place) -> dict[str, Any]:
+    def _scales_of(self, apart: FloatArray) -> dict[str, Any]:
         """The scale of each channel, row by row."""
         rows = np.ones(len(self._rows))
-        rows[self._rows] = near.apart
+        rows[self._rows] = apart
         by_channel = zip(CHANNELS, np.split(rows, len(CHANNELS)), strict=True)
         return {name: self._scale[name] * each for name, each in by_channel}
 
@@ -363,22 +411,33 @@ class _Search:
         """Whether a cause explains more than a twin may leave."""
         back = self._put_back(cause, found.truth)
         with_it, without = (
-            told(each, Scales(self._scale_at(found)), self._rows)
+            told(each, Scales(self._scales_of(found.apart)), self._rows)
             for each in self._replays([found.truth, back])
         )
         return bool(np.any(self._squares(without) - self._squares(with_it) > TOLERATED))
 
-    def _explains_more(self, one: _Place, other: _Place) -> bool:
-        """Whether one place leaves less than the other, by what their causes cost."""
-        apart = np.maximum(one.apart, other.apart)
-        return self._evidence(one, apart) < self._evidence(other, apart)
+    def _as(self, causes: tuple[str, ...]) -> _Place:
+        """The place that says most for these causes and no others, of all that have been reached.
 
-    def _evidence(self, at: _Place, apart: FloatArray | None = None) -> float:
-        """What a place leaves, how far it is from the twin, and what its causes cost: less is better."""
-        left = at.left if apart is None else at.left * at.apart / apart
+        A fit does not always come to its minimum, and where a motor sticks there is chance in what it leaves:
+        were causes judged each where its own fit has come to, that would decide. What a fit with more causes
+        has found speaks for fewer, too, if the rest of them has hardly moved there; and what went along in
+        a fit with fewer may be a cause.
+        """
+        return min((replace(each, causes=causes) for each in self._reached), key=self._evidence)
+
+    def _evidence(self, at: _Place) -> float:
+        """What a place leaves, how far it is from the twin, and what its causes cost: less is better.
+
+        Minus the log likelihood. Where replays are further apart a place foretells less, and pays for it. A
+        sample that is further off than `SOFT` says no more than one that is as far off: it comes of a motor
+        that broke away at another time, and a few of them would outweigh all others.
+        """
+        left = np.minimum(np.abs(at.left), SOFT)
         others = [number for number, each in enumerate(self._every) if each.cause not in at.causes]
         along = self._pull(others, at)
-        return 0.5 * (float(left @ left) + along + sum(map(self._price, at.causes)))
+        wide = 2.0 * float(np.sum(np.log(at.apart)))
+        return 0.5 * (float(left @ left) + wide + along + sum(map(self._price, at.causes)))
 
     def _squares(self, left: FloatArray) -> FloatArray:
         """Mean square by channel."""

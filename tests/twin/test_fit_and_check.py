@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -157,6 +158,18 @@ def test_a_check_names_what_has_changed_and_not_what_a_twin_is_off_by() -> None:
     (inertia,) = told.changes[0].parameters
     assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
     assert "load inertia" in told.sentence
+
+
+def test_a_few_samples_far_off_neither_hide_a_change_nor_make_one() -> None:
+    """As where a motor that has stuck breaks away at another time: some torques, a thousand scales off."""
+    changed = recorded(seed=2, count=1, load_inertia=1.5 * TRUTH.load_.inertia_kg_m2)
+    torque = changed.record.columns["motor_torque_nm"].copy()
+    torque[np.argmax(np.abs(torque)) :][:6] = 0.0
+    record = replace(changed.record, columns={**changed.record.columns, "motor_torque_nm": torque})
+    told = check(replace(changed, record=record), AXIS, twin(), workers=1)
+    assert [each.cause for each in told.changes] == ["load inertia"]
+    (inertia,) = told.changes[0].parameters
+    assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
 
 
 def test_a_load_that_rings_out_of_step_has_changed() -> None:
