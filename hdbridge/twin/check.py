@@ -26,12 +26,12 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.known import Known, change_of
 from hdbridge.twin.least_squares import SOFT, Fitted, fitted_rows, legs_of_rows, solve, told
-from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare
+from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare, rounding
 from hdbridge.twin.naming import Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import FALSE_ALARM
-from hdbridge.twin.scales import Scales, noise_floor
+from hdbridge.twin.scales import Scales, least_deviation, noise_floor
 
 CHECK_S = 20.0
 """A longer recording is checked on pieces that take about so long."""
@@ -41,9 +41,13 @@ goes out of step at a small share of a larger change already, and slopes say not
 CONTENDERS = 2
 """So many such places a fit begins at, in addition to the twin's own."""
 STEPS = 8
-"""From each start a fit goes so many steps over all samples,"""
-MORE_STEPS = 8
-"""... and so many without the samples that are still too far off."""
+"""Steps in each stage of a fit."""
+BLUNT = (0.1, 0.0)
+"""The stages: a replay counts as off by at least this share of the noise, in addition to the rounding of the
+readings. The second stage begins where the first ended, without the samples that are still too far off.
+Rounding is not noise: treated as noise it draws delays and feed-forwards away from their true values, because
+a smooth replay of the true axis then leaves more than the nearest wrong one (see `likelihood`). The first
+stage is blunt because the walls of a count are steep, and give no direction from far off."""
 LOST = 0.25
 """A channel of which a larger share of the samples has come to be beyond `SOFT` has become worse."""
 ROUNDS = 3
@@ -178,6 +182,12 @@ class _Search:
         parameters: tuple[Parameter, ...],
     ) -> None:
         self._replays, self._twin, self._scale = replays, twin, scale
+        self._steps, least = rounding(replays.data.axis), least_deviation(replays.data)
+        rounded = {name: step / 12.0**0.5 for name, step in self._steps.items()}
+        self._fine = {
+            name: max(least[name], math.sqrt(max(scale[name] ** 2 - rounded[name] ** 2, 0.0)))
+            for name in CHANNELS
+        }
         self._every = parameters
         self._causes = tuple(dict.fromkeys(each.cause for each in parameters))
         tolerated = TOLERANCE / NORMAL_95 * np.array([each.least_change for each in parameters])
@@ -272,14 +282,29 @@ class _Search:
         )
         prior, apart = np.array(coordinates(self._twin, parameters)), near.apart
         fit: Fitted | None = None
-        for steps in (STEPS, MORE_STEPS):
-            known = Scales(self._scales_of(apart))
+        for share in BLUNT:
             fit = solve(
-                self._replays, start, parameters, prior, steps, known=known, everything=True, near=fit
+                self._replays,
+                start,
+                parameters,
+                prior,
+                STEPS,
+                known=self._rounded(apart, share),
+                everything=True,
+                near=fit,
+                tempered=True,
             )
             # Those that are still beyond `SOFT` would draw all parameters along, which none can tell.
             start, apart = fit.truth, np.where(np.abs(fit.vector) > SOFT, np.inf, apart)
         self._reached.append(self.at(causes, start))
+
+    def _rounded(self, apart: FloatArray, blunt: float) -> Scales:
+        """What readings are rounded to, and how far off replays are beyond that, row by row."""
+        rows = self._scales_of(apart)
+        off = {
+            name: max(self._fine[name], blunt * self._scale[name]) / self._scale[name] for name in CHANNELS
+        }
+        return Scales({name: off[name] * rows[name] for name in CHANNELS}, self._steps)
 
     def _spreads(self, causes: tuple[str, ...]) -> FloatArray:
         """By parameter, how far it may be from the twin's where these causes have changed."""

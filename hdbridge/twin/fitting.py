@@ -13,7 +13,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.earned import EARNED, with_last, with_limit, with_loop
 from hdbridge.twin.least_squares import SOFT, Fitted, Progress, solve
 from hdbridge.twin.loop_laws import LAWS, LOOP
-from hdbridge.twin.minima import elsewhere, exchanged, lags, springs
+from hdbridge.twin.minima import elsewhere, exchanged, lags, neighbours, springs
 from hdbridge.twin.misfit import CHANNELS, Data
 from hdbridge.twin.noise import expected
 from hdbridge.twin.parameters import (
@@ -103,11 +103,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
     best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
     laws = len(LAWS)  # so often at most another one is taken
     while True:
-        if _leaves_more(data, best):
-            for there in better_places(roughly, best, elsewhere(best.truth, begun), begun, prior):
-                best = _better(replays, best, there, prior, most)
-        # A rough fit knows little of what the two gains do at rest, where only they differ.
-        best = _better(replays, best, exchanged(best.truth), prior, most)
+        best = _in_best_minimum(replays, best, begun, prior, most)
         wider, prior = with_last(replays, best, prior)
         if wider is not best:
             best = _ended(replays, wider, prior, most)
@@ -137,6 +133,21 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
     progress(1.0)
     # What the loops do is told by the recording's rows; those who ask further have others.
     return replace(best, scales=replace(best.scales, loops=None))
+
+
+def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatArray, most: Scales) -> Fitted:
+    """The fit from the best of the minima about one, until none is better."""
+    while True:
+        last = best
+        if _leaves_more(replays.data, best):
+            for there in better_places(replays.rough, best, elsewhere(best.truth, begun), begun, prior):
+                best = _better(replays, best, there, prior, most)
+        # A few legs know little of what the two gains do at rest, where only they differ, and a dead time
+        # of the next substep leaves so little more that no channel shows it.
+        for there in (exchanged(best.truth), *neighbours(best.truth)):
+            best = _better(replays, best, there, prior, most)
+        if best is last:
+            return best
 
 
 def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
