@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.parameters import with_values
+from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, with_values
 
+FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Where a resonance of the load is looked for: a fit finds only the nearest of its minima."""
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
@@ -50,22 +51,27 @@ def delays(truth: Truth) -> list[Truth]:
     in two halves, which is how a filter shows it too: between two whole numbers of substeps the dead time
     has a minimum of its own.
     """
-    step_ms = truth.substep_ms
-    now, most = int(truth.servo.dead_time_ms / step_ms), int(_lag_ms(truth) / step_ms - 0.5)
-    return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in range(most + 1) if each != now]
+    step_ms, now = truth.substep_ms, _substep(truth)
+    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
+    places = range(int(most_ms / step_ms + 0.5))
+    return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in places if each != now]
 
 
 def neighbours(truth: Truth) -> list[Truth]:
     """Those of `delays` whose dead time is a substep shorter or longer."""
-    near_ms = 1.5 * truth.substep_ms + 1e-9
-    now_ms = (int(truth.servo.dead_time_ms / truth.substep_ms) + 0.5) * truth.substep_ms
-    return [each for each in delays(truth) if abs(each.servo.dead_time_ms - now_ms) < near_ms]
+    return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """The truth with other inertias of the motor, and all else as it is."""
-    now = truth.motor.inertia_kg_m2
-    return [with_values(truth, {"motor inertia": factor * now}) for factor in INERTIA_FACTORS]
+    """The truth with other inertias of the motor; a spring too stiff for the time step becomes softer."""
+    motor = [BY_NAME["motor inertia"]]
+    (now,) = coordinates(truth, motor)
+    return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
+
+
+def _substep(truth: Truth) -> int:
+    """The number of the substep in which a delayed demand comes."""
+    return int(truth.servo.dead_time_ms / truth.substep_ms)
 
 
 def _lag_ms(truth: Truth) -> float:
@@ -76,7 +82,7 @@ def _lag_ms(truth: Truth) -> float:
 def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
     """The truth with another share of the dead time in its lag."""
     filter_ms = 0.5 * (_lag_ms(truth) - dead_time_ms)
-    return with_values(truth, {"command filter": filter_ms, "servo dead time": dead_time_ms})
+    return with_values(truth, {FILTER.name: filter_ms, DEAD_TIME.name: dead_time_ms})
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:

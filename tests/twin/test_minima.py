@@ -16,7 +16,7 @@ from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import better_places
 from hdbridge.twin.least_squares import solve
-from hdbridge.twin.minima import exchanged, feedforwards, lags, springs
+from hdbridge.twin.minima import delays, exchanged, feedforwards, inertias, lags, neighbours, springs
 from hdbridge.twin.misfit import Data, prepare
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
 from hdbridge.twin.replays import Replays
@@ -80,6 +80,32 @@ def test_a_lag_stays_as_long_whosever_it_is() -> None:
     for truth in lags(late):
         assert 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms == pytest.approx(wanted)
     assert len({each.servo.dead_time_ms for each in lags(late)}) > 1
+
+
+@pytest.mark.parametrize(("filter_ms", "dead_time_ms"), [(0.05, 0.0), (0.3, 1.4), (1.0, 0.0), (2.0, 19.9)])
+def test_a_dead_time_is_tried_in_each_other_substep_that_the_lag_has_room_for(
+    filter_ms: float, dead_time_ms: float
+) -> None:
+    late = with_values(TRUTH, {"command filter": filter_ms, "servo dead time": dead_time_ms})
+    lag_ms, step_ms = 2.0 * filter_ms + dead_time_ms, late.substep_ms
+    found = {each.servo.dead_time_ms for each in delays(late)}
+    for truth in delays(late):
+        assert 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms == pytest.approx(lag_ms)
+        assert truth.servo.command_filter_ms >= BY_NAME["command filter"].least
+    middles = {(each + 0.5) * step_ms for each in range(39) if each != int(dead_time_ms / step_ms)}
+    assert found == {each for each in middles if each <= lag_ms - 0.1 + 1e-9}
+    own = (int(dead_time_ms / step_ms) + 0.5) * step_ms
+    near = {each.servo.dead_time_ms for each in neighbours(late)}
+    assert near == {each for each in found if abs(each - own) < 1.1 * step_ms}
+
+
+def test_a_lighter_motor_has_a_spring_that_its_time_step_resolves() -> None:
+    stiff = with_values(TRUTH, {"gear stiffness": 0.99 * TRUTH.highest_stiffness_nm_per_rad})
+    factors = [each.motor.inertia_kg_m2 / stiff.motor.inertia_kg_m2 for each in inertias(stiff)]
+    assert min(factors) < 0.5
+    assert max(factors) > 2.0
+    for truth in inertias(stiff):
+        assert truth.gear.stiffness_nm_per_rad <= stiff.gear.stiffness_nm_per_rad
 
 
 def test_as_much_is_fed_forward_whosever_inertia_it_is() -> None:
