@@ -1,4 +1,4 @@
-"""Writes what commands print into README.md and docs/tutorial.md, so that the pages show what happens today.
+"""Writes what commands print into README.md, the tutorial and the twin's page: they show what happens today.
 
 python tools/doc_outputs.py                rewrite all blocks: some minutes, three calibrations
 python tools/doc_outputs.py --check        say which blocks have another text, or figures beyond the tolerance
@@ -24,7 +24,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs" / "tutorial.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "tutorial.md", ROOT / "docs" / "twin.md")
 BLOCK = re.compile(r"(<!-- output: (?P<name>[a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 ABSOLUTE = 0.3
@@ -118,6 +118,14 @@ STEPS = (
         "hdbridge model rollback my-axis --reason 'the old gear is back' > /dev/null && "
         "hdbridge model log my-axis",
         "hdbridge model log my-axis",
+    ),
+    Step(
+        "twin",
+        "hdbridge new arm --from demo > /dev/null && "
+        "hdbridge step arm --simulate --scheme none --count 4 --step-deg 150 --record steps > /dev/null && "
+        "sed -i 's/coulomb_nm: 0.034/coulomb_nm: 0.06/; s/nm_per_rad: 15000/nm_per_rad: 9000/' "
+        "arm/truth.yaml && hdbridge twin arm steps/stepping-none.csv.gz",
+        rows=(("^friction", "hdbridge model"),),
     ),
 )
 

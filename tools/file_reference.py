@@ -98,7 +98,7 @@ def translation_table() -> str:
     """Where each effect of the catalogue goes in a truth file."""
     lines = ["| effect | | place in the truth file |", "|---|---|---|"]
     for name, effect in CATALOGUE.items():
-        places = re.sub(r"[a-z_]+\.[a-z_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
+        places = re.sub(r"[a-z_]+\.[a-z0-9_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
         lines.append(f"| `{name}` | {effect.about.title} | {places} |")
     return "\n".join(lines) + "\n"
 

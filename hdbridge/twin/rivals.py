@@ -24,8 +24,9 @@ from hdbridge.twin.replays import Replays
 
 FALSE_ALARM = 0.02
 """Probability with which a simulation that is right has any cause named."""
-STEPS = 2
-"""Of the fit of a rival. It begins where the slopes of the twin's own fit lead."""
+STEPS = 6
+"""Most steps of a rival's fit, which begins where the slopes of the twin's own fit lead. A rival that has not
+reached its minimum loses to the twin by that alone, and a cause is named that is none."""
 
 
 def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:

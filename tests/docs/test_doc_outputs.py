@@ -53,3 +53,14 @@ def test_a_block_shows_the_lines_that_were_asked_for():
         doc_outputs.block(step, "a\nb\nc\nd\ne\nf\n", {})
         == "\n    $ hdbridge s\n    b\n    c\n    ...\n    e\n\n"
     )
+
+
+@pytest.mark.slow
+def test_the_twin_of_the_example_names_what_was_made_wrong_and_nothing_else(shown, tmp_path):
+    """A rival that has not reached its minimum loses, and had the motor's inertia named, which was right."""
+    steps = [step for step in doc_outputs.STEPS if step.name == "twin"]
+    ((step, text),) = doc_outputs.outputs(steps, tmp_path)
+    block = doc_outputs.block(step, text, {})
+    named = {line.split(":")[0].strip() for line in block.splitlines() if "->" in line}
+    assert named == {"friction", "gear stiffness"}
+    assert doc_outputs.differs(shown["twin"], block) is None, RUN
