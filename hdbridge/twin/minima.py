@@ -9,9 +9,10 @@ several places.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, with_values
+from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates, with_values
 
 FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
@@ -60,6 +61,17 @@ def delays(truth: Truth) -> list[Truth]:
 def neighbours(truth: Truth) -> list[Truth]:
     """Those of `delays` whose dead time is a substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
+
+
+def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
+    """The truth with the whole lag of another one, by whichever of filter and dead time is free."""
+    lag_ms, own = _lag_ms(other), truth.servo
+    if FILTER in free:
+        return with_values(truth, {FILTER.name: max(0.5 * (lag_ms - own.dead_time_ms), FILTER.least)})
+    if DEAD_TIME in free:
+        dead_time_ms = max(lag_ms - 2.0 * own.command_filter_ms, DEAD_TIME.least)
+        return with_values(truth, {DEAD_TIME.name: dead_time_ms})
+    return truth
 
 
 def inertias(truth: Truth) -> list[Truth]:

@@ -18,6 +18,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.covariance import information_of, over_legs
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows, solve, told
+from hdbridge.twin.minima import as_late
 from hdbridge.twin.misfit import counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
@@ -52,8 +53,9 @@ def without(
 ) -> Truth:
     """The best rival in which these parameters are where they were: all others may make up for it.
 
-    It is fitted from where the slopes of the twin's fit lead, or from where only the ``moved`` ones are as in
-    the twin, whichever is nearer: what makes up for each other may be far from the twin.
+    It is fitted from where the slopes of the twin's fit lead, from where only the ``moved`` ones are as in
+    the twin, or from where filter or dead time makes up for the other, whichever is nearest: what makes up
+    for each other may be far from the twin, and slopes do not lead from one substep into another.
     """
     free = [number for number, each in enumerate(fitted.parameters) if each not in own]
     back = [number for number, each in enumerate(fitted.parameters) if each in own]
@@ -67,7 +69,7 @@ def without(
     low, high = np.array([each.bounds for each in others]).T
     led = at_coordinates(before, others, np.clip(fitted.place[free] - along, low, high).tolist())
     kept = [coordinates(fitted.truth if each in moved else start, [each])[0] for each in others]
-    begun = [led, at_coordinates(before, others, kept)]
+    begun = [led, at_coordinates(before, others, kept), as_late(before, fitted.truth, others)]
     rows = fitted_rows(replays.data)
     costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)
