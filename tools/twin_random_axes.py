@@ -250,7 +250,7 @@ def one(
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
     about = (
         f"N {truth.gear.ratio:5.1f} {truth.load_frequency_hz:4.1f} Hz "
-        f"{truth.servo.dead_time_ms:3.1f} ms {law:16s}"
+        f"{truth.servo.dead_time_ms:3.1f} ms {law:16s}{_saturated(recording, axis)}"
     )
     found = Outcome(seed, about, fit_s=time.perf_counter() - began_s)
     again = replay(other, axis, without_noise(twin.truth), seed + 2000)
@@ -278,6 +278,13 @@ def one(
             answer = check(again, axis, twin.truth, workers=workers)
             found.checks.append((what, causes, {each.cause for each in answer.changes}))
     return found
+
+
+def _saturated(recording: Recording, axis: AxisConfig) -> str:
+    """Says where a drive is at its torque limit: there loops and load oscillate, and no axis is left so."""
+    most_nm = 0.01 * axis.limits.torque_percent * axis.drive.rated_torque_nm
+    share = float(np.mean(np.abs(recording.record.columns["motor_torque_nm"]) > 0.99 * most_nm))
+    return f" {share:.1%} at the torque limit" if share else ""
 
 
 def patient(axis: AxisConfig) -> AxisConfig:
