@@ -260,7 +260,16 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     model = TransmissionModel.load(files.model) if files.model.is_file() else None
     if model is not None:
         model.check_bound_to(axis)
-    return translate(axis, model, Truth.load(plant) if plant is not None else None)
+    begun = translate(axis, model, Truth.load(plant) if plant is not None else None)
+    if not (begun.truth.gear.hysteresis or begun.truth.gear.motor_orders):
+        notes.print(
+            "no transmission error is simulated: neither a model nor the plant's file tells it. What it does "
+            "to torque and following error may be taken for motor or loops; calibrate first "
+            f"(hdbridge calibrate {files.folder})",
+            markup=False,
+            soft_wrap=True,
+        )
+    return begun
 
 
 def _facts(

@@ -85,6 +85,7 @@ def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path
         profile, "twin", profile, recording, "--compare", "--json", "told.json", "--html", "page.html"
     )
     assert done.returncode == 0, done.stderr
+    assert "no transmission error is simulated" not in done.stderr, "the truth file tells it"
     told = json.loads((profile / "told.json").read_text())
     assert told["schema"] == "hdbridge.twin/1"
     before = figures(told, "before")
@@ -94,6 +95,15 @@ def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path
     page = (profile / "page.html").read_text()
     assert "Twin of axis" in page
     assert "truth.yaml" in page
+
+
+def test_that_no_transmission_error_is_simulated_is_said(profile: Path, recording: Path) -> None:
+    """Its torque and following error would be taken for motor and loops."""
+    (profile / "truth.yaml").unlink()
+    done = run_here(profile, "twin", profile, recording, "--compare")
+    assert done.returncode == 0, done.stderr
+    assert "no transmission error is simulated" in done.stderr
+    assert f"hdbridge calibrate {profile}" in done.stderr
 
 
 def test_an_active_model_says_how_the_simulation_errs(profile: Path, recording: Path) -> None:
