@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.encoder import TrueCoupling
 from hdbridge.twin.parameters import Parameter, with_values
 
 
@@ -42,6 +43,12 @@ VISCOUS_SHARE: Final = Usual(
 RATED_SPEED_RAD_S: Final = Usual(3000.0 * math.tau / 60.0, "rad/s", "rated speed of small servo motors")
 STRIBECK_RAD_S: Final = Usual(
     5.0, "rad/s", "bearings and teeth in grease: a film carries from some tens of turns a minute on"
+)
+COUPLING_HZ: Final = Usual(
+    1000.0, "Hz", "an encoder whose coupling is not known: stiffer than a recording shows"
+)
+COUPLING_DAMPING: Final = Usual(
+    0.1, "", "metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder"
 )
 BRAKE_SHARE: Final = Usual(
     3.0, "of the rated torque", "holding brakes are built for more than the motor gives"
@@ -111,9 +118,14 @@ def default_truth(axis: AxisConfig) -> Truth:
 
 def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     """The same simulated drive, with the sections that these parameters belong to."""
-    if truth.motor.stribeck is not None or not any("stribeck" in each.path for each in parameters):
-        return truth
-    return with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
+    wanted = {section for each in parameters for section in each.path}
+    if truth.motor.stribeck is None and "stribeck" in wanted:
+        truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
+    if truth.load_.encoder.coupling is None and "coupling" in wanted:
+        rigid = TrueCoupling(frequency_hz=COUPLING_HZ.value, damping_ratio=COUPLING_DAMPING.value)
+        encoder = truth.load_.encoder.model_copy(update={"coupling": rigid})
+        truth = truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+    return truth
 
 
 def _encoder(encoder: Any) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 Most drives feed the whole speed forward, and otherwise it looks like a dead time until all else is right;
 friction near rest is told from Coulomb friction by few rows, and how friction falls with warmth only where
-parts were at different temperatures. The gear's loop is the model's, and stays so
-unless the load's angle says otherwise. A torque limit shows only where it is reached.
+parts were at different temperatures. A load encoder on a flexible coupling winds up with the load's
+acceleration, as the gear's spring does, but by much less. The gear's loop is the model's, and stays so unless
+the load's angle says otherwise. A torque limit shows only where it is reached.
 """
 
 from __future__ import annotations
@@ -32,7 +33,12 @@ from hdbridge.twin.parameters import (
 from hdbridge.twin.replays import Replays
 
 GROWTH: Final = "friction growth"
-LAST: Final = (("velocity feed-forward",), (GROWTH,), ("friction's rise at rest", "Stribeck speed"))
+LAST: Final = (
+    ("velocity feed-forward",),
+    ("encoder coupling",),
+    (GROWTH,),
+    ("friction's rise at rest", "Stribeck speed"),
+)
 """Taken in together or not at all."""
 LIMIT: Final = BY_NAME["current limit"]
 EARNED = 8.0

@@ -56,7 +56,7 @@ APART = 0.1
 """In spreads of a parameter: fits that have come closer than this are on their way to the same place."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
-    "friction growth", *LOOP,
+    "encoder coupling", "friction growth", *LOOP,
 )  # fmt: skip
 """Not fitted unless asked for or earned: the ordinary motion does not show them, others can take their
 place, or a calibration has told them."""

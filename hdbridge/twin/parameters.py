@@ -156,6 +156,10 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         (LOAD,), _SPEEDS, 0.3, linear=True,
     ),
     Parameter(
+        "encoder coupling", ("load", "encoder", "coupling", "frequency_hz"), "Hz", 10.0, 5_000.0, 0.7,
+        "encoder coupling", (LOAD,), _STEPS, 0.2,
+    ),
+    Parameter(
         "motor encoder delay", ("motor", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "motor encoder delay",
         (FOLLOWING, LOAD), _SPEEDS, 0.3, linear=True,
     ),

@@ -1,4 +1,4 @@
-"""What a fit takes in only where the recording shows it: friction near rest, another loop, a torque limit."""
+"""What a fit takes in only where the recording shows it: friction near rest, another loop, a limit."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.encoder import TrueCoupling
 from hdbridge.twin.earned import with_last, with_limit, with_loop
 from hdbridge.twin.fitting import free_parameters
 from hdbridge.twin.least_squares import Fitted, solve
@@ -76,6 +77,28 @@ def test_friction_near_rest_is_taken_in_where_the_axis_has_it(rise: float) -> No
     assert found.truth.motor.stribeck.rise == pytest.approx(rise, rel=0.1)
     assert found.truth.motor.stribeck.speed_rad_s == pytest.approx(8.0, rel=0.2)
     assert found.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
+
+
+@pytest.mark.parametrize("hz", [None, 120.0])
+def test_the_coupling_of_the_load_encoder_is_taken_in_where_the_axis_has_it(hz: float | None) -> None:
+    rigid = with_coupling(None)
+    with Replays(prepare(recorded(with_coupling(hz)), AXIS, rigid), 1) as replays:
+        found, around = with_last(replays, fitted(replays, rigid), prior(rigid))
+        if hz is None:
+            assert found.parameters == PARAMETERS
+            return
+        assert [each.name for each in found.parameters] == [*NAMES, "encoder coupling"]
+        found = solve(replays, found.truth, found.parameters, around, 4, near=found)
+    coupling = found.truth.load_.encoder.coupling
+    assert coupling is not None
+    assert coupling.frequency_hz == pytest.approx(hz, rel=0.1)
+
+
+def with_coupling(hz: float | None) -> Truth:
+    """The demo axis with another coupling between load and load encoder; None: a rigid one."""
+    coupling = None if hz is None else TrueCoupling(frequency_hz=hz, damping_ratio=0.1)
+    encoder = TRUTH.load_.encoder.model_copy(update={"coupling": coupling})
+    return TRUTH.model_copy(update={"load_": TRUTH.load_.model_copy(update={"encoder": encoder})})
 
 
 @pytest.mark.parametrize("per_k", [0.0, -0.012])
