@@ -50,6 +50,9 @@ SAME = 0.3
 """... that is, by more than so many standard deviations."""
 MORE = 1.1
 """So many times what the true axis would leave is more: a scale of some hundred rows is known no better."""
+MINIMA = 8
+"""So often at most a fit goes on to a better minimum. Each is judged by what a drive's steps do there, so
+that of two minima each may look better from the other."""
 NEAREST = 2
 """So many of the places of a kind are looked at more closely."""
 APART = 0.1
@@ -137,7 +140,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatArray, most: Scales) -> Fitted:
     """The fit from the best of the minima about one, until none is better."""
-    while True:
+    for _ in range(MINIMA):
         last = best
         if _leaves_more(replays.data, best):
             for there in better_places(replays.rough, best, elsewhere(best.truth, begun), begun, prior):
@@ -147,7 +150,8 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatA
         for there in (exchanged(best.truth), *neighbours(best.truth)):
             best = _better(replays, best, there, prior, most)
         if best is last:
-            return best
+            break
+    return best
 
 
 def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
