@@ -1,9 +1,9 @@
 """Places where a fit may have a minimum of its own, beside the one that it has come to.
 
 A resonance that is off by more than its width makes things worse before it makes them better. Filter and
-dead time share a lag, the feed-forwards of motor and load share a torque, a lighter motor answers a shorter
-lag, and while the axis moves two gains stand in for each other: along each of these a fit comes to rest at
-several places.
+dead time share a lag, the feed-forwards of motor and load share a torque, the motor's inertia shows only in
+the first milliseconds of a demand, as these do, and while the axis moves two gains stand in for each other:
+along each of these a fit comes to rest at several places.
 """
 
 from __future__ import annotations
