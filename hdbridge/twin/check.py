@@ -300,11 +300,8 @@ class _Search:
 
     def _rounded(self, apart: FloatArray, blunt: float) -> Scales:
         """What readings are rounded to, and how far off replays are beyond that, row by row."""
-        rows = self._scales_of(apart)
-        off = {
-            name: max(self._fine[name], blunt * self._scale[name]) / self._scale[name] for name in CHANNELS
-        }
-        return Scales({name: off[name] * rows[name] for name in CHANNELS}, self._steps)
+        off = {name: max(self._fine[name], blunt * self._scale[name]) for name in CHANNELS}
+        return Scales(self._scales_of(apart, off), self._steps)
 
     def _spreads(self, causes: tuple[str, ...]) -> FloatArray:
         """By parameter, how far it may be from the twin's where these causes have changed."""
@@ -395,12 +392,13 @@ class _Search:
         left = told(found, Scales(scale), self._rows)
         return 0.5 * float(left @ left)
 
-    def _scales_of(self, apart: FloatArray) -> dict[str, Any]:
-        """The scale of each channel, row by row."""
+    def _scales_of(self, apart: FloatArray, scale: Mapping[str, float] | None = None) -> dict[str, Any]:
+        """The scale of each channel, the noise's unless it is another, row by row."""
+        scale = self._scale if scale is None else scale
         rows = np.ones(len(self._rows))
         rows[self._rows] = apart
         by_channel = zip(CHANNELS, np.split(rows, len(CHANNELS)), strict=True)
-        return {name: self._scale[name] * each for name, each in by_channel}
+        return {name: scale[name] * each for name, each in by_channel}
 
     def _moved(self, cause: str, at: _Place, *more: str, trusted: bool = False) -> _Moved:
         """How far a cause has moved next to the place's own, all other parameters as the twin leaves them.
