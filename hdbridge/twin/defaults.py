@@ -14,7 +14,7 @@ from typing import Any, Final
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
-from hdbridge.twin.parameters import Parameter, with_values
+from hdbridge.twin.parameters import Parameter, with_load_encoder, with_values
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +123,7 @@ def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
         truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
     if truth.load_.encoder.coupling is None and "coupling" in wanted:
         rigid = TrueCoupling(frequency_hz=COUPLING_HZ.value, damping_ratio=COUPLING_DAMPING.value)
-        encoder = truth.load_.encoder.model_copy(update={"coupling": rigid})
-        truth = truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+        truth = with_load_encoder(truth, coupling=rigid)
     return truth
 
 

@@ -20,7 +20,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.commands import Commands, commands_of, legs_of
-from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
+from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import run
 from hdbridge.twin.rests import RINGING_S, STANDS_COUNTS, begins_in_motion, held_rows, stands, unknown_rows
 from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
@@ -280,8 +280,7 @@ def smooth(truth: Truth) -> Truth:
 
 def silent(truth: Truth) -> Truth:
     """The truth without noise."""
-    encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
-    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+    return with_load_encoder(truth, noise_arcsec=0.0)
 
 
 def _piece(

@@ -9,7 +9,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, Data
-from hdbridge.twin.parameters import LOAD
+from hdbridge.twin.parameters import LOAD, with_load_encoder
 from hdbridge.twin.scales import MAD_TO_SIGMA, Scales, noise_floor
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -64,5 +64,4 @@ def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
     spread = MAD_TO_SIGMA * float(np.median(np.abs(steps))) / math.sqrt(2.0)
     rounding = ARCSEC_PER_TURN / encoder.counts_per_turn / math.sqrt(12.0)
     noise_arcsec = round(math.sqrt(max(spread**2 - rounding**2, 0.0)), 4)
-    noisy = encoder.model_copy(update={"noise_arcsec": noise_arcsec})
-    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": noisy})})
+    return with_load_encoder(truth, noise_arcsec=noise_arcsec)

@@ -219,6 +219,12 @@ def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
     return Truth.model_validate(_with(truth, values))
 
 
+def with_load_encoder(truth: Truth, **fields: Any) -> Truth:
+    """The truth with other fields of its load encoder, unchecked: sections that `with_values` cannot make."""
+    encoder = truth.load_.encoder.model_copy(update=fields)
+    return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
+
+
 def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
     """The content of the truth with other values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
