@@ -75,7 +75,11 @@ class DriveConfig(_Part):
     )
     following_error_time_ms: int = Field(20, ge=0, le=1000, description="following error time-out, 6066h")
     quick_stop_option: int = Field(
-        6, ge=1, le=8, description="605Ah: 5 to 8 stay in QUICK STOP ACTIVE, 1 to 4 end in SWITCH ON DISABLED"
+        2,
+        ge=1,
+        le=8,
+        description="605Ah: 1 to 4 end in SWITCH ON DISABLED, power off; 5 to 8 stay in QUICK STOP ACTIVE, "
+        "power on (an axis that would sink without power and has no brake)",
     )
     feed_scales: bool = Field(
         True,

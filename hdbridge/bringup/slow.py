@@ -19,9 +19,9 @@ from hdbridge.clock import Clock
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.link import Link
+from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
-from hdbridge.drive.objects import Mode
+from hdbridge.drive.objects import COB_EMCY, Mode
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event, Supervision
 from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
@@ -73,15 +73,25 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 
 
 class QuietLink(Link):
-    """A link that can be told to keep some of its identifiers to itself, as a master that has died would."""
+    """A link that withholds some identifiers, as a master that has died would."""
 
-    __slots__ = ("muted", "sent_s")
+    __slots__ = ("muted", "sent_s", "unheard", "withheld")
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         super().__init__(bus, clock)
         self.muted: set[int] = set()
         self.sent_s: dict[int, float] = {}
         """When each identifier was last really sent."""
+        self.unheard: set[int] = set()
+        """Identifiers that are received but not passed on."""
+        self.withheld: list[Frame] = []
+        """The frames with those."""
+
+    def recv(self, deadline_s: float) -> Frame | None:
+        """Receive, without the frames of `unheard`."""
+        while (frame := super().recv(deadline_s)) is not None and frame.can_id in self.unheard:
+            self.withheld.append(frame)
+        return frame
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send, unless the identifier is muted."""
@@ -254,6 +264,8 @@ class SlowAxis:
         last_s = self.link.sent_s.get(identifier, self.link.now())
         muted_s = self.link.now()
         self.link.muted.add(identifier)
+        # The emergency message would make this master stop the axis, before the drive shows what it does.
+        self.link.unheard.add(COB_EMCY + self.axis.drive.node_id)
         noticed_s: float | None = None
         try:
             for _ in moving:
@@ -263,6 +275,10 @@ class SlowAxis:
             pass  # what it was, `supervision.stop` says
         finally:
             self.link.muted.discard(identifier)
+            self.link.unheard.clear()
+            for frame in self.link.withheld:
+                self._drive.monitor.dispatch(frame)
+            self.link.withheld.clear()
         event = self.supervision.stop
         if event is not None:
             noticed_s = muted_s - last_s + (event.cycle - start.cycle) * self.cycle.period_s

@@ -64,7 +64,13 @@ def simulate(
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
         node = SimulatedDrive(
-            bus, Machine(known, seed), axis.eds_path, axis.drive.node_id, clock, nameplate_of(known)
+            bus,
+            Machine(known, seed),
+            axis.eds_path,
+            axis.drive.node_id,
+            clock,
+            nameplate_of(known),
+            known.firmware,
         )
         notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s

@@ -22,7 +22,7 @@ from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.states import State
-from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
+from hdbridge.drive.supervision import ROWS, Event, Fault, Reaction, Supervision
 from hdbridge.drive.traffic import Traffic
 from hdbridge.drive.writes import drives_patience_s
 from hdbridge.errors import InputError, SafetyStop
@@ -34,6 +34,7 @@ Command = Target | Callable[[Feedback], Target]
 STILL_CYCLES: Final = 3
 """After a quick stop the motor has to keep its place for this many cycles to count as standing."""
 _ENABLED: Final = State.OPERATION_ENABLED
+_POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, State.UNKNOWN)
 
 
@@ -50,7 +51,7 @@ class AxisCycle:
         "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_last", "_left",
         "_plausibility", "_refused", "_ridden", "_still", "_stop_cycles", "_traffic", "awaited", "changed",
         "command", "feedback", "image", "monitor", "name", "needed", "patience_s", "pending", "rested",
-        "rpdo_id", "silent", "supervision",
+        "rpdo_id", "silent", "spoke_s", "supervision",
     )  # fmt: skip
 
     def __init__(
@@ -83,6 +84,8 @@ class AxisCycle:
         self.patience_s = drives_patience_s(axis)
         """For how long the drive waits for a silent master before it stops by itself."""
         self.rpdo_id = image.rpdo_id
+        self.spoke_s = 0.0
+        """Begin of the last turn that gave it an RPDO, on the clock."""
 
         # Between the bus and its axes:
         self.pending: list[tuple[Fault, str]] = []
@@ -176,14 +179,40 @@ class AxisCycle:
 
     def start(self, now: float, count: int) -> None:
         """Its first turn after `begin` starts."""
-        self._traffic.heard_s = now
+        self._traffic.heard_s = self.spoke_s = now
         self._good_cycle = count
+
+    @property
+    def powered(self) -> bool:
+        """The drive has power, or is on the way to it."""
+        power = self.image.power
+        return power.aim is _ENABLED or power.state in _POWERED
+
+    def stop_before_sync(self) -> bytes | None:
+        """RPDO with a quick stop, if a fault that came before SYNC stops the axis; else None.
+
+        A drive keeps the last RPDO until SYNC. If it has stopped on its own in between, the set-point in
+        there would set it in motion again. After a fault that latches the axis, no RPDO is sent at all.
+        """
+        if max(ROWS[fault].first for fault, _ in self.pending) is not Reaction.QUICK_STOP:
+            return None
+        self.image.power.quick_stop()
+        return self.image.pack_rpdo_stop()
+
+    def glance(self, frame: Frame) -> None:
+        """Look at a TPDO that is too early or too late to be used: has the drive dropped out?"""
+        word = self.image.statusword_in(frame.can_id, frame.data)
+        if self._commanded and word is not None:
+            self.image.power.observe(word)
+            if self.image.power.dropped is not None:
+                self._fell_out()
+                self._commanded = False
 
     def hear(self, frame: Frame) -> None:
         """A frame of the axis that is not waited for: what it means."""
         can_id, data, _ = frame
         if can_id not in self._channel_ids:
-            faults = list(self._traffic.faults(frame))
+            faults = list(self._traffic.faults(frame, commanded=self._commanded))
         else:
             faults = []
             try:
@@ -196,6 +225,7 @@ class AxisCycle:
     def turn(self, now: float, count: int, time_s: float, complete: bool) -> bytes | None:
         """One period is received, ``complete`` with every TPDO: judge it; the RPDO, where one is to go."""
         image, supervision = self.image, self.supervision
+        self.spoke_s = now
         stop = supervision.stop
         if stop is not self._ridden:
             self._note(stop)
@@ -216,7 +246,7 @@ class AxisCycle:
             self._good_cycle = count
         else:
             feedback = self.stale(count, time_s)
-        if self._commanded and not enabled:
+        if self._commanded and (not enabled or power.dropped is not None):
             self._fell_out()
         if now - self._traffic.heard_s > image.heartbeat_timeout_s and (stop is None or not self._over()):
             silent_ms = 1e3 * (now - self._traffic.heard_s)
@@ -330,9 +360,10 @@ class AxisCycle:
         return True
 
     def _fell_out(self) -> None:
-        state = self.image.power.state
+        power = self.image.power
+        state = power.dropped or power.state
         fault = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
-        detail = f"it is in '{state.value}', statusword {self.image.statusword or 0:04X}h"
+        detail = f"it went to '{state.value}'"
         self.pending.append((Fault.DRIVE_FAULT if fault else Fault.DROPPED_OUT, detail))
 
     def _hold(self) -> bytes:

@@ -1,9 +1,12 @@
 """The control cycle of one bus: one thread, absolute deadlines, the same order in every period.
 
-    wait - drain - SYNC - receive - check - RPDOs - heartbeat
+    wait - drain - stop what must not run on - SYNC - receive - check - RPDOs - heartbeat
 
 * *drain*: what waited since the last cycle is not of this one. Heartbeats and emergencies are noted, TPDOs
-  are stale and thrown away.
+  are stale and thrown away, after a look at their statusword.
+* *stop*: a drive puts its last RPDO into force with SYNC, whatever happened in between. So before the first
+  SYNC, after a stall of this process that a drive does not wait out, and after a fault that stops an axis,
+  that RPDO is replaced by one with a quick stop. Drives of silent axes are put into PRE-OPERATIONAL instead.
 * *receive*: until every TPDO of every axis is there, or the window closes. The newest of each identifier
   wins. Those of the optional channels are waited for when they come with every SYNC and are not lost, else
   taken when they come.
@@ -32,7 +35,7 @@ from hdbridge.control.latency import Histogram
 from hdbridge.drive.busload import FRAME_BITS
 from hdbridge.drive.fastlink import fast_link
 from hdbridge.drive.link import Frame, Link, TransmitBufferFull
-from hdbridge.drive.objects import COB_SYNC, NmtState
+from hdbridge.drive.objects import COB_NMT, COB_SYNC, NmtCommand, NmtState
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.supervision import Fault
 from hdbridge.drive.traffic import bus_faults
@@ -48,6 +51,8 @@ DRAIN_MAXIMUM: Final = 256
 """Frames read before SYNC; at 1 Mbit/s a full bus brings at most 220 in 10 ms."""
 FLUSH_MAXIMUM: Final = 10_000
 """Frames thrown away when the cycle begins."""
+_CLOCK_STEP_S: Final = 1e-6
+"""Rounding of times, which are sums of periods."""
 _HEARTBEAT_DATA: Final = bytes([NmtState.OPERATIONAL])
 
 
@@ -73,6 +78,7 @@ class BusCycle:
         "_heartbeat_id",
         "_heartbeat_period_s",
         "_heartbeat_s",
+        "_interrupted",
         "_late_s",
         "_listeners",
         "_listening",
@@ -183,7 +189,7 @@ class BusCycle:
         The latches and the histogram stay, and who is silent.
         """
         self._deadline: float | None = None
-        self._rested = True
+        self._rested = self._interrupted = True
         for axis in self.axes:
             if not axis.silent:
                 axis.begin()
@@ -212,6 +218,7 @@ class BusCycle:
         try:
             read = self._drain(now)
             try:
+                self._stop_before_sync()
                 self._send(COB_SYNC, b"")
             except TransmitBufferFull as error:
                 self._everybody(Fault.TRANSMIT_FULL, f"SYNC: {error}")
@@ -271,15 +278,33 @@ class BusCycle:
         self.skipped += missed
         self.count += missed
         self._everybody(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
-        hang = False
+
+    def _stop_before_sync(self) -> None:
+        """Replace the set-points that SYNC must not put into force any more."""
+        send, now = self._send, self.clock.now()
         for axis in self._speaking:
-            if late_s + self.period_s > axis.patience_s:
-                patience = f"{1e3 * axis.patience_s:.0f} ms"
-                what = (Fault.HANG, f"{1e3 * late_s:.0f} ms; the drive waits {patience}")
-                axis.pending.append(what)
-                if not hang:
-                    self.faults.append(what)
-                hang = True
+            if now - axis.spoke_s >= axis.patience_s - _CLOCK_STEP_S and axis.powered:
+                self._note_hang(axis, now - axis.spoke_s)
+        if self._interrupted:
+            for axis in self.axes:
+                if axis.silent:
+                    send(COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, axis.image.node_id)))
+                else:
+                    send(axis.rpdo_id, axis.image.pack_rpdo_stop())
+            self._interrupted = False
+        else:
+            for axis in self._speaking:
+                if axis.pending:
+                    data = axis.stop_before_sync()
+                    if data is not None:
+                        send(axis.rpdo_id, data)
+
+    def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
+        """This process was silent for longer than a drive under power waits."""
+        hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
+        axis.pending.insert(0, hang)
+        if all(fault is not Fault.HANG for fault, _ in self.faults):
+            self.faults.append(hang)
 
     def _drain(self, now: float) -> bool:
         """Read what waited; whether that was all of it."""
@@ -317,6 +342,7 @@ class BusCycle:
         bit, accept, axis = slot
         if axis.awaited:
             if not axis.rested:
+                axis.glance(frame)
                 axis.pending.append((Fault.DUPLICATE_TPDO, f"{frame.can_id:03X}h before SYNC"))
             return
         self._bits_of_turn += FRAME_BITS[len(frame.data)]

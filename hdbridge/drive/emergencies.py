@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 HEARTBEAT_LOST: Final = 0x8130
+RPDO_TIMEOUT: Final = 0x8250
 
 _CODES: Final[dict[int, str]] = {
     0x2110: "short circuit or earth leakage at the input",
@@ -60,7 +61,7 @@ _CODES: Final[dict[int, str]] = {
     0x8210: "a PDO was too short to be used",
     0x8220: "a PDO was too long",
     0x8240: "SYNC of an unexpected length",
-    0x8250: "set-points (RPDOs) stayed away",
+    RPDO_TIMEOUT: "set-points (RPDOs) stayed away",
     0x8311: "excess torque",
     0x8400: "speed controller",
     0x8500: "position controller",

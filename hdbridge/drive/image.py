@@ -22,7 +22,7 @@ from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.pdo import PdoCodec, PdoEntry
-from hdbridge.drive.states import PowerWalk
+from hdbridge.drive.states import Command, PowerWalk
 from hdbridge.drive.supervision import Fault
 from hdbridge.drive.unwrap import Unwrap, wrap_int32
 from hdbridge.errors import InputError
@@ -260,6 +260,19 @@ class ProcessImage:
     def pack_rpdo_idle(self) -> bytes:
         """Data of the RPDO with the actual position as target: for every cycle before power is enabled."""
         return self._pack(wrap_int32(self.motor_counts))
+
+    def pack_rpdo_stop(self) -> bytes:
+        """Data of the RPDO with *quick stop* and the actual position, whatever ``power`` aims at.
+
+        It enables no drive in any state, and replaces an RPDO that a drive has buffered.
+        """
+        return self.rpdo.pack((Command.QUICK_STOP.word, wrap_int32(self.motor_counts)))
+
+    def statusword_in(self, can_id: int, data: bytes) -> int | None:
+        """Statusword that a TPDO carries, or None. Takes nothing over into the image."""
+        if can_id != self.tpdo_ids[0] or len(data) != self.tpdos[0].codec.length:
+            return None
+        return self.tpdos[0].codec.unpack(data)[0]
 
     def _pack(self, target_counts: int) -> bytes:
         word = self.power.controlword()

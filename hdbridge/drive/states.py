@@ -212,13 +212,17 @@ class PowerWalk:
     again, and a fault is reset only when asked. A call that raises changes nothing.
     """
 
-    __slots__ = ("_aim", "_reset", "_state", "_was_enabled")
+    __slots__ = ("_aim", "_reset", "_state", "_was_enabled", "dropped")
 
     def __init__(self) -> None:
         self._state = State.UNKNOWN
         self._aim = State.SWITCH_ON_DISABLED
         self._reset = _NO_RESET
         self._was_enabled = False
+        self.dropped: State | None = None
+        """State in which the drive was first seen after it left 'operation enabled' unasked.
+
+        It stays until the next `go`, whatever the drive reports meanwhile."""
 
     @property
     def state(self) -> State:
@@ -244,7 +248,8 @@ class PowerWalk:
         elif self._was_enabled:
             self._was_enabled = False
             if self._aim is State.OPERATION_ENABLED:
-                # It dropped out by itself. Where it went is where it is left, until somebody aims anew.
+                # The drive dropped out on its own. It stays where it went until the next `go`.
+                self.dropped = state
                 blind = state in (State.QUICK_STOP_ACTIVE, State.UNKNOWN)
                 self._aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
         if state is not _FAULT:
@@ -255,6 +260,7 @@ class PowerWalk:
         """Aim at a state; `TransitionError` when no way leads there from the present one."""
         controlword_for(self._state, target)
         self._aim = target
+        self.dropped = None
         self._was_enabled = self._state is State.OPERATION_ENABLED
 
     def quick_stop(self) -> None:

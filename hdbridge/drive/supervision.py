@@ -35,12 +35,13 @@ class Fault(Enum):
 
     LOST_TPDO = "a TPDO is missing"
     OVERRUN = "the cycle started too late"
-    HANG = "this process stood still for longer than the drive waits for it"
+    HANG = "the control process stalled for longer than the drive waits"
     DUPLICATE_TPDO = "a TPDO came twice or out of its cycle"
     WRONG_LENGTH = "a TPDO has the wrong length"
     DISCARDED_FRAME = "a frame of the wrong kind was thrown away"
     FLOOD = "more frames waited than one cycle reads"
     EMERGENCY = "the drive sent an emergency message"
+    MASTER_LOST = "the drive reports that its master went silent"
     DRIVE_FAULT = "the drive reports a fault"
     DROPPED_OUT = "the drive left 'operation enabled' by itself"
     BOOT_UP = "a node restarted"
@@ -73,14 +74,13 @@ _GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP,
 TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.LOST_TPDO, _FREEZE, 2, _STOP, "check the cable, the bus load and the drive's PDOs"),
     Row(Fault.OVERRUN, _GO, 2, _STOP, "see 'hdbridge latency' for the cycle time that this machine carries"),
-    Row(
-        Fault.HANG, _GO, 1, _GO, "see 'hdbridge latency' for what this machine carries; keep it from sleeping"
-    ),
+    Row(Fault.HANG, _STOP, 1, _STOP, "see 'hdbridge latency' for what this machine carries; keep it awake"),
     Row(Fault.DUPLICATE_TPDO, _GO, 1, _GO, "look for a second node with the drive's node id"),
     Row(Fault.WRONG_LENGTH, _FREEZE, 2, _STOP, "boot the drive again: its PDO mapping (1A00h) was changed"),
     Row(Fault.DISCARDED_FRAME, _GO, 1, _GO, "look for a node that is not CANopen, or restart the drive"),
     Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that babbles"),
     Row(Fault.EMERGENCY, _GO, 1, _GO, "look the code up in the drive's manual"),
+    Row(Fault.MASTER_LOST, _STOP, 1, _STOP, "check the bus load, and 'hdbridge latency' for this machine"),
     Row(Fault.DRIVE_FAULT, _STOP, 1, _STOP, "read its error code (603Fh), remove the cause, reset the fault"),
     Row(Fault.DROPPED_OUT, _STOP, 1, _STOP, "check the enable input, the supply and the limit switches"),
     Row(Fault.BOOT_UP, _LATCH, 1, _LATCH, "check its supply, then boot and verify the drive again"),
@@ -102,6 +102,7 @@ EVENTS_KEPT: Final = 1000
 EMERGENCIES_TOLD: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
 """What a drive does by itself, and for reasons that it knows best."""
+_EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
 _AS_IT_SAYS: Final = "remove that cause, then reset the fault, or boot the drive again"
 
 
@@ -127,12 +128,11 @@ class Supervision:
     Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
     """
 
-    __slots__ = ("_frozen", "_hang", "_runs", "counts", "events", "gravest", "noted", "stop")
+    __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "noted", "stop")
 
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}
         self._frozen = False
-        self._hang: Event | None = None
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         """Every fault seen, oldest first."""
         self.noted = 0
@@ -163,8 +163,6 @@ class Supervision:
         previous, self._runs = self._runs, {}
         frozen, self._frozen = self._frozen, False
         worst = Reaction.GO
-        if not previous:
-            self._hang = None
         for fault, detail in faults:
             if fault not in self._runs:
                 worst = max(worst, self._note(cycle, fault, detail, previous.get(fault, 0) + 1, frozen))
@@ -187,11 +185,8 @@ class Supervision:
         self.events.append(event)
         self.noted += 1
         self.counts[fault] += 1
-        if fault is Fault.HANG:
-            self._hang = event
         if reaction >= Reaction.QUICK_STOP:
-            # What is wrong in the wake of a hang came of it: the drive has given this master up.
-            self.stop = self.stop or self._hang or event
+            self.stop = self.stop or event
             if reaction > self.reaction:
                 self.gravest = event
         return reaction
@@ -223,7 +218,7 @@ class Supervision:
         said = [
             event.detail
             for event in self.events
-            if event.fault is Fault.EMERGENCY and event.cycle >= since_cycle
+            if event.fault in _EMERGENCIES and event.cycle >= since_cycle and event is not self.stop
         ]
         return list(dict.fromkeys(said))[:EMERGENCIES_TOLD]
 
@@ -234,6 +229,6 @@ class Supervision:
         """
         if self.reaction is Reaction.LATCH and not verified:
             raise self.error()
-        self.stop = self.gravest = self._hang = None
+        self.stop = self.gravest = None
         self._runs = {}
         self._frozen = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
+from hdbridge.drive.emergencies import HEARTBEAT_LOST, RPDO_TIMEOUT
 from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, NmtState
 from hdbridge.drive.supervision import Fault
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from hdbridge.drive.monitor import NetworkMonitor
 
 _NODE_MASK: Final = 0x7F
+_MASTER_LOST: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT)
+"""Emergency codes of a drive that has stopped because it missed its master."""
 _STATES: Final[dict[int, str]] = {
     NmtState.STOPPED: " (stopped)",
     NmtState.PRE_OPERATIONAL: " (pre-operational)",
@@ -51,16 +54,24 @@ class Traffic:
         self.heard_s = now_s
         """When the drive's last heartbeat came."""
 
-    def faults(self, frame: Frame) -> Iterator[tuple[Fault, str]]:
-        """What is wrong about a frame, with its detail for a person."""
+    def faults(self, frame: Frame, *, commanded: bool) -> Iterator[tuple[Fault, str]]:
+        """Faults that a frame reports, each with its detail for a person.
+
+        ``commanded``: the drive is enabled on this master's behalf, and is to follow set-points.
+        """
         can_id, data, time_s = frame
         if self._monitor.dispatch(frame):
             node_id = can_id & _NODE_MASK
             if node_id not in self._nodes or not data:
                 return
             if can_id < COB_HEARTBEAT:
-                if any(data[:2]):
-                    yield Fault.EMERGENCY, str(self._monitor.nodes[node_id].last_error)
+                code = int.from_bytes(data[:2], "little")
+                if code:
+                    lost = commanded and code in _MASTER_LOST and node_id == self._node_id
+                    yield (
+                        Fault.MASTER_LOST if lost else Fault.EMERGENCY,
+                        str(self._monitor.nodes[node_id].last_error),
+                    )
                 return
             if node_id == self._node_id:
                 self.heard_s = time_s

@@ -49,8 +49,6 @@ class Faults:
     """A lost heartbeat does not take it out of OPERATIONAL, whatever 1029h says."""
     ignore_missing_set_points: bool = False
     """It does not notice that RPDOs stay away."""
-    resume_from_quick_stop: bool = False
-    """Transition 16 at once, by a controlword that only repeats 'enable operation'."""
     deceleration_counts_s2: float | None = None
     """How it brakes, whatever its objects say."""
     concerns_poll: bool = False
@@ -58,6 +56,7 @@ class Faults:
     _held: list[Outgoing] = field(default_factory=list)
     _errors: list[tuple[int, bytes]] = field(default_factory=list)
     _lost_masters: list[int] = field(default_factory=list)
+    _missed_masters: list[int] = field(default_factory=list)
     _boot_ups: int = 0
     _departures: int = 0
     _openings: int = 0
@@ -70,6 +69,11 @@ class Faults:
     def lose_master(self, code: int) -> None:
         """At the next poll: react as 6007h says to the loss of the master, without a word of it."""
         self._lost_masters.append(code)
+        self.concerns_poll = True
+
+    def miss_master(self, code: int) -> None:
+        """At the next poll: the same, with the EMCY ``code`` (8130h or 8250h)."""
+        self._missed_masters.append(code)
         self.concerns_poll = True
 
     def boot_up(self) -> None:
@@ -95,6 +99,11 @@ class Faults:
     def take_lost_masters(self) -> list[int]:
         """For the node: with which codes to lose its master now."""
         codes, self._lost_masters = self._lost_masters, []
+        return codes
+
+    def take_missed_masters(self) -> list[int]:
+        """For the node: with which codes to miss its master now."""
+        codes, self._missed_masters = self._missed_masters, []
         return codes
 
     def take_boot_up(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from hdbridge.sim.behaviour import Behaviour, Controlword
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults
@@ -52,9 +53,17 @@ class Firmware:
     """One drive. ``state`` is its power state, ``motion`` where its axis is."""
 
     def __init__(
-        self, dictionary: Dictionary, machine: Machine, emergency: Emergency, faults: Faults | None = None
+        self,
+        dictionary: Dictionary,
+        machine: Machine,
+        emergency: Emergency,
+        faults: Faults | None = None,
+        behaviour: Behaviour | None = None,
     ) -> None:
         self._faults = faults or Faults()
+        behaviour = behaviour or Behaviour()
+        self._by_level = behaviour.controlword is Controlword.LEVEL
+        self._status_delay_s = behaviour.status_delay_ms / 1000.0
         self._dictionary = dictionary
         self._emergency = emergency
         self.motion = Motion(dictionary, machine)
@@ -81,6 +90,9 @@ class Firmware:
         self._following_error = False
         self._error_code = 0
         self._mode = self._modes[0]
+        self._old_status_s = 0.0
+        """Time for which 6041h and 6061h still show the values from before a command."""
+        self._old_statusword = self._old_mode = 0
         self.motion.limited = False
         self.motion.take_parameters()
         self.motion.take_actual_as_demand()
@@ -94,7 +106,7 @@ class Firmware:
         for key, read in {
             0x603F: lambda: self._error_code,
             0x6041: self.statusword,
-            0x6061: lambda: self._mode.number,
+            0x6061: lambda: self._old_mode if self._old_status_s > 0.0 else self._mode.number,
             0x6062: motion.demand_position,
             0x6063: lambda: wrap_int32(motion.motor_counts),
             0x6064: motion.actual_position,
@@ -124,6 +136,9 @@ class Firmware:
 
     def statusword(self) -> int:
         """Object 6041h now."""
+        return self._old_statusword if self._old_status_s > 0.0 else self._statusword()
+
+    def _statusword(self) -> int:
         word = self._state_bits
         machine = self.motion.machine
         if self.motion.limited or abs(machine.torque_permille) >= machine.torque_limit_permille > 0.0:
@@ -140,6 +155,13 @@ class Firmware:
             word |= _REACHED  # stopped, as demanded
         return word
 
+    def _delay_status(self) -> None:
+        """Keep showing the present status for a while: a command has come."""
+        if self._status_delay_s:
+            if self._old_status_s <= 0.0:
+                self._old_statusword, self._old_mode = self._statusword(), self._mode.number
+            self._old_status_s = self._status_delay_s
+
     def _check_mode(self, mode: int) -> None:
         if mode not in self._modes:
             raise SdoAbortError(Abort.RANGE)
@@ -151,6 +173,7 @@ class Firmware:
     def _change_mode(self, number: int) -> None:
         if self._mode.number == number:
             return
+        self._delay_status()
         self._mode = self._modes[number]
         if self.state is State.OPERATION_ENABLED and self._braking is None and self.motion.velocity_counts_s:
             self._brake(SLOW_DOWN_RAMP[0], None)
@@ -171,10 +194,11 @@ class Firmware:
         self._state_bits = state.value | _ALWAYS
 
     def control(self, word: int) -> None:
-        """Take a controlword. A word that only repeats the last one asks for nothing new."""
-        resumes = self._faults.resume_from_quick_stop and self.state is State.QUICK_STOP_ACTIVE
-        if word == self._word and not self._waits_for_rest and not resumes:
+        """Take a controlword. One that repeats the last asks for nothing new, unless levels are read."""
+        if word == self._word and not self._waits_for_rest and not self._by_level:
             return
+        if word != self._word:
+            self._delay_status()
         rising = word & ~self._word
         self._word = word
         self._waits_for_rest = False
@@ -228,7 +252,7 @@ class Firmware:
     def _leave_quick_stop(self) -> None:
         if self._dictionary.value(0x605A) < STAY_STOPPED:
             return
-        if self._braking is not None and not self._faults.resume_from_quick_stop:
+        if self._braking is not None and not self._by_level:
             self._waits_for_rest = True  # the same word counts once more when the axis stands
             return
         self._braking = None
@@ -327,6 +351,8 @@ class Firmware:
 
     def advance(self, period_s: float) -> None:
         """Run the axis for one period."""
+        if self._old_status_s > 0.0:
+            self._old_status_s -= period_s
         motion, braking = self.motion, self._braking
         if self.state not in POWERED:
             motion.coast(period_s)

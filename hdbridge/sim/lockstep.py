@@ -24,6 +24,7 @@ from can.interfaces.virtual import VirtualBus, channels_lock
 
 from hdbridge.canframe import DataFrame
 from hdbridge.errors import InputError
+from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
 from hdbridge.sim.nameplate import Nameplate
@@ -229,6 +230,7 @@ def lockstep_bench(
     channel: str | None = None,
     nameplate: Nameplate | None = None,
     others: Sequence[Node] = (),
+    behaviour: Behaviour | None = None,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
     """A simulated drive that moves ``machine``, and the master's bus and clock to it.
 
@@ -240,7 +242,7 @@ def lockstep_bench(
     channel = channel or f"hdbridge-{uuid4()}"
     clock = VirtualClock()
     with _unsearched(), _PolledBus(channel) as node_bus:
-        node = SimulatedDrive(node_bus, machine, eds_path, node_id, clock, nameplate)
+        node = SimulatedDrive(node_bus, machine, eds_path, node_id, clock, nameplate, behaviour)
         node.poll(clock.now())
         clock.nodes += [node, *others]
         with LockstepBus(channel, clock) as bus:
@@ -259,7 +261,9 @@ def simulated_bench(
     """The simulated axis of a truth file on a bench; the same truth and seed give the same frames."""
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
     machine = Machine(known, seed, may_compile=True)
-    with lockstep_bench(machine, eds_path, node_id, channel, nameplate_of(known)) as bench:
+    with lockstep_bench(
+        machine, eds_path, node_id, channel, nameplate_of(known), behaviour=known.firmware
+    ) as bench:
         yield bench
 
 
@@ -302,6 +306,7 @@ def simulated_benches(
                 axis.node_id,
                 clock,
                 nameplate_of(known, serial),
+                known.firmware,
             )
             node.poll(clock.now())
             clock.nodes.append(node)

@@ -2,6 +2,7 @@
 
 Upon SYNC the node first sends its synchronous TPDOs with the values of that moment, then applies the
 synchronous RPDOs that came since the last one, then runs its axis for exactly one period of object 60C2h.
+(Some drives apply RPDOs first: `Behaviour` has this and other choices of a firmware.)
 When SYNC stays away for one and a half periods, and before the first, the axis runs on the clock instead: a
 drive without a master stops by itself. Single-threaded: everything happens inside ``poll``.
 """
@@ -18,6 +19,7 @@ import can
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.errors import InputError
+from hdbridge.sim.behaviour import Behaviour, HeartbeatConsumer
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults, Outgoing
@@ -49,7 +51,7 @@ class SimulatedDrive:
     """A CiA-402 drive on ``bus``, moving ``machine``.
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
-    the time of start; ``nameplate`` distinguishes drives.
+    the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware.
     ``poll`` must be called when frames may have come and at ``next_event_s``.
     """
 
@@ -61,9 +63,11 @@ class SimulatedDrive:
         node_id: int,
         clock: Clock,
         nameplate: Nameplate | None = None,
+        behaviour: Behaviour | None = None,
     ) -> None:
         self.bus = bus
         self.node_id = node_id
+        self.behaviour = behaviour or Behaviour()
         self.faults = Faults()
         self.lost_frames = 0
         self.dictionary = Dictionary(Path(eds_path), node_id)
@@ -81,11 +85,12 @@ class SimulatedDrive:
         nameplate.engrave(self.dictionary)
         self.dictionary.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
-        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults)
+        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour)
         self._sdo = SdoServer(self.dictionary)
         numbers = range(1, PDO_COUNT + 1)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
-        self._rpdos = [ReceivePdo(self.dictionary, number, self._route) for number in numbers]
+        holds = self.behaviour.holds_rpdo
+        self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in numbers]
         entry = self.dictionary
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()
@@ -99,6 +104,7 @@ class SimulatedDrive:
         """Start from the dictionary as it stands; the boot-up message is still to come."""
         self.nmt = Nmt.INITIALISING
         self._sdo.reset()
+        self._sdo_from_s = self._now_s + self.behaviour.sdo_delay_s
         self._take_period()
         self._run_due_s = self._now_s + self._period_s
         for pdo in (*self._tpdos, *self._rpdos):
@@ -122,6 +128,7 @@ class SimulatedDrive:
         self._watched_s = (word & 0xFFFF) * 1e-3
         self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
         self._watch_due_s = _NEVER
+        self._watch_ended = False
 
     def _change_watch(self) -> None:
         self._watch_heartbeat()
@@ -216,6 +223,8 @@ class SimulatedDrive:
             self._send(can_id, data)
 
     def _on_sync(self, _: bytearray, now_s: float) -> None:
+        if self.behaviour.rpdo_before_tpdo:
+            self._apply_rpdos()
         tpdos: list[Outgoing] = []
         for tpdo in self._sync_tpdos:
             data = tpdo.on_sync()
@@ -225,13 +234,16 @@ class SimulatedDrive:
             tpdos = self.faults.spoil(tpdos)
         for can_id, data in tpdos:
             self._send(can_id, data)
+        self._apply_rpdos()
+        self._advance()
+        self._run_due_s = now_s + 1.5 * self._period_s
+        self._due_s = self._next_due_s()
+
+    def _apply_rpdos(self) -> None:
         for rpdo in self._sync_rpdos:
             if rpdo.pending is not None:
                 pending, rpdo.pending = rpdo.pending, None
                 rpdo.apply(pending)
-        self._advance()
-        self._run_due_s = now_s + 1.5 * self._period_s
-        self._due_s = self._next_due_s()
 
     def _on_rpdo(self, pdo: ReceivePdo, data: bytearray, now_s: float) -> None:
         if len(data) < pdo.length:
@@ -256,7 +268,9 @@ class SimulatedDrive:
         else:
             pdo.apply(data)
 
-    def _on_sdo_request(self, data: bytearray, _: float) -> None:
+    def _on_sdo_request(self, data: bytearray, now_s: float) -> None:
+        if now_s < self._sdo_from_s:
+            return
         if answer := self._sdo.respond(bytes(data)):
             self._send(0x580 + self.node_id, answer)
 
@@ -301,6 +315,8 @@ class SimulatedDrive:
         self._boot()
 
     def _on_watched_heartbeat(self, _: bytearray, now_s: float) -> None:
+        if self._watch_ended:
+            return
         self._watch_due_s = now_s + self._watched_s
         self.emergency.clear(ErrorCode.HEARTBEAT)
         self._due_s = self._next_due_s()
@@ -309,6 +325,9 @@ class SimulatedDrive:
         for code, additional in self.faults.take_errors():
             self.firmware.fault(code, additional)
         for code in self.faults.take_lost_masters():
+            self.firmware.connection_lost(code)
+        for code in self.faults.take_missed_masters():
+            self.emergency.occur(code)
             self.firmware.connection_lost(code)
         if self.faults.take_opening():
             self.firmware.power_cut()
@@ -361,6 +380,7 @@ class SimulatedDrive:
 
     def _lose_heartbeat(self) -> None:
         self._watch_due_s = _NEVER
+        self._watch_ended = self.behaviour.heartbeat_consumer is HeartbeatConsumer.STOPS
         if self.faults.ignore_lost_heartbeat:
             return
         self.emergency.occur(ErrorCode.HEARTBEAT)
@@ -377,7 +397,8 @@ class SimulatedDrive:
             if pdo.deadline_s <= now_s:
                 pdo.deadline_s = _NEVER
         self._rpdo_due_s = min((pdo.deadline_s for pdo in self._rpdo_by_id.values()), default=_NEVER)
-        if self.firmware.follows_the_bus and not self.faults.ignore_missing_set_points:
+        watches = self.behaviour.rpdo_timer and not self.faults.ignore_missing_set_points
+        if self.firmware.follows_the_bus and watches:
             self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
             self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
 

@@ -190,7 +190,11 @@ class ReceivePdo(Pdo):
     ``deadline_s`` is when the next one must have come (event timer), armed by the first that comes.
     """
 
-    def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, dictionary: Dictionary, number: int, changed: Callable[[], None], *, holds: bool = False
+    ) -> None:
+        """``holds``: data that waits for SYNC survives a change of the NMT state."""
+        self._holds = holds
         self._writers: tuple[Callable[[int], None], ...] = ()
         self.length = 0
         """Bytes that are mapped."""
@@ -204,11 +208,13 @@ class ReceivePdo(Pdo):
     def _link(self, entries: list[Entry]) -> None:
         self._writers = tuple(entry.writer() for entry in entries)
         self.length, self._unpack_from = self._codec.size, self._codec.unpack_from
+        self.pending = None  # of another mapping
         self.restart()
 
     def restart(self) -> None:
-        """Forget what came, and disarm the deadline."""
-        self.pending = None
+        """Disarm the deadline, and discard data that has not taken effect unless the drive holds it."""
+        if not self._holds:
+            self.pending = None
         self.deadline_s = float("inf")
 
     def apply(self, data: bytearray) -> None:

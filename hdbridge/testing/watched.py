@@ -99,7 +99,7 @@ class WatchedDrive(SimulatedDrive):
         """The data last sent, by identifier."""
         self._plans: list[_Plan] = []
         self._begin_s = clock.now()
-        super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate)
+        super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate, truth.firmware)
         self._last_state, self._last_nmt = self.firmware.state, self.nmt
 
     @property

@@ -66,7 +66,11 @@ class Case:
         nameplate = nameplate_of(truth if self.honest else Truth.from_text(plain))
         eds = ARTICLE.parents[1] / "eds" / "hdbridge-402.eds"
         machine = Machine(truth, 0, may_compile=True)
-        with lockstep_bench(machine, eds, self.node_id, nameplate=nameplate) as (bus, clock, node):
+        with lockstep_bench(machine, eds, self.node_id, nameplate=nameplate, behaviour=truth.firmware) as (
+            bus,
+            clock,
+            node,
+        ):
             self.node = node
             self.spoil(node)
             yield bus, clock

@@ -246,11 +246,14 @@ def test_a_drive_without_a_torque_limit(case: Callable[..., Any]) -> None:
     assert "the EDS lacks, so what the drive has holds: 6072h:00 (torque limit" in verdicts["files"].measured
 
 
+HOLDING = {"quick_stop_option: 2": "quick_stop_option: 6"}
+
+
 def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) -> None:
     def spoil(node: SimulatedDrive) -> None:
         node.faults.only_report_lost_heartbeat = True
 
-    verdict = case(spoil=spoil).run(until="heartbeat")["heartbeat"]
+    verdict = case(axis=HOLDING, spoil=spoil).run(until="heartbeat")["heartbeat"]
     assert verdict.outcome is FAIL
     assert "it sent EMCY 8130h (a heartbeat that the drive watches stayed away)" in verdict.measured
     assert "1016h" not in verdict.remedies[0]
@@ -261,10 +264,10 @@ def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) ->
 
 def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[..., Any]) -> None:
     def spoil(node: SimulatedDrive) -> None:
-        node.faults.resume_from_quick_stop = True
         node.faults.stay_operational = True
 
-    verdict = case(spoil=spoil).run(until="heartbeat")["heartbeat"]
+    level = {"servo:": "firmware: {controlword: level}\nservo:"}
+    verdict = case(axis=HOLDING, truth=level, spoil=spoil).run(until="heartbeat")["heartbeat"]
     assert verdict.outcome is PASS, verdict
     assert "(transition 16); it sent EMCY 8130h" in verdict.measured
 

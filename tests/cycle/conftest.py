@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
@@ -15,12 +15,16 @@ import pytest
 from hdbridge.axis import AxisConfig
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Link
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, simulated_bench
 from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+from tests.support.characters import FRIENDLY, Character
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STEP_COUNTS = 40
@@ -158,15 +162,25 @@ class Rig:
         assert abs(self.node.firmware.motion.machine.motor_counts - place) <= 2
         assert abs(place - self.target) < 8000
 
+    def next_program(self, cycles: int = 10) -> None:
+        """Another program begins on this bus, with a cycle of its own, and asks for no power."""
+        self.bus.recv_error = self.bus.send_error = self.bus.no_room_for = None
+        link = Link(self.bus, self.clock)
+        cycle = Cycle(link, self.clock, ProcessImage(self.drive.axis), Supervision(), self.period_s)
+        for _ in range(cycles):
+            with suppress(SafetyStop):
+                cycle.tick()
+
     def frames(self, can_id: int) -> list[tuple[float, bytes]]:
         return [(time_s, data) for time_s, sent, data in self.bus.sent if sent == can_id]
 
 
 @contextmanager
-def rig(profile: Path = PROFILE) -> Iterator[Rig]:
-    axis = AxisConfig.load(profile)
+def rig(profile: Path = PROFILE, character: Character = FRIENDLY) -> Iterator[Rig]:
+    axis = character.of_axis(AxisConfig.load(profile))
     channel = f"cycle-{uuid4()}"
-    with simulated_bench(profile / "truth.yaml", axis.eds_path, axis.drive.node_id, channel=channel) as (
+    truth = character.of_truth(Truth.load(profile))
+    with simulated_bench(truth, axis.eds_path, axis.drive.node_id, channel=channel) as (
         bus,
         clock,
         node,
@@ -190,9 +204,9 @@ def idle() -> Iterator[Rig]:
 
 
 @pytest.fixture
-def moving() -> Iterator[Rig]:
-    """Enabled and moving at constant speed."""
-    with rig() as made:
+def moving(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """Enabled and moving at constant speed; a test may ask for the drive's character."""
+    with rig(character=getattr(request, "param", FRIENDLY)) as made:
         made.enable()
         made.move(60)
         made.bus.sent.clear()

@@ -91,7 +91,14 @@ ROWS = {
     "short TPDO": Row(drive(shorten_tpdos=1), F.WRONG_LENGTH, R.FREEZE),
     "short TPDOs twice": Row(drive(shorten_tpdos=4), F.WRONG_LENGTH, R.QUICK_STOP, allowed=2),
     "doubled TPDO": Row(drive(duplicate_tpdos=2), F.DUPLICATE_TPDO, R.GO, allowed=2),
-    "stale TPDO": Row(frame(0x181, bytes(8)), F.DUPLICATE_TPDO, R.GO),
+    "stale TPDO": Row(frame(0x181, b"\x37\x16" + bytes(6)), F.DUPLICATE_TPDO, R.GO),
+    "left 'operation enabled' between two SYNCs": Row(
+        frame(0x181, b"\x07\x16" + bytes(6)), F.DROPPED_OUT, R.QUICK_STOP
+    ),
+    "drive missed the master's heartbeat": Row(
+        frame(0x081, b"\x30\x81\x11" + bytes(5)), F.MASTER_LOST, R.QUICK_STOP
+    ),
+    "drive missed set-points": Row(frame(0x081, b"\x50\x82\x11" + bytes(5)), F.MASTER_LOST, R.QUICK_STOP),
     "cable pulled": Row(drive(silent=True), F.LOST_TPDO, R.QUICK_STOP, allowed=2),
     "heartbeat lost": Row(drive(mute_heartbeat=True), F.HEARTBEAT_LOST, R.QUICK_STOP, allowed=26),
     "node restarts": Row(lambda pair: pair.nodes[0].faults.boot_up(), F.BOOT_UP, R.LATCH, allowed=2),
@@ -116,7 +123,7 @@ ROWS = {
     "babbling node": Row(frame(0x7E5, bytes(8), times=300), F.FLOOD, R.QUICK_STOP, BOTH, 2, again=True),
     "overrun": Row(lambda pair: pair.hang(0.007), F.OVERRUN, R.GO, BOTH),
     "overruns in a row": Row(lambda pair: pair.hang(0.007), F.OVERRUN, R.QUICK_STOP, BOTH, 2, again=True),
-    "hang": Row(lambda pair: pair.hang(0.4), F.HANG, R.GO, BOTH),
+    "hang": Row(lambda pair: pair.hang(0.4), F.HANG, R.QUICK_STOP, BOTH),
     "no room for SYNC": Row(interface(no_room_for=0x080), F.TRANSMIT_FULL, R.QUICK_STOP, BOTH),
     "no room for the first RPDO": Row(interface(no_room_for=0x201), F.TRANSMIT_FULL, R.QUICK_STOP, BOTH),
     "no room for the second RPDO": Row(interface(no_room_for=0x202), F.TRANSMIT_FULL, R.QUICK_STOP, BOTH),
@@ -158,7 +165,7 @@ def test_the_quick_stop_is_driven_and_confirmed_while_the_other_axis_moves(pair:
     assert not pair.axes[0].riding
     assert pair.axes[0].confirmed
     assert "did not confirm" not in str(pair.axes[0].stopped)
-    assert pair.axes[0].image.power.state is State.QUICK_STOP_ACTIVE
+    assert pair.axes[0].image.power.state is State.SWITCH_ON_DISABLED
 
 
 def test_a_stop_that_is_not_confirmed_says_so_and_delays_nobody_for_ever(pair: TwoAxes) -> None:
@@ -235,12 +242,13 @@ def test_after_the_interface_was_opened_anew_verified_axes_move_again(pair: TwoA
     sent = len(pair.bus.sent)
     pair.turn(10)
     assert pair.cycle.down is None
-    assert {can_id for _, can_id, _ in pair.bus.sent[sent:]} == {0x080, 0x77F}
+    frames = [(can_id, data) for _, can_id, data in pair.bus.sent[sent:]]
+    assert frames[:3] == [(0x000, b"\x80\x01"), (0x000, b"\x80\x02"), (0x080, b"")], "pre-operational first"
+    assert {can_id for can_id, _ in frames[3:]} == {0x080, 0x77F}
     for place in (0, 1):
         pair.drives[place].boot()
         pair.drives[place].enable()
         pair.axes[place].reset(verified=True)
-    pair.cycle.restart()
     pair.enable(0)
     pair.enable(1)
     assert pair.follows(0)

@@ -92,7 +92,7 @@ def test_the_first_cycle_after_a_rest_sends_the_heartbeat(idle) -> None:
     idle.cycle.restart()
     idle.bus.sent.clear()
     idle.cycle.tick()
-    assert [can_id for _, can_id, _ in idle.bus.sent] == [0x080, 0x201, 0x77F]
+    assert [can_id for _, can_id, _ in idle.bus.sent] == [0x201, 0x080, 0x201, 0x77F]
 
 
 def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:

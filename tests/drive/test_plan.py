@@ -23,7 +23,7 @@ def test_values_come_from_the_axis_file(axis: AxisConfig) -> None:
     written = values(axis)
     assert written[1, 0x60C2, 1] == 4
     assert written[1, 0x60C2, 2] == -3
-    assert written[1, 0x605A, 0] == 6
+    assert written[1, 0x605A, 0] == 2
     assert written[1, 0x605D, 0] == 1
     assert written[1, 0x6065, 0] == round(5.0 * 8000 / 360)
     assert written[1, 0x6066, 0] == 20
@@ -102,7 +102,7 @@ def test_a_separate_encoder_gets_its_pdo_and_heartbeat(build_axis: Callable[...,
 
 def test_a_row_reads_like_a_sentence(axis: AxisConfig) -> None:
     rows = [str(row) for row in plan(axis)]
-    assert "605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]" in rows
+    assert "605Ah:00 = 2 (2h): what a quick stop does [drive.quick_stop_option]" in rows
     assert all(row.why for row in plan(axis))
 
 

@@ -117,9 +117,6 @@ def test_csp_by_pdo(drive: Drive, bench: tuple[can.BusABC, Any]) -> None:
     assert image.load_counts == pytest.approx((here + 1000) * 7.2, abs=400)
     image.power.quick_stop()
     exchange(here + 1000, cycles=30)
-    assert image.power.state is State.QUICK_STOP_ACTIVE
-    image.power.go(State.SWITCH_ON_DISABLED)
-    exchange(cycles=5)
     assert image.power.state is State.SWITCH_ON_DISABLED
     assert drive.monitor.nodes[1].emergency_count == 0
 

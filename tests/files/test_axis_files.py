@@ -51,7 +51,7 @@ def load(folder: Path, text: str) -> AxisConfig:
 def test_a_good_file_gives_nested_values_and_defaults(folder):
     axis = load(folder, GOOD)
     assert (axis.name, axis.drive.cycle_s, axis.drive.interpolation_period) == ("test", 0.004, (4, -3))
-    assert (axis.drive.heartbeat_ms, axis.drive.master_node_id, axis.drive.quick_stop_option) == (50, 127, 6)
+    assert (axis.drive.heartbeat_ms, axis.drive.master_node_id, axis.drive.quick_stop_option) == (50, 127, 2)
     assert (axis.load_encoder.source.index, axis.load_encoder.source.wraps_at_counts) == (0x60E4, 2**32)
     assert (axis.realtime.priority, axis.realtime.cpus) == (50, ())
     assert (axis.compensation.maximum_arcsec, axis.compensation.slew_arcsec_s, axis.compensation.ramp_s) == (

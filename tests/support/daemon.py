@@ -31,6 +31,8 @@ from hdbridge.drive.objects import Mode
 from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+from support.characters import FRIENDLY, Character
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 EVENTS_KEPT = 1000
@@ -268,13 +270,15 @@ def stepped_daemon(
     model: TransmissionModel | None = None,
     setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
     truth: Path = PROFILE / "truth.yaml",
+    character: Character = FRIENDLY,
 ) -> Iterator[SteppedDaemon]:
     """A control loop with simulated axes, none verified yet; with the article's model by default."""
-    configs = article_axes(axes) if isinstance(axes, int) else axes
+    configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
+    plant = character.of_truth(Truth.load(truth))
     known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")
     channel = f"daemon-{uuid4()}"
     simulated = [
-        SimulatedAxis(truth, each.eds_path, each.drive.node_id, seed) for seed, each in enumerate(configs)
+        SimulatedAxis(plant, each.eds_path, each.drive.node_id, seed) for seed, each in enumerate(configs)
     ]
     with ExitStack() as stack:
         bus, clock, nodes = stack.enter_context(simulated_benches(simulated, channel))

@@ -20,7 +20,9 @@ from typing import Any, Final, Protocol
 
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
+from hdbridge.sim.behaviour import Controlword
 from hdbridge.sim.node import SimulatedDrive
+from tests.support.characters import FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
 """Environment variable: the file to which a line of JSON is added for each row that was tried."""
@@ -77,6 +79,16 @@ class Row:
     everybody: bool = False
     """It concerns every axis of the bus, not one."""
 
+    def unseen_on(self, character: Character) -> bool:
+        """Whether a drive of this character shows nothing of the fault.
+
+        One that stops without an EMCY, and resumes at SYNC before it takes the values of its TPDOs, shows
+        nothing. An option 605Ah below 5 rules that out.
+        """
+        behaviour = character.behaviour
+        resumes = behaviour.controlword is Controlword.LEVEL and character.quick_stop_option >= 5
+        return self.fault is Fault.DROPPED_OUT and resumes and behaviour.rpdo_before_tpdo
+
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
         """The same in cycles of an axis."""
         if isinstance(self.allowed, int):
@@ -90,6 +102,11 @@ def _drive(**wishes: Any) -> Wish:
             setattr(bench.node.faults, name, value)
 
     return make
+
+
+def _stale(bench: Bench) -> None:
+    """The TPDO of the last SYNC comes once more."""
+    bench.interfere(0x181, bench.node._tpdos[0].pack())
 
 
 def _frame(can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> Wish:
@@ -106,6 +123,20 @@ def _glitch(bench: Bench, counts: int) -> None:
     bench.node.faults.load_reading = lambda right: right + (jumps.pop() if jumps else 0)
 
 
+def _miss(code: int) -> Wish:
+    """The drive stops because it missed its master, and says so."""
+
+    def make(bench: Bench) -> None:
+        bench.node.faults.miss_master(code)
+
+    return make
+
+
+def patience_s(bench: Bench) -> float:
+    """How long the drive waits for set-points: four cycles, at least 10 ms."""
+    return max(4.0 * bench.period_s, 0.01)
+
+
 _F, _R = Fault, Reaction
 _EMCY = struct.pack("<HB5x", 0x3110, 1)
 ROWS: Final = (
@@ -118,7 +149,7 @@ ROWS: Final = (
     Row("a remote frame", _frame(0x181, is_remote_frame=True), _F.DISCARDED_FRAME, _R.GO, 1),
     Row("a 29-bit identifier", _frame(0x181, bytes(8), is_extended_id=True), _F.DISCARDED_FRAME, _R.GO, 1,
         places=(VIRTUAL, DAEMON)),
-    Row("a stale TPDO before SYNC", _frame(0x181, bytes(8)), _F.DUPLICATE_TPDO, _R.GO, 1),
+    Row("a stale TPDO before SYNC", _stale, _F.DUPLICATE_TPDO, _R.GO, 1),
     Row("the drive falls silent (cable pulled)", _drive(silent=True), _F.LOST_TPDO, _R.QUICK_STOP, 2),
     Row("the drive's heartbeat stays away", _drive(mute_heartbeat=True), _F.HEARTBEAT_LOST, _R.QUICK_STOP,
         "heartbeats"),
@@ -127,8 +158,12 @@ ROWS: Final = (
     Row("32 emergency messages", _frame(0x081, _EMCY, 32), _F.EMERGENCY, _R.GO, 1),
     Row("the drive goes into fault (3210h)", lambda bench: bench.node.faults.raise_error(0x3210),
         _F.DRIVE_FAULT, _R.QUICK_STOP, 2),
-    Row("the drive drops out by itself", lambda bench: bench.node.faults.lose_master(0x8130),
+    Row("the drive drops out on its own", lambda bench: bench.node.faults.lose_master(0x8130),
         _F.DROPPED_OUT, _R.QUICK_STOP, 2),
+    Row("the drive has dropped out between two SYNCs", _frame(0x181, b"\x07\x16" + bytes(6)),
+        _F.DROPPED_OUT, _R.QUICK_STOP, 1),
+    Row("the drive misses the master's heartbeat (8130h)", _miss(0x8130), _F.MASTER_LOST, _R.QUICK_STOP, 1),
+    Row("the drive misses set-points (8250h)", _miss(0x8250), _F.MASTER_LOST, _R.QUICK_STOP, 1),
     Row("the load encoder jumps and stays away", _drive(load_jump_counts=100_000), _F.ENCODER_JUMP,
         _R.QUICK_STOP, 3),
     Row("the load encoder jumps for one sample", lambda bench: _glitch(bench, 100_000), _F.ENCODER_JUMP,
@@ -146,7 +181,10 @@ ROWS: Final = (
         _R.GO, 1),
     Row("two cycles in a row start late", lambda bench: bench.hang(1.7 * bench.period_s), _F.OVERRUN,
         _R.QUICK_STOP, 2, again=True, everybody=True),
-    Row("the master's process hangs for 0.5 s", lambda bench: bench.hang(0.5), _F.HANG, _R.GO, 1,
+    Row("the master's process stalls for as long as the drive waits, and a period",
+        lambda bench: bench.hang(patience_s(bench) + bench.period_s), _F.HANG, _R.QUICK_STOP, 1,
+        everybody=True),
+    Row("the master's process hangs for 0.5 s", lambda bench: bench.hang(0.5), _F.HANG, _R.QUICK_STOP, 1,
         everybody=True),
     Row("a target that is not a number", lambda bench: bench.bad_target(math.nan), _F.BAD_TARGET,
         _R.QUICK_STOP, 1),
@@ -215,6 +253,7 @@ class Seen:
     taken: float
     """Cycles."""
     allowed: float
+    character: str = FRIENDLY.name
 
 
 def read_record(path: Path) -> list[Seen]:
@@ -227,7 +266,9 @@ def rows_of(place: str) -> list[Row]:
     return [row for row in ROWS if place in row.places]
 
 
-def try_out(row: Row, bench: Bench, place: str, heartbeat_timeout_s: float) -> Seen:
+def try_out(
+    row: Row, bench: Bench, place: str, heartbeat_timeout_s: float, character: Character = FRIENDLY
+) -> Seen:
     """Make the fault on an axis under way; AssertionError where its reaction does not come in time."""
     allowed = row.allowed_cycles(heartbeat_timeout_s, bench.period_s)
     bench.supervision.events.clear()
@@ -250,8 +291,8 @@ def try_out(row: Row, bench: Bench, place: str, heartbeat_timeout_s: float) -> S
         ]
     assert hits[0].reaction is row.reaction
     latched = bench.supervision.stop
-    assert (latched is not None) == (row.reaction >= Reaction.QUICK_STOP or row.fault is Fault.HANG)
-    seen = Seen(place, row.name, _words(bench.supervision, hits[0]), cycles, allowed)
+    assert (latched is not None) == (row.reaction >= Reaction.QUICK_STOP)
+    seen = Seen(place, row.name, _words(bench.supervision, hits[0]), cycles, allowed, character.name)
     record(seen)
     return seen
 

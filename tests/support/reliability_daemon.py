@@ -18,6 +18,7 @@ from hdbridge.drive.supervision import Reaction
 from hdbridge.effects import Moment
 from hdbridge.errors import RefusedError
 from hdbridge.units import DEG_PER_TURN
+from support.characters import FRIENDLY, Character
 from support.service import Service, play, stepped_service, until
 
 FAR_DEG = 390.0
@@ -180,7 +181,7 @@ def _wrong_once(config: AxisConfig, made: AxisSetup) -> AxisSetup:
 
 
 @contextmanager
-def daemon_bench(folder: Path) -> Iterator[DaemonBench]:
+def daemon_bench(folder: Path, character: Character = FRIENDLY) -> Iterator[DaemonBench]:
     """Two axes, at rest and not verified."""
-    with stepped_service(folder, axes=2, setup=_wrong_once) as service:
+    with stepped_service(folder, axes=2, setup=_wrong_once, character=character) as service:
         yield DaemonBench(service)

@@ -20,6 +20,7 @@ from hdbridge.daemon.service.jobwork import run
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.files.profile import Profile
 from hdbridge.model import TransmissionModel
+from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
 
 Params = ParamSpec("Params")
@@ -115,11 +116,17 @@ async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: floa
 
 
 @contextmanager
-def stepped_service(folder: Path, axes: int = 1, lease_s: float = 10.0, **options: Any) -> Iterator[Service]:
+def stepped_service(
+    folder: Path,
+    axes: int = 1,
+    lease_s: float = 10.0,
+    character: Character = FRIENDLY,
+    **options: Any,
+) -> Iterator[Service]:
     """A control loop with simulated drives, nothing verified yet, and the machine that it is."""
     files = article_profiles(folder, axes)
-    configs = [AxisConfig.load(each.axis) for each in files]
-    with stepped_daemon(configs, **options) as daemon:
+    configs = [character.of_axis(AxisConfig.load(each.axis)) for each in files]
+    with stepped_daemon(configs, character=character, **options) as daemon:
         machine = replace(
             Machine.of_profile(str(files[0].folder)),
             axes=tuple(Axis(config, profile) for config, profile in zip(configs, files, strict=True)),

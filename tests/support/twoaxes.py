@@ -159,13 +159,14 @@ def two_axes(
         intruder = can.Bus(interface="virtual", channel=channel, ignore_config=True)
         with intruder, bus:
             drives = tuple(Drive(bus, axis, clock) for axis in configs)
+            cycle = BusCycle(Link(bus, clock), clock, configs[0].drive.cycle_s, bitrate_bps=bitrate_bps)
+            axes = tuple(AxisCycle(drive.image, Supervision(), monitor=drive.monitor) for drive in drives)
+            for axis in axes:
+                cycle.join(axis)
+            cycle.exchange()  # as in the daemon, the loop runs before the drives are booted
             for place in boot:
                 drives[place].boot()
             for place in boot:
                 drives[place].enable()
                 drives[place].image.power.go(State.SWITCH_ON_DISABLED)
-            cycle = BusCycle(Link(bus, clock), clock, configs[0].drive.cycle_s, bitrate_bps=bitrate_bps)
-            axes = tuple(AxisCycle(drive.image, Supervision(), monitor=drive.monitor) for drive in drives)
-            for axis in axes:
-                cycle.join(axis)
             yield TwoAxes(bus, clock, nodes, cycle, axes, drives, intruder)

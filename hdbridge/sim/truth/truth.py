@@ -14,6 +14,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from hdbridge.files.yamlfile import document_from_text, read_yaml, wrong
+from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.truth.gear import TrueGear
 from hdbridge.sim.truth.load import TrueLoad
 from hdbridge.sim.truth.motor import TrueMotor, TrueServo
@@ -71,6 +72,7 @@ class Truth(Part):
     gear: TrueGear = Field(description="the harmonic gear")
     load_: TrueLoad = Field(alias="load", description="load and load encoder")
     temperature: TrueTemperature = Field(default_factory=TrueTemperature, description="heat")
+    firmware: Behaviour = Field(default_factory=Behaviour, description="choices of the drive's firmware")
     intervals: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="95 % intervals of the values that were fitted, by their place"
     )

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
+from support.characters import FRIENDLY, Character
 from support.daemon import SteppedDaemon, stepped_daemon
 from support.reliability_daemon import DaemonBench, daemon_bench
 
@@ -37,22 +38,27 @@ def pair() -> Iterator[SteppedDaemon]:
 
 
 @pytest.fixture(scope="module")
-def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], DaemonBench]]:
-    """Gives the bench of the test before, as a daemon goes on after a fault; a new one where that failed."""
+def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Character], DaemonBench]]:
+    """Gives the bench of the test before, as a daemon continues after a fault; a new one if that failed."""
     with ExitStack() as stack:
-        made: list[DaemonBench] = []
+        made: dict[Character, DaemonBench] = {}
 
-        def bench() -> DaemonBench:
-            if not made or any(state is not AxisState.ENABLED for state in made[-1].states):
-                made.append(stack.enter_context(daemon_bench(tmp_path_factory.mktemp("machine"))))
-            return made[-1]
+        def bench(character: Character) -> DaemonBench:
+            known = made.get(character)
+            if known is None or any(state is not AxisState.ENABLED for state in known.states):
+                folder = tmp_path_factory.mktemp("machine")
+                made[character] = stack.enter_context(daemon_bench(folder, character))
+            return made[character]
 
         yield bench
 
 
 @pytest.fixture
-def moving(benches: Callable[[], DaemonBench]) -> DaemonBench:
-    """Two axes of a daemon with a service, at constant speed. To be left enabled."""
-    made = benches()
+def moving(benches: Callable[[Character], DaemonBench], request: pytest.FixtureRequest) -> DaemonBench:
+    """Two axes of a daemon with a service, at constant speed; a test may ask for the drives' character.
+
+    To be left enabled.
+    """
+    made = benches(getattr(request, "param", FRIENDLY))
     made.set_off()
     return made

@@ -258,7 +258,7 @@ def test_a_lent_axis_is_quick_stopped_by_the_loop(daemon: SteppedDaemon) -> None
     daemon.done(K.QUICK_STOP)
     assert daemon.states == [S.QUICK_STOPPED]
     daemon.run(0.5)
-    assert daemon.axes[0].image.power.state is State.QUICK_STOP_ACTIVE
+    assert daemon.axes[0].image.power.state is State.SWITCH_ON_DISABLED
 
 
 def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:

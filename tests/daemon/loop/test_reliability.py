@@ -3,20 +3,39 @@
 from __future__ import annotations
 
 import pytest
+from support.characters import CHARACTERS, Character, PowerCount, every_character
 from support.reliability import DAEMON, Row, rows_of, try_out
 from support.reliability_daemon import STATES, DaemonBench
 
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import EventKind
-from hdbridge.drive.supervision import Fault, Reaction
+from hdbridge.drive.supervision import Reaction
 
 
 @pytest.mark.parametrize("row", rows_of(DAEMON), ids=lambda row: row.name)
-def test_a_fault_has_its_reaction_in_time_and_is_latched(moving: DaemonBench, row: Row) -> None:
-    bench = moving
-    try_out(row, bench, DAEMON, bench.daemon.axes[0].image.heartbeat_timeout_s)
-    stops = row.reaction >= Reaction.QUICK_STOP or row.fault is Fault.HANG
+@pytest.mark.parametrize("moving", CHARACTERS, ids=str, indirect=True)
+def test_a_fault_has_its_reaction_in_time_and_is_latched(
+    moving: DaemonBench, row: Row, request: pytest.FixtureRequest
+) -> None:
+    check(moving, row, request.node.callspec.params["moving"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", rows_of(DAEMON), ids=lambda row: row.name)
+@pytest.mark.parametrize("moving", every_character(), ids=str, indirect=True)
+def test_a_fault_has_its_reaction_on_every_drive(
+    moving: DaemonBench, row: Row, request: pytest.FixtureRequest
+) -> None:
+    check(moving, row, request.node.callspec.params["moving"])
+
+
+def check(bench: DaemonBench, row: Row, character: Character) -> None:
+    if row.unseen_on(character):
+        pytest.skip("nothing that this drive sends shows it")
+    counts = [PowerCount(node) for node in bench.daemon.nodes]
+    try_out(row, bench, DAEMON, bench.daemon.axes[0].image.heartbeat_timeout_s, character)
+    stops = row.reaction >= Reaction.QUICK_STOP
     concerned = ((0, 1) if row.everybody else (0,)) if stops else ()
     for axis in range(2):
         if axis not in concerned:
@@ -24,9 +43,10 @@ def test_a_fault_has_its_reaction_in_time_and_is_latched(moving: DaemonBench, ro
             continue
         assert bench.states[axis] is STATES[bench.daemon.axes[axis].supervision.reaction]
         bench.stays_stopped(axis)
-        (told,) = bench.daemon.told(EventKind.STOPPED, axis)
-        assert told.code == FAULT_INDEX[row.fault]
-        assert row.fault.value in told.text
+        (stopped,) = bench.daemon.told(EventKind.STOPPED, axis)
+        assert stopped.code == FAULT_INDEX[row.fault]
+        assert row.fault.value in stopped.text
     bench.mend()
+    assert [each.times for each in counts] == [0, 0], "power without a request"
     bench.leads_back()
     assert all(state is AxisState.ENABLED for state in bench.states)

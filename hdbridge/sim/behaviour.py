@@ -1,0 +1,53 @@
+"""Choices that CiA 301 and CiA 402 leave to a drive's firmware, and that real drives make differently."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from pydantic import Field
+
+from hdbridge.strictness import Strict
+
+
+class Controlword(Enum):
+    """How the drive reads a controlword that only repeats the last one."""
+
+    EDGE = "edge"
+    """It asks for nothing new."""
+    LEVEL = "level"
+    """It is evaluated again: a repeated 000Fh in *quick stop active* is transition 16."""
+
+
+class HeartbeatConsumer(Enum):
+    """Supervision of the master's heartbeat (1016h) after one was lost."""
+
+    RESTARTS = "restarts"
+    """It starts again with the next heartbeat."""
+    STOPS = "stops"
+    """It stays off until 1016h is written or the node is reset."""
+
+
+class Behaviour(Strict):
+    """Firmware behaviour of the simulated drive. The defaults are the friendliest drive."""
+
+    controlword: Controlword = Field(
+        Controlword.EDGE, description="`edge`: a repeated controlword is ignored; `level`: it acts again"
+    )
+    holds_rpdo: bool = Field(
+        False,
+        description="a received synchronous RPDO survives NMT commands, and takes effect at the next SYNC",
+    )
+    rpdo_before_tpdo: bool = Field(
+        False, description="at SYNC, RPDOs take effect before the values of the TPDOs are taken"
+    )
+    rpdo_timer: bool = Field(True, description="missing RPDOs stop the axis after the time in 1400h:05")
+    heartbeat_consumer: HeartbeatConsumer = Field(
+        HeartbeatConsumer.RESTARTS,
+        description="after a lost heartbeat, 1016h `restarts` with the next one, or `stops`",
+    )
+    status_delay_ms: float = Field(
+        0.0, ge=0, le=1_000, description="after a command, 6041h and 6061h keep their old values this long"
+    )
+    sdo_delay_s: float = Field(
+        0.0, ge=0, le=60, description="time from the boot-up message to the first answered SDO request"
+    )

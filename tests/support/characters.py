@@ -1,0 +1,76 @@
+"""Drives that all keep to CiA 402 and behave differently where it leaves the choice to the firmware."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Final
+
+from hdbridge.axis import AxisConfig
+from hdbridge.sim.behaviour import Behaviour, Controlword, HeartbeatConsumer
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+
+
+@dataclass(frozen=True)
+class Character:
+    """A firmware, and what a quick stop ends in."""
+
+    name: str
+    behaviour: Behaviour = Behaviour()
+    quick_stop_option: int = 2
+
+    def of_axis(self, axis: AxisConfig) -> AxisConfig:
+        drive = axis.drive.model_copy(update={"quick_stop_option": self.quick_stop_option})
+        return axis.model_copy(update={"drive": drive})
+
+    def of_truth(self, truth: Truth) -> Truth:
+        return truth.model_copy(update={"firmware": self.behaviour})
+
+    def __str__(self) -> str:
+        return self.name
+
+
+_RESTLESS: Final = {"controlword": Controlword.LEVEL, "holds_rpdo": True, "rpdo_before_tpdo": True}
+_SLUGGISH: Final = {
+    "status_delay_ms": 50.0,
+    "sdo_delay_s": 0.1,
+    "rpdo_timer": False,
+    "heartbeat_consumer": HeartbeatConsumer.STOPS,
+}
+FRIENDLY: Final = Character("friendly")
+RESTLESS: Final = Character("restless", Behaviour(**_RESTLESS), 6)
+"""It resumes whenever it can."""
+SLUGGISH: Final = Character("sluggish", Behaviour(**_SLUGGISH), 6)
+"""It shows late what it does."""
+AWKWARD: Final = Character("awkward", Behaviour(**_RESTLESS, **_SLUGGISH), 2)
+CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD)
+
+
+def every_character() -> list[Character]:
+    """All combinations of all choices."""
+    return list(_every_character())
+
+
+def _every_character() -> Iterator[Character]:
+    choices = {**_RESTLESS, **_SLUGGISH}
+    for option in (2, 6):
+        for taken in product((False, True), repeat=len(choices)):
+            behaviour = dict(pair for pair, take in zip(choices.items(), taken, strict=True) if take)
+            yield Character(", ".join((*behaviour, f"605Ah {option}")), Behaviour(**behaviour), option)
+
+
+class PowerCount:
+    """Counts how often a drive enters 'operation enabled'."""
+
+    def __init__(self, node: SimulatedDrive) -> None:
+        self.times = 0
+        firmware = node.firmware
+        operate = firmware._operate
+
+        def counted() -> None:
+            self.times += 1
+            operate()
+
+        firmware._operate = counted  # type: ignore[method-assign]
