@@ -7,9 +7,10 @@ too long ends with a quick stop.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
@@ -31,6 +32,9 @@ ACKNOWLEDGED: Final = 0x1000
 """PP: set-point acknowledged; HM: homing attained."""
 FAILED: Final = 0x2000
 """PP: following error; HM: homing error."""
+HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
+STALE_READINGS: Final = 50
+"""Readings of the statusword, `POLL_S` apart at least, after which bits from before a command have gone."""
 _TIME_MARGIN: Final = 1.5
 _TIME_EXTRA_S: Final = 2.0
 
@@ -144,25 +148,15 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
         sdo.store(objects.PROFILE_DECELERATION, motor_rate(axis, move.acceleration_deg_s2))
         sdo.store(objects.TARGET_POSITION, move.target_counts)
         commander.control(ENABLED)
+        doing = f"moving to {move.load_deg:g} deg"
+        _wait(commander, doing, "room for a set-point", _has_room, STEP_TIMEOUT_S)
+        before = commander.statusword()
         commander.control(ENABLED | NEW_SET_POINT | CHANGE_AT_ONCE)
-        commander.wait_for(
-            "the acknowledgement of a set-point", lambda word: bool(word & ACKNOWLEDGED), STEP_TIMEOUT_S
-        )
+        _wait(commander, doing, "the acknowledgement of a set-point", _acknowledged, STEP_TIMEOUT_S)
         commander.control(ENABLED | CHANGE_AT_ONCE)
-        commander.wait_for(
-            "room for the next set-point", lambda word: not word & ACKNOWLEDGED, STEP_TIMEOUT_S
-        )
-        word = commander.wait_for(
-            f"arrival at {move.load_deg:g} deg",
-            lambda word: bool(word & (TARGET_REACHED | FAILED)) or _dropped_out(word),
-            timeout_s,
-        )
-        if _dropped_out(word):
-            raise DriveError(
-                f"{commander.name}: left 'operation enabled' moving to {move.load_deg:g} deg and is in "
-                f"'{decode(word).value}'; look at its error display"
-            )
-        if word & FAILED:
+        _wait(commander, doing, "room for the next set-point", _has_room, STEP_TIMEOUT_S)
+        what = f"arrival at {move.load_deg:g} deg"
+        if _end(commander, doing, what, before, TARGET_REACHED, timeout_s) & FAILED:
             raise DriveError(
                 f"{commander.name}: following error moving to {move.load_deg:g} deg; check that the axis "
                 "moves freely, or lower the acceleration"
@@ -184,18 +178,14 @@ def run_homing(commander: Commander, homing: Homing) -> None:
         sdo.store(objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
         sdo.store(objects.HOME_OFFSET, offset)
         commander.control(ENABLED)
+        before = commander.statusword()
         commander.control(ENABLED | START_HOMING)
-        done = ACKNOWLEDGED | TARGET_REACHED
-        word = commander.wait_for(
-            f"the end of homing by method {homing.method}",
-            lambda word: word & done == done or bool(word & FAILED) or _dropped_out(word),
-            homing.timeout_s,
-        )
-        if word & FAILED or _dropped_out(word):
+        doing = f"homing by method {homing.method}"
+        word = _end(commander, doing, f"the end of {doing}", before, HOMED, homing.timeout_s)
+        if word & FAILED:
             raise DriveError(
-                f"{commander.name}: homing by method {homing.method} failed (statusword {word:04X}h); "
-                "check the "
-                "home and limit switches and that the method suits them"
+                f"{commander.name}: {doing} failed (statusword {word:04X}h); check the home and limit "
+                "switches and that the method suits them"
             )
         commander.control(ENABLED)
 
@@ -205,6 +195,46 @@ def halt(commander: Commander) -> bool:
     commander.image.halt = True
     commander.control(ENABLED | HALT_BIT)
     return commander.wait_for_standstill()
+
+
+def _wait(commander: Commander, doing: str, what: str, done: Callable[[int], bool], timeout_s: float) -> int:
+    """Waits for a statusword; `DriveError` if the drive leaves 'operation enabled' before.
+
+    It must not be sent another *enable operation* then: that could set it in motion again.
+    """
+    word = commander.wait_for(what, lambda word: done(word) or _dropped_out(word), timeout_s)
+    if _dropped_out(word):
+        raise DriveError(
+            f"{commander.name}: left 'operation enabled' {doing} and is in '{decode(word).value}'; look at "
+            "its error display"
+        )
+    return word
+
+
+def _end(commander: Commander, doing: str, what: str, before: int, bits: int, timeout_s: float) -> int:
+    """Waits for the end of an action, which shows in ``bits``, all set, or in `FAILED`.
+
+    ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
+    drive has to clear those bits first. Some drives take 50 ms for that; an action that is over at once
+    never shows them cleared. So after `STALE_READINGS` readings they count as the answer.
+    """
+
+    def over(word: int) -> bool:
+        return word & bits == bits or bool(word & FAILED)
+
+    if over(before):
+        readings = count(1)
+        cleared = lambda word: not over(word) or next(readings) >= STALE_READINGS  # noqa: E731
+        _wait(commander, doing, f"the start of {doing}", cleared, timeout_s)
+    return _wait(commander, doing, what, over, timeout_s)
+
+
+def _acknowledged(statusword: int) -> bool:
+    return bool(statusword & ACKNOWLEDGED)
+
+
+def _has_room(statusword: int) -> bool:
+    return not statusword & ACKNOWLEDGED
 
 
 def _dropped_out(statusword: int) -> bool:

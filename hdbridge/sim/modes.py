@@ -6,6 +6,7 @@ firmware's.
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Final
 
 from hdbridge.sim.dictionary import Abort, SdoAbortError
@@ -13,8 +14,10 @@ from hdbridge.sim.motion import Motion, wrap_int32
 from hdbridge.sim.powerstate import Control, Status
 from hdbridge.sim.profile import Profile, move
 
-HOMING_METHODS: Final = (35, 37)
-"""Take the present position as home; 35 is the old number of 37."""
+INDEX_PULSE: Final = {33: -1, 34: 1}
+"""Methods that move to the next index pulse, and in which direction."""
+HOMING_METHODS: Final = (*INDEX_PULSE, 35, 37)
+"""35 is the old number of 37."""
 
 _NEW: Final = int(Control.NEW_SET_POINT)
 _IMMEDIATELY: Final = int(Control.CHANGE_IMMEDIATELY)
@@ -174,7 +177,10 @@ class ProfilePosition(Mode):
 
 
 class Homing(Mode):
-    """HM: methods 35 and 37, which declare the present position to be 607Ch and move nothing."""
+    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 take the present position.
+
+    Where the axis then is becomes 607Ch. The index pulse comes once per motor turn.
+    """
 
     number = 6
 
@@ -187,21 +193,53 @@ class Homing(Mode):
     def enter(self) -> None:
         self._attained = False
         self._failed = False
+        self._profile: Profile | None = None
+        self._elapsed_s = 0.0
 
     def control(self, word: int, rising: int) -> None:
+        if not word & _NEW:
+            self._profile = None  # withdrawing the start bit breaks homing off
         if not rising & _NEW:
             return
-        motion = self.motion
+        motion, value = self.motion, self.motion.dictionary.value
         moved_per_ms = abs(motion.machine.velocity_counts_s) * 1e-3
         self._failed = moved_per_ms > 1.0 or motion.velocity_counts_s != 0.0
-        self._attained = not self._failed
-        if self._attained:
-            home = motion.dictionary.value(0x607C)
-            motion.home_counts = home - motion.sign * motion.motor_counts
-            motion.preload_target()
-            self.referenced = True
+        self._attained = False
+        if self._failed:
+            return
+        method = value(0x6098)
+        if method not in INDEX_PULSE:
+            self._attain(motion.motor_counts)
+            return
+        turn = value(0x608F, 1)
+        here = motion.demand_counts / turn
+        index = math.ceil(here) - 1 if INDEX_PULSE[method] * motion.sign < 0 else math.floor(here) + 1
+        self._elapsed_s = 0.0
+        acceleration = value(0x609A)
+        self._profile = move(
+            motion.demand_counts, 0.0, float(index * turn), value(0x6099, 2), acceleration, acceleration
+        )
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        if self._profile is None:
+            return self.motion.demand_counts, 0.0
+        self._elapsed_s += period_s
+        demand, velocity = self._profile.at(self._elapsed_s)
+        if self._elapsed_s >= self._profile.duration_s:
+            self._profile = None
+            self._attain(round(demand))
+        return demand, velocity
+
+    def _attain(self, counts: int) -> None:
+        """Declare a position of the motor encoder to be 607Ch."""
+        motion = self.motion
+        motion.home_counts = motion.dictionary.value(0x607C) - motion.sign * counts
+        motion.preload_target()
+        self._attained = self.referenced = True
 
     def status(self) -> int:
+        if self._profile is not None:
+            return 0
         return _REACHED | (_BIT_12 if self._attained else 0) | (_BIT_13 if self._failed else 0)
 
 

@@ -1,0 +1,118 @@
+"""A status from before a command is not taken for its answer, on drives that show it for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdbridge.axis import AxisConfig
+from hdbridge.drive import Drive, Mode, State
+from hdbridge.errors import DriveError
+from hdbridge.sim.behaviour import Behaviour
+from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.truth import Truth
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
+AXIS = AxisConfig.load(PROFILE)
+DELAYS_MS = (0.0, 8.0, 50.0)
+
+
+@contextmanager
+def drive_that_shows_late(delay_ms: float) -> Iterator[tuple[Drive, SimulatedDrive]]:
+    truth = Truth.load(PROFILE).model_copy(update={"firmware": Behaviour(status_delay_ms=delay_ms)})
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id) as (bus, clock, node),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        yield drive, node
+
+
+@pytest.mark.parametrize("delay_ms", DELAYS_MS)
+@pytest.mark.parametrize("first", [35, 34])
+def test_an_axis_that_is_homed_again_is_homed_when_it_says_so(delay_ms: float, first: int) -> None:
+    with drive_that_shows_late(delay_ms) as (drive, node):
+        drive.home(first, 2.0, 1.0)
+        away = drive.move_to(0.5)
+        for method, turns in ((34, 1), (33, -1), (34, 1)):
+            before = node.firmware.motion.motor_counts
+            homed = drive.home(method, 2.0, 1.0)
+            assert homed.motor_counts == pytest.approx(0, abs=1)
+            moved = node.firmware.motion.motor_counts - before
+            assert 0 < moved * turns <= 8000, "to the next index pulse in the direction of the method"
+        assert away.motor_counts != 0
+
+
+@pytest.mark.parametrize("delay_ms", DELAYS_MS)
+def test_homing_that_is_over_at_once_is_noticed(delay_ms: float) -> None:
+    with drive_that_shows_late(delay_ms) as (drive, _):
+        for place_deg in (0.3, 0.6):
+            drive.move_to(place_deg)
+            drive.home(37, 2.0, 1.0)
+            assert drive.home(35, 2.0, 1.0).motor_counts == pytest.approx(0, abs=1)
+
+
+@pytest.mark.parametrize("delay_ms", DELAYS_MS)
+def test_an_error_of_the_homing_before_is_not_this_ones(delay_ms: float) -> None:
+    with drive_that_shows_late(delay_ms) as (drive, node):
+        drive.enable(Mode.HM)
+        node.firmware._modes[6]._failed = True  # type: ignore[attr-defined]
+        assert drive.home(34, 2.0, 1.0).motor_counts == pytest.approx(0, abs=1)
+
+
+@settings(max_examples=15)
+@given(
+    st.sampled_from(DELAYS_MS),
+    st.lists(st.floats(-2.0, 2.0).map(lambda deg: round(deg, 3)), min_size=1, max_size=4),
+)
+def test_a_move_has_arrived_when_it_says_so(delay_ms: float, places_deg: list[float]) -> None:
+    with drive_that_shows_late(delay_ms) as (drive, _):
+        for place_deg in (*places_deg, places_deg[-1]):
+            assert drive.move_to(place_deg).motor_deg == pytest.approx(50.0 * place_deg, abs=0.1)
+
+
+@pytest.mark.parametrize("delay_ms", DELAYS_MS)
+def test_power_and_modes_are_what_the_drive_has_not_what_it_showed(delay_ms: float) -> None:
+    with drive_that_shows_late(delay_ms) as (drive, node):
+        for mode in (Mode.PP, Mode.HM, Mode.PP):
+            drive.enable(mode)
+            assert node.firmware._mode.number == mode
+            assert node.firmware.state.name == "OPERATION_ENABLED"
+            drive.disable()
+            assert node.firmware.state.name == "SWITCH_ON_DISABLED"
+        node.faults.raise_error(0x3210)
+        drive.wait(0.1)
+        drive.fault_reset()
+        assert drive.state() is State.SWITCH_ON_DISABLED
+        drive.enable(Mode.PP)
+
+
+@pytest.mark.parametrize("delay_ms", DELAYS_MS)
+def test_a_drive_that_stops_in_a_move_is_not_set_in_motion_again(delay_ms: float) -> None:
+    holding = AXIS.model_copy(update={"drive": AXIS.drive.model_copy(update={"quick_stop_option": 6})})
+    truth = Truth.load(PROFILE).model_copy(update={"firmware": Behaviour(status_delay_ms=delay_ms)})
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id) as (bus, clock, node),
+        Drive(bus, holding, clock) as drive,
+    ):
+        drive.boot()
+        drive.enable(Mode.PP)
+        moving = node.firmware._mode
+        step = moving.step
+
+        def stops_on_the_way(period_s: float) -> tuple[float, float]:
+            if node.firmware.motion.motor_counts > 4000:
+                node.faults.lose_master(0x8130)
+            return step(period_s)
+
+        moving.step = stops_on_the_way  # type: ignore[method-assign]
+        with pytest.raises(DriveError, match="left 'operation enabled' moving to 30 deg"):
+            drive.move_to(30.0)
+        clock.sleep_until(clock.now() + 0.5)
+        assert abs(node.firmware.motion.motor_counts) < 12000
