@@ -1,0 +1,97 @@
+"""The first SYNC of a new loop, or after the bus was down, puts no buffered set-point into force."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.characters import CHARACTERS, Character, PowerCount, every_character
+from support.daemon import SteppedDaemon, stepped_daemon
+
+from hdbridge.daemon.loop.states import AxisState
+
+AWAY_S = st.sampled_from((0.0, 0.004, 0.011, 0.016, 0.03, 0.06, 0.5, 2.0))
+RUNNING_S = st.integers(0, 80).map(lambda turns: 0.004 * turns)
+
+
+@contextmanager
+def moving(character: Character) -> Iterator[tuple[SteppedDaemon, list[PowerCount]]]:
+    """Two axes in motion."""
+    with stepped_daemon(2, character=character) as daemon:
+        for axis in range(2):
+            daemon.verify(axis)
+        for axis in range(2):
+            daemon.enable(axis)
+            daemon.move(300.0, axis)
+        yield daemon, [PowerCount(node) for node in daemon.nodes]
+
+
+def places(daemon: SteppedDaemon) -> list[int]:
+    return [node.firmware.motion.machine.motor_counts for node in daemon.nodes]
+
+
+def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None:
+    daemon.run(1.5)
+    before = places(daemon)
+    daemon.run(1.0)
+    assert [each.times for each in counts] == [0, 0], "power without a request"
+    assert all(abs(now - then) <= 2 for now, then in zip(places(daemon), before, strict=True))
+
+
+@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@settings(max_examples=6)
+@given(RUNNING_S, AWAY_S)
+def test_after_another_start_of_the_control_process(
+    character: Character, running_s: float, away_s: float
+) -> None:
+    with moving(character) as (daemon, counts):
+        daemon.run(running_s)
+        daemon.hang(away_s)
+        daemon.begin_again()
+        stays_without_power(daemon, counts)
+        assert daemon.states == [AxisState.UNVERIFIED] * 2
+
+
+@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@settings(max_examples=6)
+@given(RUNNING_S, AWAY_S)
+def test_after_the_bus_was_down(character: Character, running_s: float, away_s: float) -> None:
+    with moving(character) as (daemon, counts):
+        daemon.run(running_s)
+        daemon.bus.down = errno.ENETDOWN
+        daemon.run(0.004 + away_s)
+        daemon.bus.down = None
+        stays_without_power(daemon, counts)
+        assert daemon.states == [AxisState.LATCHED] * 2
+
+
+@pytest.mark.parametrize("character", CHARACTERS, ids=str)
+@settings(max_examples=6)
+@given(RUNNING_S, st.floats(0.012, 1.0))
+def test_after_the_control_process_hung(character: Character, running_s: float, away_s: float) -> None:
+    with moving(character) as (daemon, counts):
+        daemon.run(running_s)
+        daemon.hang(away_s)
+        stays_without_power(daemon, counts)
+        assert not {AxisState.ENABLED, AxisState.ENABLING} & set(daemon.states)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("character", every_character(), ids=str)
+def test_on_every_drive(character: Character) -> None:
+    for away_s in (0.011, 0.03, 0.06, 0.5):
+        with moving(character) as (daemon, counts):
+            daemon.run(0.1)
+            daemon.hang(away_s)
+            daemon.begin_again()
+            stays_without_power(daemon, counts)
+        with moving(character) as (daemon, counts):
+            daemon.run(0.1)
+            daemon.bus.down = errno.ENETDOWN
+            daemon.run(away_s)
+            daemon.bus.down = None
+            stays_without_power(daemon, counts)
