@@ -269,12 +269,12 @@ def stepped_daemon(
     axes: int | Sequence[AxisConfig] = 1,
     model: TransmissionModel | None = None,
     setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
-    truth: Path = PROFILE / "truth.yaml",
+    truth: Path | Truth = PROFILE / "truth.yaml",
     character: Character = FRIENDLY,
 ) -> Iterator[SteppedDaemon]:
     """A control loop with simulated axes, none verified yet; with the article's model by default."""
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
-    plant = character.of_truth(Truth.load(truth))
+    plant = character.of_truth(truth if isinstance(truth, Truth) else Truth.load(truth))
     known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")
     channel = f"daemon-{uuid4()}"
     simulated = [
