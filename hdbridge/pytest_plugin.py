@@ -39,8 +39,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Make the marker known."""
     config.addinivalue_line(
         "markers",
-        f"{MARKER}(profile='demo', bus='virtual', seed=0, truth=None): the drive that the fixture "
-        "hdbridge_drive makes; before the command line and the ini file",
+        f"{MARKER}(profile='demo', bus='virtual', seed=0, truth=None, firmware={{}}): the drive that the "
+        "fixture hdbridge_drive makes; before the command line and the ini file",
     )
 
 
@@ -78,10 +78,11 @@ def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
     config = request.config
     marks: dict[str, Any] = {}
     for marker in request.node.iter_markers(MARKER):  # the nearest first
-        unknown = sorted({*marker.kwargs} - {*_DEFAULTS})
+        known = (*_DEFAULTS, "firmware")
+        unknown = sorted({*marker.kwargs} - {*known})
         if marker.args or unknown:
             found = f"found {', '.join(unknown)}" if unknown else f"found {marker.args!r} without a name"
-            pytest.fail(f"the marker {MARKER}: {found}; expected {', '.join(_DEFAULTS)}", pytrace=False)
+            pytest.fail(f"the marker {MARKER}: {found}; expected {', '.join(known)}", pytrace=False)
         marks = {**marker.kwargs, **marks}
     ini_folder = config.inipath.parent if config.inipath is not None else config.rootpath
     wanted: dict[str, Any] = {}
@@ -96,7 +97,8 @@ def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
         if name in ("profile", "truth") and value and (folder / str(value)).exists():
             value = folder / str(value)
         wanted[name] = value
-    return {**wanted, "seed": _seed(wanted["seed"]), "truth": wanted["truth"] or None}
+    wanted |= {"seed": _seed(wanted["seed"]), "truth": wanted["truth"] or None}
+    return {**wanted, "firmware": marks.get("firmware", {})}
 
 
 def _seed(value: Any) -> Any:

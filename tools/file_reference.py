@@ -35,10 +35,17 @@ from hdbridge.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
+from hdbridge.sim.behaviour import Behaviour
 from hdbridge.twin.translation import TABLE as TRANSLATED
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = (DOCS / "files.md", DOCS / "calibration.md", DOCS / "daemon.md", DOCS / "twin.md")
+PAGES = (
+    DOCS / "files.md",
+    DOCS / "calibration.md",
+    DOCS / "daemon.md",
+    DOCS / "twin.md",
+    DOCS / "truth-file.md",
+)
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -109,6 +116,7 @@ BLOCKS: Mapping[str, Any] = {
     "model": lambda: key_table(ModelFile),
     "columns": column_table,
     "recording": lambda: key_table(RecordingFile),
+    "firmware": lambda: key_table(Behaviour),
     "history": lambda: key_table(LogFile),
     "faults": fault_table,
     "plan": lambda: key_table(Plan),

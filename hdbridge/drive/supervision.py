@@ -41,7 +41,7 @@ class Fault(Enum):
     DISCARDED_FRAME = "a frame of the wrong kind was thrown away"
     FLOOD = "more frames waited than one cycle reads"
     EMERGENCY = "the drive sent an emergency message"
-    MASTER_LOST = "the drive reports that its master went silent"
+    MASTER_LOST = "the drive reports that it missed its master"
     DRIVE_FAULT = "the drive reports a fault"
     DROPPED_OUT = "the drive left 'operation enabled' by itself"
     BOOT_UP = "a node restarted"

@@ -192,6 +192,11 @@ def _drive_fault(reach: Reach, code: int) -> End:
     return _nothing
 
 
+def _missed(reach: Reach, code: int) -> End:
+    reach.drive.faults.miss_master(code)
+    return _nothing
+
+
 def _glitch(reach: Reach, counts: int, samples: int) -> End:
     left = [counts] * samples
     return reach.wish("load_reading", lambda right: right + (left.pop() if left else 0))
@@ -307,6 +312,8 @@ _ROWS: Final = (
         _drive_fault, {"code": 0x3210}, "the drive reports a fault"),
     Row("enable_lost", "The power stage goes off without a word, as by a hardware enable input.",
         _once(lambda drive: drive.faults.open_enable_input()), answers="the drive reports a fault"),
+    Row("master_missed", "The drive misses its master, sends EMCY `code` and stops as 6007h says.",
+        _missed, {"code": 0x8130}, "EMCY 8130h or 8250h"),
     Row("restart", "The drive restarts, as after a brown-out: boot-up message, every object as at power-on.",
         _once(lambda drive: drive.faults.boot_up()), answers="boot-up message"),
     Row("leaves_operational", "The drive goes into NMT PRE-OPERATIONAL; its heartbeat says so.",

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
+
+from pydantic import ValidationError
 
 from hdbridge.axis import AxisConfig
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.profile import Profile
+from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.truth import Truth
 
 VIRTUAL, LOCKSTEP = "virtual", "lockstep"
@@ -61,11 +66,18 @@ class Settings:
 
     @classmethod
     def load(
-        cls, profile: str, bus: str, seed: int, truth: str | Path | None = None, folder: Path | None = None
+        cls,
+        profile: str,
+        bus: str,
+        seed: int,
+        truth: str | Path | None = None,
+        folder: Path | None = None,
+        firmware: Mapping[str, Any] = MappingProxyType({}),
     ) -> Settings:
         """``folder`` is where relative paths start, by default the present one. InputError in one line.
 
-        Without ``truth``, the profile's ``twin.yaml`` is it where there is one, else its ``truth.yaml``.
+        Without ``truth``, the profile's ``twin.yaml`` is used if it has one, else its ``truth.yaml``.
+        ``firmware`` has keys of the truth file's section of that name.
         """
         folder = folder or Path()
         choice = BusChoice.parse(bus)
@@ -79,4 +91,16 @@ class Settings:
                 f"{path}: no such file, and no twin.yaml beside it, so nothing says what the simulated axis "
                 "is like; make a twin of the axis, or name a truth file"
             )
-        return cls(axis, Truth.load(path), path, seed, choice)
+        known = Truth.load(path)
+        behaviour = _behaviour({**known.firmware.model_dump(), **firmware})
+        return cls(axis, known.model_copy(update={"firmware": behaviour}), path, seed, choice)
+
+
+def _behaviour(keys: Mapping[str, Any]) -> Behaviour:
+    try:
+        return Behaviour.model_validate(keys)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        name = ".".join(map(str, problem["loc"]))
+        known = ", ".join(Behaviour.model_fields)
+        raise InputError(f"firmware: '{name}': {problem['msg']}; expected keys are {known}") from error

@@ -231,6 +231,7 @@ def simulated_drive(
     truth: str | Path | None = None,
     folder: Path | None = None,
     beside: SimulatedDrive | None = None,
+    firmware: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[SimulatedDrive]:
     """A simulated drive as long as the block lasts.
 
@@ -239,11 +240,12 @@ def simulated_drive(
     time passes only while the program waits) or ``INTERFACE:CHANNEL`` of python-can, for programs of any
     process. ``truth`` replaces the profile's twin.yaml or truth.yaml. The same truth and seed give the same
     axis; in lockstep the same frames. With ``beside`` it stands on the bus of another drive, whose node id is
-    another. While another test has a drive on a bus of the machine, this one waits. InputError, BusError in
-    one line.
+    another. While another test has a drive on a bus of the machine, this one waits. ``firmware`` sets keys of
+    the truth file's section of that name, such as ``{"controlword": "level"}``. InputError, BusError in one
+    line.
     """
     settings = Settings.load(
-        profile, bus if beside is None else str(beside._line.choice), seed, truth, folder
+        profile, bus if beside is None else str(beside._line.choice), seed, truth, folder, firmware
     )
     with ExitStack() as stack:
         line = beside._line if beside is not None else stack.enter_context(open_line(settings.bus))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,25 +19,30 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
-from hdbridge.drive.supervision import Reaction
+from hdbridge.drive.supervision import Fault, Reaction
 from hdbridge.errors import BusError
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.run import run
 from hdbridge.sim.truth import Truth
+from tests.support.characters import CHARACTERS, FRIENDLY, RESTLESS, Character, PowerCount
 from tests.support.command import run_here
 from tests.support.reliability import VCAN, Row, rows_of, try_out
 
 
 @contextmanager
-def drive_in_a_thread(interface: str, profile: Path) -> Iterator[SimulatedDrive]:
+def drive_in_a_thread(
+    interface: str, profile: Path, character: Character = FRIENDLY
+) -> Iterator[SimulatedDrive]:
     """The simulated drive on a socket of its own, with its fault injector within reach."""
-    axis, truth = AxisConfig.load(profile), Truth.load(profile)
+    axis, truth = AxisConfig.load(profile), character.of_truth(Truth.load(profile))
     ended = threading.Event()
     with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as bus:
         clock = MonotonicClock()
-        node = SimulatedDrive(bus, Machine(truth, 0), axis.eds_path, 1, clock, nameplate_of(truth))
+        node = SimulatedDrive(
+            bus, Machine(truth, 0), axis.eds_path, 1, clock, nameplate_of(truth), truth.firmware
+        )
 
         def serve() -> None:
             with suppress(BusError):  # the row has taken the interface away
@@ -99,21 +106,59 @@ def bench(
     another_master: Callable[..., AbstractContextManager[Any]],
     intruder: can.BusABC,
     may_configure: Callable[..., None],
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
 ) -> Iterator[VcanBench]:
-    with drive_in_a_thread(interface, profile) as node, another_master(interface) as master:
+    character = getattr(request, "param", FRIENDLY)
+    own = Path(shutil.copytree(profile, tmp_path / "axis"))
+    text = (own / "axis.yaml").read_text()
+    option = f"quick_stop_option: {character.quick_stop_option}"
+    (own / "axis.yaml").write_text(re.sub("quick_stop_option: [0-9]", option, text))
+    with drive_in_a_thread(interface, own, character) as node, another_master(interface, own) as master:
         master.boot()
         master.run(20)
         yield VcanBench(master, node, intruder, may_configure, interface)
 
 
+ABOUT_POWER = (Fault.HANG, Fault.MASTER_LOST, Fault.DROPPED_OUT, Fault.HEARTBEAT_LOST, Fault.TRANSMIT_FULL)
+"""Faults after which a drive with a will of its own may set off again."""
+
+
 @pytest.mark.parametrize("row", rows_of(VCAN), ids=lambda row: row.name)
 def test_a_fault_has_its_reaction_in_time(bench: VcanBench, row: Row) -> None:
-    try_out(row, bench, VCAN, bench.master.drive.image.heartbeat_timeout_s)
+    check(bench, row, FRIENDLY)
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in rows_of(VCAN) if row.fault in ABOUT_POWER], ids=lambda row: row.name
+)
+@pytest.mark.parametrize("bench", [RESTLESS], ids=str, indirect=True)
+def test_a_drive_that_resumes_is_stopped_all_the_same(bench: VcanBench, row: Row) -> None:
+    check(bench, row, RESTLESS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", rows_of(VCAN), ids=lambda row: row.name)
+@pytest.mark.parametrize("bench", CHARACTERS[1:], ids=str, indirect=True)
+def test_a_fault_has_its_reaction_on_other_drives(
+    bench: VcanBench, row: Row, request: pytest.FixtureRequest
+) -> None:
+    check(bench, row, request.node.callspec.params["bench"])
+
+
+def check(bench: VcanBench, row: Row, character: Character) -> None:
+    if row.unseen_on(character):
+        pytest.skip("nothing that this drive sends shows it")
+    power = PowerCount(bench.node)
+    try_out(row, bench, VCAN, bench.master.drive.image.heartbeat_timeout_s, character)
     if row.reaction >= Reaction.QUICK_STOP:
         time.sleep(1.0)
         place = bench.motor_counts
+        if row.fault is not Fault.BUS_DOWN:
+            bench.interfere(0x080)  # the first SYNC of another program
         time.sleep(0.3)
         assert abs(bench.motor_counts - place) <= 2
+        assert power.times == 0, "power without a request"
 
 
 # ------------------------------------------------------------------ manners

@@ -138,6 +138,14 @@ def emergency_burst(drive, program):
     assert drive.state == "operation enabled"
 
 
+def master_missed(drive, program):
+    drive.fault("master_missed", code=0x8250)
+    program.move(60)
+    assert drive.emergencies == (0x8250,)
+    assert drive.state != "operation enabled"
+    assert stands(drive)
+
+
 def drive_fault(drive, program):
     drive.fault("drive_fault", code=0x2310)
     program.move(60)

@@ -115,7 +115,7 @@ def test_a_marker_with_a_wrong_name_is_refused(session, mark, complaint):
     done = session(f"import pytest\n@pytest.mark.hdbridge_drive({mark})\n{PASSES}")
     done.assert_outcomes(errors=1)
     done.stdout.fnmatch_lines(
-        [f"*the marker hdbridge_drive: {complaint}; expected profile, bus, seed, truth"]
+        [f"*the marker hdbridge_drive: {complaint}; expected profile, bus, seed, truth, firmware"]
     )
 
 

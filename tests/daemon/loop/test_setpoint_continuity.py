@@ -1,4 +1,4 @@
-"""No sequence of commands and faults makes the set-point on the bus jump: limits hold across interruptions."""
+"""No sequence of commands and faults makes the set-point jump: limits hold across interruptions."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.errors import HdbridgeError
 from hdbridge.model import TransmissionModel
+from hdbridge.sim.faults import Faults
 from hdbridge.sim.truth import Truth
 
 COUNTS_PER_TURN = 1 << 20
@@ -31,7 +32,13 @@ PERIOD_S = AXIS.drive.cycle_s
 DEG_PER_COUNT = 360.0 / COUNTS_PER_TURN / AXIS.gear.ratio
 ENABLE_OPERATION = 0x0F
 
+STOPPING = (CommandKind.STOP, CommandKind.QUICK_STOP, CommandKind.DISABLE, CommandKind.RESET)
+
 Event = Callable[[SteppedDaemon], object]
+
+
+def faults(daemon: SteppedDaemon) -> Faults:
+    return daemon.nodes[0].faults
 
 
 def _command(kind: CommandKind, **fields: float) -> Event:
@@ -77,13 +84,13 @@ EVENTS: st.SearchStrategy[Event] = st.one_of(
     st.floats(-50, 50).map(lambda deg: lambda daemon: _moves(daemon, deg)),
     st.floats(-15, 15).map(lambda speed: _command(CommandKind.JOG, a=speed, b=0.3)),
     st.floats(-15, 15).map(lambda speed: lambda daemon: _streams(daemon, speed)),
-    st.sampled_from((CommandKind.STOP, CommandKind.QUICK_STOP, CommandKind.DISABLE, CommandKind.RESET)).map(_command),
+    st.sampled_from(STOPPING).map(_command),
     st.sampled_from((0.003, 0.007, 0.011, 0.03, 0.2)).map(lambda time_s: lambda daemon: daemon.hang(time_s)),
-    st.integers(1, 4).map(lambda count: lambda daemon: setattr(daemon.nodes[0].faults, "drop_tpdos", count)),
-    st.sampled_from((0x8130, 0x8250)).map(lambda code: lambda daemon: daemon.nodes[0].faults.miss_master(code)),
-    st.just(lambda daemon: daemon.nodes[0].faults.lose_master(0x8130)),
-    st.just(lambda daemon: daemon.nodes[0].faults.raise_error(0x3210)),
-    st.just(lambda daemon: daemon.nodes[0].faults.leave_operational()),
+    st.integers(1, 4).map(lambda count: lambda daemon: setattr(faults(daemon), "drop_tpdos", count)),
+    st.sampled_from((0x8130, 0x8250)).map(lambda code: lambda daemon: faults(daemon).miss_master(code)),
+    st.just(lambda daemon: faults(daemon).lose_master(0x8130)),
+    st.just(lambda daemon: faults(daemon).raise_error(0x3210)),
+    st.just(lambda daemon: faults(daemon).leave_operational()),
     st.just(lambda daemon: setattr(daemon.bus, "down", errno.ENETDOWN)),
     st.just(lambda daemon: daemon.begin_again()),
     st.just(_bring_back),
