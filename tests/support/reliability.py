@@ -78,6 +78,8 @@ class Row:
     places: tuple[str, ...] = (VIRTUAL, VCAN, DAEMON)
     everybody: bool = False
     """It concerns every axis of the bus, not one."""
+    without_a_word: bool = False
+    """Only the statusword shows it."""
 
     def unseen_on(self, character: Character) -> bool:
         """Whether a drive of this character shows nothing of the fault.
@@ -87,7 +89,7 @@ class Row:
         """
         behaviour = character.behaviour
         resumes = behaviour.controlword is Controlword.LEVEL and character.quick_stop_option >= 5
-        return self.fault is Fault.DROPPED_OUT and resumes and behaviour.rpdo_before_tpdo
+        return self.without_a_word and resumes and behaviour.rpdo_before_tpdo
 
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
         """The same in cycles of an axis."""
@@ -159,7 +161,7 @@ ROWS: Final = (
     Row("the drive goes into fault (3210h)", lambda bench: bench.node.faults.raise_error(0x3210),
         _F.DRIVE_FAULT, _R.QUICK_STOP, 2),
     Row("the drive drops out on its own", lambda bench: bench.node.faults.lose_master(0x8130),
-        _F.DROPPED_OUT, _R.QUICK_STOP, 2),
+        _F.DROPPED_OUT, _R.QUICK_STOP, 2, without_a_word=True),
     Row("the drive has dropped out between two SYNCs", _frame(0x181, b"\x07\x16" + bytes(6)),
         _F.DROPPED_OUT, _R.QUICK_STOP, 1),
     Row("the drive misses the master's heartbeat (8130h)", _miss(0x8130), _F.MASTER_LOST, _R.QUICK_STOP, 1),
