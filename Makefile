@@ -74,10 +74,12 @@ format: $(READY) ## format and mend what can be mended
 	$(BIN)/ruff check --fix hdbridge tests tools
 
 BLIND_SEED  ?= 1
-BLIND_CASES ?= single=4,power=1,pair=20,triple=10,none=20,other_law=20,unknown=20,no_torque=10
-blind: $(READY)  ## a blind suite of diagnoses into build/blind (hours; BLIND_SEED, BLIND_CASES)
-	$(BIN)/python tools/blind/generate.py --out build/blind --seed $(BLIND_SEED) --cases $(BLIND_CASES)
-	$(BIN)/python tools/blind/score.py build/blind --json build/blind/verdicts.json | tee build/blind/figures.md
+BLIND_SUITE ?= development
+BLIND_JOBS  ?= 2
+BLIND       := build/blind-$(BLIND_SEED)
+blind: $(READY)  ## a blind suite of diagnoses; continues where it stopped (BLIND_SEED, BLIND_SUITE=development|everyday|bench)
+	nice $(BIN)/python tools/blind/generate.py $(BLIND) --seed $(BLIND_SEED) --suite $(BLIND_SUITE) --jobs $(BLIND_JOBS)
+	nice $(BIN)/python tools/blind/score.py $(BLIND) --jobs $(BLIND_JOBS) | tee $(BLIND)/figures.md
 
 bench-realtime: $(READY)  ## what a cycle and the daemon's loop cost on PREEMPT_RT, in instructions (some twenty minutes; root, QEMU)
 	@mkdir -p build/realtime

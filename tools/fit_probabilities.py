@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.optimize import minimize
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parent))
+from blind.case import record_of, unsealed
 from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
 
 from hdbridge.diagnose import Diagnosis, diagnose
@@ -62,16 +63,14 @@ def judged(
 
 def from_suite(folder: Path) -> Iterator[Row]:
     """The findings in the cases of a blind suite."""
-    for path in sorted(folder.glob("*/hidden.yaml")):
-        hidden = yaml.safe_load(path.read_text(encoding="utf-8"))
-        recording = Recording.load(path.parent / "record.csv")
-        model = TransmissionModel.load(path.parent / "model.yaml")
+    for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
+        hidden = unsealed(case)
+        recording = Recording.load(*record_of(case))
+        model = TransmissionModel.load(case / "model.yaml")
         result = diagnose(recording, model, scales=Scales(named_from=0.0))
         there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
-        loop = hidden["kind"] == "other_law"
-        yield from judged(
-            folder.name, f"{folder.name}/{path.parent.name}", result, there, set(hidden["also"]), loop
-        )
+        loop = hidden["kind"] in {"law", "other_law"}
+        yield from judged(folder.name, f"{folder.name}/{case.name}", result, there, set(hidden["also"]), loop)
 
 
 def from_trials(seeds: int) -> Iterator[Row]:

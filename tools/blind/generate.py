@@ -1,39 +1,61 @@
 """Make a blind suite: records of simulated axes with something hidden in them, or nothing.
 
-python tools/blind/generate.py --out FOLDER [--seed 1] [--cases single=1,pair=20,...] [--jobs 2] [--means]
+    python tools/blind/generate.py build/blind                      # everyday records, to develop on: seed 1
+    python tools/blind/generate.py build/held --seed 4711 --suite everyday
+    python tools/blind/generate.py build/full --seed 4712 --suite bench
 
-Each case is a folder: record.csv and model.yaml (what a diagnosis is given), hidden.yaml (what it should
-find) and truth.yaml (the plant, for whoever wants to look). The same seed and case name give the same files.
-"single" and "power" are numbers for each cause of the catalogue, "power" at several sizes over the noise; the
-others are numbers of cases.
+Each case is a folder: the record and model.yaml are what a diagnosis is given, sealed.json is what it should
+find. A case that is there already is not made again, so the command continues where it was stopped. A folder
+is either whole or not there. The same seed and case give the same record. Suites with a seed of 1000 and more
+are held out: score.py prints rates of them and no cases, so that nobody develops on them.
+
+A suite may also be a list such as ``fault=60,law=20``. ``single`` and ``power`` are numbers for each cause of
+the catalogue, ``flicker`` counts pairs, the others count cases.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
+import os
 import sys
 import time
+import traceback
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from blindcase import KINDS, Case, cases, make
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from blind.case import KINDS, SCHEMA, Case, cases, make
 
-SUITE = "single=2,pair=30,triple=10,none=30,other_law=20,unknown=20,no_torque=4"
+SUITES = {
+    "development": "healthy_bench=60,healthy_work=60,fault=60,law=20,outside=20,flicker=10",
+    "everyday": "healthy_bench=200,healthy_work=200,fault=200,law=100,outside=60,flicker=50",
+    "bench": "single=4,power=1,pair=20,triple=10,none=20,other_law=20,unknown=20,no_torque=10",
+}
 
 
 def wanted(text: str) -> dict[str, int]:
-    """``kind=number,...`` as a mapping."""
-    pairs = (each.partition("=") for each in text.split(",") if each)
+    """A suite's name, or ``kind=number,...``, as a mapping."""
+    pairs = (each.partition("=") for each in SUITES.get(text, text).split(",") if each)
     return {kind.strip(): int(number or 1) for kind, _, number in pairs}
 
 
-def made(case: Case, seed: int, out: Path, means: bool) -> tuple[str, float]:
-    """Make one case; its name and how long it took."""
-    began_s = time.perf_counter()
-    make(case, seed, out, means)
-    return case.name, time.perf_counter() - began_s
+def made(group: Sequence[Case], seed: int, out: Path, means: bool) -> list[tuple[str, float]]:
+    """Make the cases of one axis that are not there; their names and seconds, NaN if it failed."""
+    done = []
+    for case in group:
+        began_s, folder = time.perf_counter(), case.folder(out, seed)
+        if not folder.exists():
+            try:
+                make(case, seed, out, means)
+            except Exception:
+                traceback.print_exc()
+        done.append((folder.name, time.perf_counter() - began_s if folder.exists() else math.nan))
+    return done
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -41,25 +63,52 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the suite")
+    parser.add_argument("out", type=Path, help="folder of the suite")
     parser.add_argument("--seed", type=int, default=1, help="seed of the suite")
     parser.add_argument(
-        "--cases", default=SUITE, help=f"number by kind ({', '.join(KINDS)}); default {SUITE}"
+        "--suite",
+        default="development",
+        help=f"{', '.join(SUITES)}, or a list of kind=number ({', '.join(KINDS)})",
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--means", action="store_true", help="block means in place of every fifth reading")
+    parser.add_argument(
+        "--means", action="store_true", help="bench suite: block means in place of every fifth reading"
+    )
     parser.add_argument("--only", default="", help="only cases whose name contains this")
     options = parser.parse_args(arguments)
     try:
-        chosen = [each for each in cases(wanted(options.cases), options.seed) if options.only in each.name]
+        chosen = [each for each in cases(wanted(options.suite), options.seed) if options.only in each.name]
+        claim(options.out, options.seed)
     except ValueError as problem:
         print(problem, file=sys.stderr)
         return 2
+    # Cases of one axis go to one process, because the first of them calibrates it.
+    groups: dict[str, list[Case]] = {}
+    for each in chosen:
+        axis = each.axis.removesuffix("-fine").removesuffix("-coarse")
+        groups.setdefault(axis or each.name, []).append(each)
     job = partial(made, seed=options.seed, out=options.out, means=options.means)
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for number, (name, seconds) in enumerate(pool.map(job, chosen), 1):
-            print(f"{number}/{len(chosen)} {name} {seconds:.1f} s", flush=True)
-    return 0
+    number = failed = 0
+    with ProcessPoolExecutor(options.jobs, initializer=os.nice, initargs=(10,)) as pool:
+        for done in pool.map(job, groups.values()):
+            for name, seconds in done:
+                number, failed = number + 1, failed + math.isnan(seconds)
+                print(f"{number}/{len(chosen)} {name} {seconds:.1f} s", flush=True)
+    return 1 if failed else 0
+
+
+def claim(folder: Path, seed: int) -> None:
+    """Write down whose seed the folder is; ValueError if it belongs to another."""
+    about = folder / "suite.json"
+    if about.exists():
+        found = json.loads(about.read_text(encoding="utf-8"))["seed"]
+        if found != seed:
+            raise ValueError(
+                f"{folder}: holds a suite of seed {found}; name another folder, or --seed {found}"
+            )
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    about.write_text(json.dumps({"schema": SCHEMA, "seed": seed}) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

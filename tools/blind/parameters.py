@@ -1,8 +1,7 @@
-"""What the parameters of a finding would be if it were right: the secret in its units and conventions.
+"""The parameters of a finding if it were right: what was hidden, in the finding's units and conventions.
 
-hidden.yaml says what was hidden, truth.yaml what the plant is, model.yaml what the diagnosis compared it
-with. `true_parameters` converts: a name is missing where the two do not mean the same, for the reasons that
-stand next to each cause.
+The secret says what was hidden and what the plant is, model.yaml what the diagnosis compared it with. A
+parameter is missing if the two do not mean the same, for the reasons given next to each cause.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ FINE = 1024
 TWINS = {"motor_order": "motor_encoder_eccentricity", "motor_encoder_eccentricity": "motor_order"}
 """Orders of the motor have the same amplitudes and phases under either name."""
 ALWAYS_THERE = ("inertial_windup", "compliance")
-"""Causes that need not have been hidden: truth.yaml says how large they are, where they are named."""
+"""Causes that need not have been hidden: the plant says how large they are."""
 
 
 @dataclass(frozen=True)
@@ -31,22 +30,22 @@ class Secret:
     """What is known of a case."""
 
     parameters: Data
-    """Those of the cause in hidden.yaml; empty where it is there without having been hidden."""
+    """Those of the cause; empty if it is there without having been hidden."""
     found: Data = field(default_factory=dict)
     """Values of the finding, by name."""
     truth: Data = field(default_factory=dict)
-    """truth.yaml; empty where there is none."""
+    """The plant, as a truth file."""
     model: Data = field(default_factory=dict)
     """model.yaml."""
 
     @property
     def gear(self) -> Data:
-        """Section ``gear`` of truth.yaml."""
+        """Section ``gear`` of the plant."""
         return self.truth.get("gear", {})
 
     @property
     def load(self) -> Data:
-        """Section ``load`` of truth.yaml."""
+        """Section ``load`` of the plant."""
         return self.truth.get("load", {})
 
     @property
@@ -277,7 +276,7 @@ def _local_defect(secret: Secret) -> Values:
 
 
 def _named(**names: str) -> Callable[[Secret], Values]:
-    """Parameters that differ by their name alone: finding's name = hidden.yaml's."""
+    """Parameters that differ by their name alone: finding's name = secret's."""
     return lambda secret: {
         mine: float(secret.parameters[theirs])
         for mine, theirs in names.items()
@@ -301,7 +300,7 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     "compliance": _compliance,
     "inertial_windup": _inertial,
     "velocity_windup": _velocity,
-    # hidden.yaml counts the age of the load's sample, the finding how much later it is taken.
+    # The secret counts the age of the load's sample, the finding how much later it is taken.
     "channel_skew": _scaled(-1.0, delay_ms="delay_ms"),
     "backlash": _named(gap_arcsec="gap_arcsec"),
     "hysteresis_parameters": _named(
@@ -318,7 +317,7 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     "wear": _wear,
     "ratio_error": _named(ramp_arcsec_per_turn="arcsec_per_motor_turn"),
     "count_loss": _count_loss,
-    # Not the amplitude: hidden.yaml has that of the load on its spring, and where the motor rests the
+    # Not the amplitude: the secret has that of the load on its spring, and where the motor rests the
     # vibration shakes the loop as well, by more than that.
     "vibration": _named(frequency_hz="frequency_hz"),
     "local_defect": _local_defect,

@@ -1,0 +1,595 @@
+"""The blind suites: what is made, what it is judged by, and what is printed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from blind import axes, generate, score, tables, work
+from blind import case as blindcase
+from blind.case import Case, cases, make, record_of, unsealed
+from blind.plant import PlantRig
+from blind.verdict import Answer, Verdict, judged
+
+from hdbridge import AxisConfig, Bench, Recording, Stepping, TransmissionModel, simulated
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.sim.truth import Truth
+
+PLAN = """
+schema: hdbridge.plan/1
+name: tiny
+reference_s: 0.3
+procedures:
+  - {procedure: standstill, duration_s: 1}
+  - {procedure: sweep, motor_turns: 3, motor_turns_per_s: 0.5}
+  - {procedure: sines, amplitudes_deg: [60, 10], frequency_hz: 0.1, periods: 2}
+"""
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bench suite with a bench of half a minute."""
+    drawn_plan = blindcase.drawn_plan
+
+    def shorter(*arguments: Any) -> Any:
+        changes = {"sweep_turns": 2.0, "slow_turns": 0.3, "sine_periods": 0.05, "steps": 1, "still_s": 0.5}
+        return dataclasses.replace(drawn_plan(*arguments), **changes, depths_deg=(2.0,), holds_deg=())
+
+    monkeypatch.setattr(blindcase, "drawn_plan", shorter)
+
+
+def shorten(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Everyday suites have work of some seconds, and a calibration of a minute."""
+    plan = folder / "tiny.yaml"
+    plan.write_text(PLAN)
+    axis_of = blindcase.axis_of
+    monkeypatch.setattr(
+        blindcase, "axis_of", lambda *which: dataclasses.replace(axis_of(*which), plan=str(plan))
+    )
+    monkeypatch.setattr(work, "LONGEST_S", 11.0)
+    monkeypatch.setattr(work, "KINDS", ("moves", "daemon"))
+    monkeypatch.setattr(blindcase, "WORK_KINDS", ("moves",))
+    monkeypatch.setattr(blindcase, "SLOW_S", 10.0)
+
+
+FILES = ("record.csv", "model.yaml", "sealed.json")
+
+
+def contents(folder: Path) -> list[bytes]:
+    return [(folder / name).read_bytes() for name in FILES]
+
+
+@pytest.mark.usefixtures("short")
+def test_a_case_is_made_again_bit_for_bit_from_its_seed_and_name(tmp_path: Path) -> None:
+    case = Case("pair-007", "pair", ("wear", "count_loss"))
+    first = contents(make(case, 5, tmp_path / "a"))
+    assert contents(make(case, 5, tmp_path / "b")) == first
+    other = contents(make(case, 6, tmp_path / "c"))
+    assert all(here != there for here, there in zip(first, other, strict=True))
+
+
+@pytest.mark.usefixtures("short")
+def test_a_case_of_the_bench_suite_is_a_record_with_its_model_and_its_secret(tmp_path: Path) -> None:
+    folder = make(Case("single-x", "single", ("compliance",)), 1, tmp_path)
+    rows = np.genfromtxt(folder / "record.csv", delimiter=",", names=True)
+    assert rows.dtype.names == (
+        "time_s", "motor_position_deg", "load_position_deg", "motor_target_deg", "load_torque_nm",
+        "motor_torque_nm", "temperature_c",
+    )  # fmt: skip
+    assert np.allclose(np.diff(rows["time_s"]), 0.02)
+    secret = unsealed(folder)
+    truth = Truth.model_validate(secret["truth"])
+    error_deg = rows["load_position_deg"] - rows["motor_target_deg"] / truth.gear.ratio
+    assert np.max(np.abs(error_deg)) * 3600.0 < 400.0
+    assert TransmissionModel.load(folder / "model.yaml").ratio == truth.gear.ratio
+    assert [each["cause"] for each in secret["hidden"]] == ["compliance"]
+    assert secret["samples"] == len(rows)
+    assert truth.load_.gravity is not None
+    assert "compliance" not in (folder / "sealed.json").read_text()
+
+
+@pytest.mark.usefixtures("short")
+def test_without_a_torque_channel_there_is_no_such_column(tmp_path: Path) -> None:
+    folder = make(Case("no_torque-000", "no_torque", ("load_order",)), 1, tmp_path)
+    with (folder / "record.csv").open() as file:
+        assert "load_torque_nm" not in file.readline()
+
+
+def test_a_suite_has_the_cases_asked_for() -> None:
+    wanted = {"single": 2, "power": 1, "pair": 40, "unknown": 4, "none": 3, "fault": 46, "flicker": 4}
+    suite = list(cases(wanted, 1))
+    kinds = [each.kind for each in suite]
+    assert [kinds.count(each) for each in wanted] == [46, 92, 40, 4, 3, 46, 8]
+    assert len({each.name for each in suite}) == len(suite)
+    pairs = [set(each.causes) for each in suite if each.kind == "pair"]
+    assert all(len(each) == 2 and {"load_order", "compliance"} != each for each in pairs)
+    assert len({each.causes for each in suite if each.kind == "unknown"}) == 4
+    faults = [each for each in suite if each.kind == "fault"]
+    assert len({each.causes for each in faults}) == 23
+    assert len({each.axis for each in faults}) >= len(faults) / 5
+    assert suite == list(cases(wanted, 1))
+    # A larger suite of the same seed holds the smaller one, so a suite can be continued.
+    assert set(cases({"fault": 10}, 1)) < set(cases({"fault": 20}, 1))
+    with pytest.raises(ValueError, match="found 'singles'"):
+        list(cases({"singles": 1}, 1))
+
+
+def test_the_folders_of_a_held_out_suite_say_nothing(tmp_path: Path) -> None:
+    (case,) = cases({"law": 1}, 1)
+    assert case.folder(tmp_path, 999).name == "law-000"
+    assert "law" not in case.folder(tmp_path, 1000).name
+    assert case.folder(tmp_path, 1000) != case.folder(tmp_path, 1001)
+
+
+def test_a_procedure_measures_the_same_without_a_bus_as_over_frames() -> None:
+    profile = bundled_profile("article")
+    axis, steps = AxisConfig.load(profile), Stepping(count=2)
+    with simulated(axis) as drive:
+        drive.boot()
+        over_frames = Bench(drive).run(steps)
+    bare = axes.EverydayAxis(axis, Truth.load(profile), "rolling_friction", 0.0, "quick")
+    without = PlantRig(bare, 0).bench().run(steps)
+    for one, other in zip(over_frames.outcome.cw, without.outcome.cw, strict=True):
+        assert one.error_arcsec == pytest.approx(other.error_arcsec, abs=0.1)
+    assert [each.kind for each in without.segments] == [each.kind for each in over_frames.segments]
+
+
+@pytest.fixture(scope="module")
+def lost(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two suites of one seed, each with a work record in which counts are lost."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        folder = tmp_path_factory.mktemp("everyday")
+        shorten(monkeypatch, folder)
+        for name in ("a", "b"):
+            make(Case("fault-000", "fault", ("count_loss",), axis="fault-000"), 2, folder / name)
+    return folder
+
+
+def test_an_everyday_case_is_made_again_bit_for_bit(lost: Path) -> None:
+    one, other = (lost / name / "fault-000" for name in ("a", "b"))
+    assert sorted(path.name for path in one.iterdir()) == sorted(path.name for path in other.iterdir())
+    assert (one / "sealed.json").read_bytes() == (other / "sealed.json").read_bytes()
+    first, again = (Recording.load(*record_of(each)).record for each in (one, other))
+    assert first == again
+
+
+def test_the_model_of_an_everyday_case_is_what_a_calibration_of_its_axis_found(lost: Path) -> None:
+    model = TransmissionModel.load(lost / "a" / "fault-000" / "model.yaml")
+    gear = unsealed(lost / "a" / "fault-000")["truth"]["gear"]
+    (found,) = (each.parameters()["offset_arcsec"] for each in model.effects if each.name == "hysteresis")
+    assert found == pytest.approx(gear["hysteresis"]["offset_arcsec"], rel=0.2)
+    assert found != gear["hysteresis"]["offset_arcsec"]
+
+
+def test_the_cause_is_in_the_record_where_the_secret_says(lost: Path) -> None:
+    folder = lost / "a" / "fault-000"
+    secret = unsealed(folder)
+    (hidden,) = secret["hidden"]
+    # About its mean, a step is between half of it and all of it.
+    assert 0.4 < secret["effect"]["peak_arcsec"] / hidden["size_arcsec"] < 1.1
+    time_s = Recording.load(*record_of(folder)).record.time_s
+    assert time_s[0] < hidden["parameters"]["time_s"] < time_s[-1]
+
+
+def test_the_fresh_record_is_the_same_course_with_other_noise(lost: Path) -> None:
+    folder = lost / "a" / "fault-000"
+    record, fresh = (Recording.load(*record_of(folder, name)).record for name in ("record", "fresh"))
+    assert np.array_equal(record.time_s, fresh.time_s)
+    assert not np.array_equal(record.load_position_deg, fresh.load_position_deg)
+    noise = np.std(record.load_position_deg - fresh.load_position_deg) * 3600.0
+    assert noise < 3.0 * unsealed(folder)["noise_arcsec"]
+
+
+def test_both_axes_of_a_pair_are_one_but_for_the_motor_encoder() -> None:
+    fine, coarse = (blindcase.axis_of(each, 3) for each in cases({"flicker": 1}, 3))
+    assert (fine.truth.motor.encoder.counts_per_turn, coarse.truth.motor.encoder.counts_per_turn) == (
+        2**20,
+        2**16,
+    )
+    assert fine.flicker_counts > 0.0 == coarse.flicker_counts
+    assert fine.truth.gear == coarse.truth.gear
+    assert fine.truth.load_ == coarse.truth.load_
+    assert fine.config.limits == coarse.config.limits
+
+
+@pytest.mark.parametrize("kind", work.KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_work_stays_within_the_limits_of_its_axis(kind: str, seed: int) -> None:
+    import random
+
+    from hdbridge.control.bench import axis_view
+    from hdbridge.procedures.rehearsal import rehearse
+
+    rng = random.Random(f"{kind} {seed}")
+    view = axis_view(AxisConfig.load(bundled_profile("article")))
+    place, recorded_s = 0.0, 0.0
+    way, *bursts = work.drawn_work(rng, view, kind)
+    for burst in (way, *bursts):
+        walked = rehearse(burst, view, place)  # refuses what leaves the limits
+        recorded_s += walked.duration_s if burst is not way else 0.0
+        for leg in burst.legs:
+            path = leg.path(place, view.limits)
+            place = path.at(path.duration_s)
+    longest_s = work.LONGEST_DAY_S + 3 * 160.0 if kind == "daemon" else work.LONGEST_S + 200.0
+    assert 1.0 < recorded_s < longest_s
+
+
+def test_a_suite_is_continued_and_belongs_to_one_seed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[str] = []
+
+    def fake(case: Case, seed: int, out: Path, means: bool) -> None:
+        if case.name == "none-002":
+            raise RuntimeError("no such axis")
+        made.append(case.name)
+        case.folder(out, seed).mkdir(parents=True)
+
+    monkeypatch.setattr(generate, "make", fake)
+    group = list(cases({"none": 4}, 1))
+    generate.made(group[:2], 1, tmp_path, False)
+    done = generate.made(group, 1, tmp_path, False)
+    assert made == ["none-000", "none-001", "none-003"]
+    assert [name for name, seconds in done if np.isnan(seconds)] == ["none-002"]
+    assert "no such axis" in capsys.readouterr().err
+    generate.claim(tmp_path, 1)
+    generate.claim(tmp_path, 1)
+    with pytest.raises(ValueError, match="seed 1"):
+        generate.claim(tmp_path, 2)
+
+
+@pytest.mark.parametrize("law", ["maxwell_slip", "bouc_wen", "dahl", "rolling_friction"])
+def test_the_model_s_loop_is_near_the_plant_s_whatever_its_law(law: str) -> None:
+    import random
+
+    axis = axes.drawn_axis(random.Random(4), "x", law)
+    offset, width, exponent = axes.nearest_loop(axis.truth)
+    model = yaml.safe_load(axis.model_yaml)
+    believed = model["effects"][1]["parameters"]
+    assert believed["offset_arcsec"] == pytest.approx(offset, rel=0.12)
+    assert believed["width_deg"] == pytest.approx(width, rel=0.15)
+    assert believed["exponent"] == pytest.approx(exponent, abs=0.08)
+    assert believed["offset_arcsec"] != offset
+
+
+def secret(*causes: str, also: tuple[str, ...] = (), kind: str = "single", **parameters: float) -> Any:
+    return {
+        "case": "a case",
+        "kind": kind,
+        "family": blindcase.KINDS[kind],
+        "motion": "moves",
+        "rate_hz": 50.0,
+        "counts_per_turn": 8000,
+        "law": "rolling_friction",
+        "noise_arcsec": 1.0,
+        "samples": 50_000,
+        "hidden": [{"cause": each, "size_arcsec": 3.0, "parameters": parameters} for each in causes],
+        "also": list(also),
+    }
+
+
+def finding(cause: str, *aliases: str, probability: float = 0.9, **parameters: Any) -> Any:
+    return {
+        "cause": cause,
+        "probability": probability,
+        "aliases": list(aliases),
+        "parameters": parameters,
+        "gain": {"held_out_rms_before_arcsec": 3.0, "held_out_rms_after_arcsec": 1.0},
+    }
+
+
+def document(*findings: Any) -> Any:
+    return {"schema": "hdbridge.diagnosis/1", "findings": list(findings), "extended": {"rms_arcsec": 1.1}}
+
+
+def verdict(hidden: Any, *findings: Any, model: Any = None, **answer: Any) -> Verdict:
+    return judged(hidden, Answer(document(*findings), **answer), model)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "findings", "first", "names", "wrong"),
+    [
+        (secret("wear"), [finding("wear")], "right", True, ()),
+        (secret("wear"), [finding("ratio_error", "wear")], "right", False, ()),
+        (secret("wear"), [finding("ratio_error")], "wrong", False, ("ratio_error",)),
+        (secret("wear"), [], "nothing", False, ()),
+        (secret("wear"), [finding("unexplained")], "unexplained", False, ()),
+        (secret("wear"), [finding("unexplained"), finding("wear")], "unexplained", False, ()),
+        (secret("wear"), [finding("wear"), finding("creep")], "right", True, ("creep",)),
+        (secret("wear"), [finding("wear"), finding("ratio_error", "wear")], "right", True, ("ratio_error",)),
+        (secret("wear"), [finding("creep", probability=0.5), finding("wear")], "right", True, ()),
+        (secret("wear"), [finding("wear", probability=0.5)], "nothing", False, ()),
+        (secret("wear", also=("creep",)), [finding("creep"), finding("wear")], "right", True, ()),
+        (secret(kind="none"), [], "nothing", False, ()),
+        (secret(kind="none"), [finding("backlash")], "wrong", False, ("backlash",)),
+        (secret(kind="none", also=("backlash",)), [finding("backlash")], "nothing", False, ()),
+        (secret(kind="law"), [finding("hysteresis_memory")], "right", True, ()),
+        (secret(kind="law"), [finding("hysteresis_parameters")], "wrong", False, ("hysteresis_parameters",)),
+        (secret("unexplained", kind="unknown"), [finding("unexplained")], "unexplained", False, ()),
+        (secret("unexplained", kind="unknown"), [finding("creep")], "wrong", False, ("creep",)),
+    ],
+)
+def test_a_case_is_judged_by_what_its_findings_name(
+    hidden: Any, findings: Any, first: str, names: bool, wrong: tuple[str, ...]
+) -> None:
+    found = verdict(hidden, *findings)
+    assert (found.first, found.first_names_it, found.wrong) == (first, names, wrong)
+
+
+def test_several_causes_are_met_once_each() -> None:
+    hidden = secret("wear", "creep", kind="pair")
+    both = verdict(hidden, finding("creep"), finding("ratio_error", "wear"))
+    assert both.met == ("creep", "wear")
+    assert both.wrong == ()
+    one = verdict(hidden, finding("creep"), finding("vibration"))
+    assert one.met == ("creep",)
+    assert one.wrong == ("vibration",)
+
+
+def test_what_the_axis_has_of_itself_is_told_apart_from_a_false_name() -> None:
+    found = verdict(secret(kind="healthy_work", also=("inertial_windup",)), finding("inertial_windup"))
+    assert (found.ordinary, found.wrong, found.first) == (True, (), "nothing")
+    found = verdict(secret(kind="healthy_work"), finding("inertial_windup"))
+    assert (found.ordinary, found.wrong, found.first) == (False, ("inertial_windup",), "wrong")
+
+
+@pytest.mark.parametrize(
+    ("reported", "peak_arcsec", "detectable"),
+    [
+        ({"wear": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, True),
+        ({"wear": {"detectable": True, "detection_limit_arcsec": 3.0}}, 2.0, False),
+        ({"wear": {"detectable": False, "detection_limit_arcsec": None}}, 2.0, False),
+        ({"ratio_error": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, True),  # its twin
+        ({"creep": {"detectable": True, "detection_limit_arcsec": 1.0}}, 2.0, False),
+    ],
+)
+def test_a_cause_is_detectable_if_the_report_says_so_for_what_it_does_in_the_record(
+    reported: Any, peak_arcsec: float, detectable: bool
+) -> None:
+    hidden = {**secret("wear", kind="fault"), "effect": {"peak_arcsec": peak_arcsec, "rms_arcsec": 0.5}}
+    found = judged(hidden, Answer({**document(), "identifiability": reported}))
+    assert found.detectable is detectable
+    assert found.effect_over_noise == 0.5
+
+
+def test_a_claimed_gain_is_held_against_a_fresh_record() -> None:
+    fresh = {
+        "fresh_given": {"baseline": {"rms_arcsec": 3.1}},
+        "fresh_extended": {"baseline": {"rms_arcsec": 1.21}},
+    }
+    found = verdict(secret("wear"), finding("wear"), **fresh)
+    assert found.fresh_gain == pytest.approx((3.1**2 - 1.21**2) ** 0.5 / 8.0**0.5)
+    assert found.fresh_left == pytest.approx(1.1)
+    both = verdict(secret("wear"), finding("wear"), finding("creep"), **fresh)
+    assert both.fresh_gain is None
+    assert both.fresh_left == pytest.approx(1.1)
+
+
+@pytest.mark.parametrize(
+    ("cause", "effects", "unwritten"),
+    [
+        ("wear", {"hysteresis": 20.0, "wear": 1.0}, ()),
+        ("wear", {"hysteresis": 21.0}, ("wear",)),
+        ("hysteresis_parameters", {"hysteresis": 21.0}, ()),
+        ("hysteresis_parameters", {"hysteresis": 20.0}, ("hysteresis_parameters",)),
+    ],
+)
+def test_what_is_named_is_looked_for_in_the_written_model(
+    cause: str, effects: dict[str, float], unwritten: tuple[str, ...]
+) -> None:
+    def model(values: dict[str, float]) -> Any:
+        return {"effects": [{"effect": name, "parameters": {"x": each}} for name, each in values.items()]}
+
+    given = model({"hysteresis": 20.0})
+    found = verdict(secret("wear"), finding(cause), model=given, extended=model(effects))
+    assert found.unwritten == unwritten
+
+
+def test_parameters_are_compared_where_both_have_them() -> None:
+    hidden = secret("channel_skew", delay_ms=-0.5)  # the age of the load's sample
+    late = {"value": 0.55, "unit": "ms", "ci95": [0.45, 0.65]}
+    found = verdict(hidden, finding("channel_skew", delay_ms=late))
+    assert [(each.true, each.covered) for each in found.compared] == [(0.5, True)]
+    assert found.compared[0].error == pytest.approx(0.1)
+    early = {"value": -0.7, "unit": "ms", "ci95": [-0.8, -0.6]}
+    found = verdict(hidden, finding("channel_skew", delay_ms=early))
+    assert [each.covered for each in found.compared] == [False]
+    assert verdict(hidden, finding("velocity_windup", delay_ms=late)).compared == ()
+
+
+def value(value: float, half: float = 0.1) -> dict[str, Any]:
+    return {"value": value, "ci95": [value - half, value + half]}
+
+
+def test_a_change_of_a_motor_order_is_that_against_the_given_model() -> None:
+    hidden = secret("motor_encoder_eccentricity", amplitude_arcsec=2.0, second_arcsec=0.0)
+    disc = {"radius_mm": 20.0, "eccentricity_um": 20e3 * 2.0 * 50 / 206264.8, "eccentric_at_deg": 30.0}
+    truth = {
+        "gear": {"ratio": 50.0, "motor_orders": [{"order": 1, "amplitude_arcsec": 3.0, "phase_deg": 60.0}]},
+        "motor": {"encoder": {"disc": disc}},
+    }
+    given = {"orders": [{"order": 1, "amplitude_arcsec": 1.0, "phase_deg": 60.0}]}
+    model = {"effects": [{"effect": "synchronous", "parameters": given}]}
+    found = finding("motor_order", order_1_amplitude_arcsec=value(4.05), order_1_phase_deg=value(420.05))
+    compared = verdict({**hidden, "truth": truth}, found, model=model).compared
+    # The disc's -2 sin(a - 30) is 2 cos(a + 60), in phase with the 3 - 1 that the model is short of.
+    assert [each.true for each in compared] == pytest.approx([4.0, 420.0], abs=1e-3)
+    assert all(each.covered for each in compared)
+
+
+def test_a_spring_is_compared_as_soft_as_a_cause_hidden_after_it_has_left_it() -> None:
+    hidden = secret("compliance", compliance_arcsec_per_nm=0.5, stiffness_nm_per_rad=412529.6)
+    truth = {"gear": {"stiffness_nm_per_rad": 206264.8}}
+    found = finding("compliance", c1_arcsec_per_nm=value(1.0))
+    (compared,) = verdict({**hidden, "truth": truth}, found).compared
+    assert compared.true == pytest.approx(1.0)
+
+
+def test_an_interpolation_error_is_compared_by_its_harmonics_and_not_by_its_signals() -> None:
+    signals = {"lines_per_turn": 2000, "sine_offset": 0.1, "gain_mismatch": 0.2}
+    names = [f"order_{order}_amplitude_arcsec" for order in (1, 2)]
+    hidden, truth = (
+        secret("subdivisional_error", lines_per_turn=2000),
+        {"load": {"encoder": {"signals": signals}}},
+    )
+    found = finding("subdivisional_error", **dict.fromkeys(names, value(10.0)))
+    compared = verdict({**hidden, "truth": truth}, found).compared
+    # The reading is the angle of exp(i p) (1 + u z + w z^2), z = exp(-i p), to u z + (w - u^2 / 2) z^2.
+    u, w = 0.1 / 1.1, 0.1 / 1.1
+    expected = [u * 206264.8 / 2000, (w - 0.5 * u**2) * 206264.8 / 2000]
+    assert [each.true for each in compared] == pytest.approx(expected, rel=1e-6)
+
+
+def test_growths_are_compared_in_per_cent_and_springs_as_compliances() -> None:
+    hidden = secret("torque_modulation", also=("compliance",), growth_per_nm=0.03)
+    truth = {"gear": {"stiffness_nm_per_rad": 206264.8}}
+    found = [
+        finding("torque_modulation", growth_percent_per_nm=value(3.05)),
+        finding("compliance", c1_arcsec_per_nm=value(1.2)),
+    ]
+    compared = verdict({**hidden, "truth": truth}, *found).compared
+    assert {each.name: (pytest.approx(each.true), each.covered) for each in compared} == {
+        "growth_percent_per_nm": (3.0, True),
+        "c1_arcsec_per_nm": (1.0, False),
+    }
+
+
+def test_of_several_lost_counts_the_one_nearest_in_time_is_compared() -> None:
+    hidden = secret("count_loss", time_s=100.0, step_arcsec=5.0)
+    steps = {
+        "step_1_time_s": value(30.0),
+        "step_1_size_arcsec": value(0.5),
+        "step_2_time_s": value(100.05),
+        "step_2_size_arcsec": value(5.02),
+    }
+    compared = verdict(hidden, finding("count_loss", **steps)).compared
+    assert {each.name for each in compared} == {"step_2_time_s", "step_2_size_arcsec"}
+    assert all(each.covered for each in compared)
+
+
+def test_the_interval_of_a_rate_is_wilson_s() -> None:
+    assert tables.wilson(0, 200) == pytest.approx((0.0, 0.018846), abs=1e-5)
+    assert tables.wilson(95, 100) == pytest.approx((0.888249, 0.978458), abs=1e-5)
+    assert tables.rate([]) == "-"
+    assert tables.rate([True, False]) == "1 / 2 (50.0 %; 9.5 to 90.5)"
+
+
+STAND_IN = """
+import json, sys
+from pathlib import Path
+case = Path(sys.argv[1]).parent
+if "broken" in case.name or "refused" in case.name:
+    print("error: no such thing", file=sys.stderr)
+    raise SystemExit(3 if "broken" in case.name else 2)
+says = json.loads((case / "says.json").read_text())
+extended = "extended" in sys.argv[sys.argv.index("--model") + 1]
+rms = 1.0 if extended else 3.0
+answer = {
+    "schema": "hdbridge.diagnosis/1", "findings": says, "baseline": {"rms_arcsec": rms},
+    "extended": {"rms_arcsec": 1.0},
+}
+Path(sys.argv[sys.argv.index("--json") + 1]).write_text(json.dumps(answer))
+if "--extend" in sys.argv:
+    text = json.dumps({"effects": [{"effect": each["cause"], "parameters": {}} for each in says]})
+    Path(sys.argv[sys.argv.index("--extend") + 1]).write_text(text)
+with (case / "runs").open("a") as file:
+    file.write(Path(sys.argv[1]).name + "\\n")
+"""
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> str:
+    """A diagnosis that says what stands next to the record."""
+    path = tmp_path / "stand_in.py"
+    path.write_text(STAND_IN)
+    return f"{sys.executable} {path}"
+
+
+def suite(folder: Path, cases: dict[str, tuple[Any, list[Any]]], seed: int = 1) -> None:
+    folder.mkdir()
+    generate.claim(folder, seed)
+    for name, (hidden, findings) in cases.items():
+        case = folder / name
+        case.mkdir()
+        blindcase.seal(case, seed, {**hidden, "case": name})
+        (case / "says.json").write_text(json.dumps(findings))
+        for record in ("record.csv", "fresh.csv") if hidden["hidden"] else ("record.csv",):
+            (case / record).touch()
+
+
+def test_a_suite_is_diagnosed_in_processes_and_reported_in_tables(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "suite"
+    fault = secret("creep", kind="fault")
+    suite(
+        folder,
+        {
+            "a": (secret("wear"), [finding("wear", probability=0.97)]),
+            "b": (secret("creep"), [finding("vibration", probability=0.6)]),
+            "c": (secret(kind="none"), []),
+            "d": (secret("wear", "creep", kind="pair"), [finding("wear"), finding("backlash")]),
+            "e": (secret("unexplained", kind="unknown"), [finding("unexplained")]),
+            "f": ({**secret("creep", kind="power"), "over_noise": 3.0}, [finding("creep")]),
+            "g": (secret(kind="healthy_work"), [finding("count_loss")]),
+            "h": ({**fault, "effect": {"peak_arcsec": 2.0, "rms_arcsec": 1.5}}, [finding("creep")]),
+            "refused": (secret(kind="healthy_work"), []),
+        },
+    )
+    assert score.main([str(folder), "--command", command]) == 0
+    said = capsys.readouterr().out
+    for line in (
+        "9 cases of seed 1 (development)",
+        "| single: right first | 1 / 2 (50.0 %; 9.5 to 90.5) | 99 % |",
+        "| single: wrong first | 1 / 2 (50.0 %; 9.5 to 90.5) |",
+        "| nothing hidden: silent | 1 / 1 (100.0 %; 20.7 to 100.0) |",
+        "| unknown: unexplained leads | 1 / 1 (100.0 %; 20.7 to 100.0) |",
+        "| pair: recall | 1 / 2 (50.0 %; 9.5 to 90.5) | 97 % |",
+        "| pair: precision | 1 / 2 (50.0 %; 9.5 to 90.5) | 97 % |",
+        "| 3 | 1 / 1 (100.0 %; 20.7 to 100.0) |",
+        "| healthy, work: false name | 1 / 2 (50.0 %; 9.5 to 90.5) | at most 1 % |",
+        "| one fault: right first | 1 / 1 (100.0 %; 20.7 to 100.0) |",
+        "| a finding's gain holds on a fresh record | 1 / 1 (100.0 %; 20.7 to 100.0) | all |",
+        "| refused | 1 / 3 (33.3 %; 6.1 to 79.2) |",
+        "| 1 to 3 | 0 / 1 (0.0 %; 0.0 to 79.3) | 1 / 1 (100.0 %; 20.7 to 100.0) |",
+    ):
+        assert line in said, said
+    assert "| d |" not in said
+    assert score.main([str(folder), "--command", command, "--cases"]) == 0
+    assert "| d | wear, creep | wear, backlash | missed creep; wrong backlash |" in capsys.readouterr().out
+    # Once each, and the fresh record only where something was named that had been hidden.
+    runs = {path.parent.name: path.read_text().split() for path in folder.glob("*/runs")}
+    assert runs["a"] == ["record.csv", "fresh.csv", "fresh.csv"]
+    assert runs["c"] == runs["e"] == runs["g"] == ["record.csv"]
+
+
+def test_answers_are_kept_and_failures_reported(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, answers = tmp_path / "suite", tmp_path / "before"
+    suite(folder, {"broken": (secret("wear"), [])})
+    arguments = [str(folder), "--answers", str(answers), "--cases"]
+    assert score.main([*arguments, "--command", command]) == 1
+    assert "| broken | wear | - | exit status 3; missed wear |" in capsys.readouterr().out
+    assert "no such thing" in (answers / "broken" / "answer.json").read_text()
+    assert score.main([*arguments, "--command", "/no/such/command"]) == 1
+    assert score.main([str(tmp_path / "empty")]) == 2
+
+
+def test_the_cases_of_a_held_out_suite_are_not_listed(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "suite"
+    suite(folder, {"a": (secret("wear"), [finding("creep")])}, seed=1000)
+    assert score.main([str(folder), "--command", command, "--cases"]) == 2
+    said = capsys.readouterr()
+    assert "held out" in said.err
+    assert not said.out
+    assert score.main([str(folder), "--command", command]) == 0
+    assert "| single: wrong first | 1 / 1 (100.0 %; 20.7 to 100.0) |" in capsys.readouterr().out
