@@ -164,7 +164,7 @@ def judged(secret: Data, answer: Answer, model: Data | None = None) -> Verdict:
             each["cause"] in also and each not in relevant and each["probability"] > NAMED_ABOVE
             for each in findings
         ),
-        detectable=_detectable(answer.diagnosis, known, effect),
+        detectable=_detectable(answer.diagnosis, known, secret),
         probabilities=tuple((float(each["probability"]), right) for each, right in rights),
         compared=tuple(_compared(secret, findings, model or {})),
         fresh_gain=fresh_gain,
@@ -192,14 +192,16 @@ def _first(first: Data | None, expected: tuple[str, ...]) -> str:
     return "right" if _meets(first, expected) else "wrong"
 
 
-def _detectable(diagnosis: Data | None, known: tuple[str, ...], effect: Data) -> bool | None:
+def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) -> bool | None:
     """The identifiability report of the cause, or of its structural twin, covers what the cause does here."""
-    if diagnosis is None or len(known) != 1 or not effect:
+    if diagnosis is None or len(known) != 1 or not secret.get("effect"):
         return None
+    # What the cause does here is not more of it than there is: a mass also winds up the spring, for example.
+    peak_arcsec = min(secret["effect"]["peak_arcsec"], secret["hidden"][0]["size_arcsec"])
     names = {known[0], *(each for twins in TWINS if known[0] in twins for each in twins)}
     reports = [diagnosis.get("identifiability", {}).get(each) for each in names]
     return any(
-        each["detectable"] and (each["detection_limit_arcsec"] or 0.0) <= effect["peak_arcsec"]
+        each["detectable"] and (each["detection_limit_arcsec"] or 0.0) <= peak_arcsec
         for each in reports
         if each
     )
