@@ -54,8 +54,7 @@ def hold(
             _tell_page(listeners[-1], token, tls=tcp is not None and tcp.certificate is not None)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
         start = Start(
-            machine, memory.fd, os.getpid(), simulation=simulation, force=force, runtime=folder,
-            page_token=token, log=log,
+            machine, memory.fd, os.getpid(), simulation=simulation, force=force, page_token=token, log=log,
         )  # fmt: skip
         return Keeper(start, memory, listeners, Notifier.of_environment()).run()
 

@@ -50,8 +50,6 @@ class Start:
     simulation: Simulation | None = None
     force: bool = False
     """Speak even where another master is heard. The lock of the interface is the keeper's either way."""
-    runtime: Path = Path()
-    """The runtime folder."""
     api_fds: tuple[int, ...] = ()
     """Listening sockets, the Unix one first; the service's."""
     page_token: str | None = None

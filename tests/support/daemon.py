@@ -25,9 +25,11 @@ from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
 from hdbridge.drive.objects import Mode
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.node import SimulatedDrive
@@ -188,6 +190,19 @@ class SteppedDaemon:
         """`order`, and it has to be done."""
         answer = self.order(kind, axis, **fields)
         assert answer.kind is EventKind.DONE, answer.text
+
+    def setting(
+        self, axis: int = 0, scheme: Scheme = Scheme.EXTENDED, model: TransmissionModel | None = None,
+        *, load_loop: bool = False,
+    ) -> CompensationSetting:  # fmt: skip
+        """A compensation setting of an axis; of the article's model by default."""
+        config = self.axes[axis].config
+        model = model or TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
+        return CompensationSetting(model, scheme, load_loop=load_loop)
+
+    def use(self, setting: CompensationSetting, axis: int = 0) -> None:
+        """Have the loop compensate by a setting."""
+        self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
 
     def drive(self, axis: int) -> Drive:
         """The service's drive object of an axis, over the relay."""

@@ -55,7 +55,7 @@ class Controller:
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
-            AxisLoop(index, setup, memory.knots[index], memory.blobs, self._tell)
+            AxisLoop(index, setup, memory.knots[index], memory.settings[index], self._tell)
             for index, setup in enumerate(setups)
         )
         for axis in self.axes:

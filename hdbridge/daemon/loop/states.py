@@ -95,7 +95,7 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
         for state in (_S.UNVERIFIED, _S.DISABLED, _S.QUICK_STOPPED, _S.LATCHED)
     ),
     # What compensates is the service's choice at any time.
-    *(Transition(state, kind, state) for state in _S for kind in (_C.COMPENSATE, _C.CHANGE, _C.LOAD_LOOP)),
+    *(Transition(state, _C.CHANGE, state) for state in _S),
     *(Transition(state, _H.STOP_LATCHED, _S.QUICK_STOPPED) for state in _SPEAKING),
     *(
         Transition(state, _H.VERIFICATION_LOST, _S.LATCHED)

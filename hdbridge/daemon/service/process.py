@@ -64,7 +64,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, runtime=start.runtime, simulated=start.simulation is not None,
+            machine, memory, timing, simulated=start.simulation is not None,
             recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
         )  # fmt: skip
         metrics = Metrics()

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.service.lease import Lease
-    from hdbridge.daemon.service.models import InUse
     from hdbridge.daemon.service.ports import ServiceAxis
+    from hdbridge.daemon.setting import CompensationSetting
 
 FAULTS: Final = tuple(Fault)
 STATES: Final = tuple(messages.ControlState)
@@ -91,7 +91,7 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
     )
 
 
-def model_in_use(in_use: InUse) -> messages.ModelInUse | None:
+def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
     """The model and its age; None where there is none."""
     if not in_use.model.effects:
         return None
@@ -99,7 +99,7 @@ def model_in_use(in_use: InUse) -> messages.ModelInUse | None:
     age_s = max((datetime.now(UTC) - date).total_seconds(), 0.0) if date is not None else None
     return messages.ModelInUse(
         version=in_use.version,
-        file=str(in_use.file),
+        file=str(in_use.file or ""),
         date=date,
         age_s=age_s,
         reason=str(in_use.model.provenance.get("reason", "")),
@@ -170,7 +170,7 @@ def axis_state(
         model=model_in_use(in_use),
         load_loop=messages.LoadLoopState(
             configured=axis.axis.load_loop is not None,
-            on=axis.load_loop_on,
+            on=in_use.load_loop,
             correction_arcsec=link.value("loop_arcsec"),
         ),
         adaptation=adaptation,

@@ -5,7 +5,6 @@ Blocking, for one worker thread; several benches of a job follow each other.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Unpack
@@ -80,11 +79,7 @@ class DaemonRig:
         """Power on, standing still, compensated anew from here on."""
         if self.state is not AxisState.DISABLED:
             self.disable()
-        number = self.core.memory.blobs.put(pickle.dumps(compensation))
-        self.command(CommandKind.CHANGE, i=number)
-        self.command(CommandKind.COMPENSATE, i=1)
-        if self._axis.axis.load_loop is not None:
-            self.command(CommandKind.LOAD_LOOP, i=0)  # what is measured is the axis without it
+        self.command(CommandKind.CHANGE, i=self._axis.models.send_for_job(compensation.model))
         seeds = self._axis.commissioning.prepare()
         self.command(CommandKind.ENABLE, POWER_S, **seeds.arguments())
 

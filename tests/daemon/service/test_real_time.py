@@ -43,7 +43,7 @@ async def verified(bridge: ServiceBridge) -> None:
 def test_many_things_at_once(tmp_path: Path) -> None:
     async def story(service: Service) -> None:
         timing = RealTiming(8)
-        async with ServiceBridge(service.machine, service.daemon.memory, timing, runtime=tmp_path) as bridge:
+        async with ServiceBridge(service.machine, service.daemon.memory, timing) as bridge:
             await verified(bridge)
             token = bridge.lease.take("test")
             await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))
