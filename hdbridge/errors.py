@@ -18,7 +18,10 @@ A message says what is wrong, where (file:line:column, node and object), what wa
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
 """
 
-from typing import ClassVar
+from typing import ClassVar, Final
+
+RESET: Final = "'hdbridge reset PROFILE', or 'hdbridge ctl reset AXIS' if a daemon holds the drive"
+"""The command that resets a fault; every message that asks for a reset names it."""
 
 
 class HdbridgeError(Exception):

@@ -196,12 +196,14 @@ class Drive:
         self._mode = None
         _log.info("disabled", {"node": self.axis.drive.node_id, "state": state.value})
 
-    def fault_reset(self) -> None:
-        """Reset a fault: a rising edge on bit 7. `TransitionError` when there is none, `DriveError` when "
-        "it stays.
+    def fault_reset(self) -> str:
+        """Resets a fault by a rising edge on bit 7; returns its error code and last emergency in words.
+
+        Raises `TransitionError` if the drive is not in fault, `DriveError` if the fault stays.
         """
         commander = self._commander
         row_for(commander.state(), Command.FAULT_RESET)
+        words = commander.fault_words()
         commander.control(0x0000)
         commander.control(Command.FAULT_RESET.word)
         try:
@@ -216,6 +218,7 @@ class Drive:
         finally:
             commander.control(0x0000)
         commander.state()
+        return words
 
     def quick_stop(self) -> State:
         """Stop at once. What follows is 605Ah's choice; the state in which the drive then is."""

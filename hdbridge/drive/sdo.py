@@ -25,7 +25,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import COB_SDO_ANSWER, COB_SDO_REQUEST, STANDARD, Address, IntegerType
-from hdbridge.errors import InputError, SdoError
+from hdbridge.errors import RESET, InputError, SdoError
 
 _log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
@@ -65,7 +65,7 @@ _ADVICE: Final = {
     0x0609_0031: "the drive refuses the value as too high: lower it in the axis file",
     0x0609_0032: "the drive refuses the value as too low: raise it in the axis file",
     0x0800_0021: "another controller holds the drive (local or fieldbus): release it there",
-    0x0800_0022: "the drive refuses in its present state: disable it or reset its fault first",
+    0x0800_0022: f"the drive refuses in its present state: disable it, or reset its fault: {RESET}",
 }
 
 

@@ -26,7 +26,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Reaction, Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
-from hdbridge.errors import HdbridgeError, InputError, TransitionError
+from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
@@ -220,7 +220,7 @@ class AxisLoop:
         if state is not State.SWITCH_ON_DISABLED:
             raise TransitionError(
                 f"{self.config.name}: the drive is in '{state.value}', but it is enabled from 'switch on "
-                "disabled'; reset its fault, or disable it first"
+                f"disabled'; reset its fault ({RESET}), or disable it first"
             )
         self.image.check_target(command.i)
         self._seed(command)
@@ -241,7 +241,7 @@ class AxisLoop:
 
     def _quick_stop(self, _: Command) -> None:
         if self.state in (*_UNDER_COMMAND, AxisState.LENT):
-            self._why = "quick stop by command: latched; reset it when the axis may move again"
+            self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
             # What the service does by SDO is overruled by the next RPDO.
             self.image.power.quick_stop()

@@ -147,10 +147,7 @@ class Controller:
     def _command(self, command: Command) -> None:
         try:
             kind = CommandKind(command.kind)
-            if kind is CommandKind.ENDING:
-                self._tell(_ALL, EventKind.DONE, command.id)
-                self.end()
-            elif kind is CommandKind.STREAM_BEGIN:
+            if kind is CommandKind.STREAM_BEGIN:
                 self._begin_stream(command)
             elif command.axis == _ALL and kind in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 for axis in self.axes:

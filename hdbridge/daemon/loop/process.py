@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> int:
 
 
 def run(start: Start) -> None:
-    """Turn the loop of a machine until SIGTERM, ``STOP_ASKED`` or an ENDING command has brought it to rest.
+    """Turn the loop of a machine until SIGTERM or ``STOP_ASKED`` has brought it to rest.
 
     Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is heard on it.
     """

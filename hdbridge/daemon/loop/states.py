@@ -113,8 +113,8 @@ _WAY_OUT: Final = {
     _S.ENABLED: "disable it first",
     _S.STOPPING: "wait until it is disabled",
     _S.LENT: "wait until the service has given it back",
-    _S.QUICK_STOPPED: "remove the cause, then reset it",
-    _S.LATCHED: "remove the cause, verify the drive again, then reset it",
+    _S.QUICK_STOPPED: "remove the cause, then reset it: hdbridge ctl reset AXIS",
+    _S.LATCHED: "remove the cause, then reset it, which verifies the drive again: hdbridge ctl reset AXIS",
 }
 """What a person does where a command is refused."""
 

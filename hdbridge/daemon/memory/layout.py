@@ -97,8 +97,6 @@ class CommandKind(IntEnum):
     """Compensate by another setting; i is its number."""
     DRIVE_FAULT_RESET = 15
     """Reset the drive's own fault, by its controlword."""
-    ENDING = 16
-    """Axis -1: stop all in order, disable, end the process."""
 
 
 class EventKind(IntEnum):

@@ -200,7 +200,9 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
         else fault.value
         if fault is not None
         else "quick stop by command",
-        hint=ROWS[fault].hint if fault is not None else "reset it when the axis may move again",
+        hint=ROWS[fault].hint
+        if fault is not None
+        else f"reset it when the axis may move again: hdbridge ctl reset {axis.name}",
         cycle=event.cycle if event is not None else None,
         date=stopped.date if stopped is not None else None,
         needs_verification=link.state is AxisState.LATCHED,

@@ -139,7 +139,8 @@ class DaemonRig:
             if told:
                 return SafetyStop(f"{self._axis.name}: {told[-1].text}")
             self.wait(self.period_s)
-        return SafetyStop(f"{self._axis.name}: {self._activity.over or 'the axis was stopped; reset it'}")
+        why = self._activity.over or f"the axis was stopped; reset it: hdbridge ctl reset {self._axis.name}"
+        return SafetyStop(f"{self._axis.name}: {why}")
 
     def _look(self) -> None:
         rows, _ = self._reader.read()
