@@ -84,7 +84,11 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
 
 def shared_eds(path: Path, node_id: int) -> ObjectDictionary:
     """As `load_eds`, parsed once, which takes longer than to boot a simulated drive: not to be changed."""
-    return _read_as_of(path.stat().st_mtime_ns if path.exists() else 0, path, node_id)
+    try:
+        modified_ns = path.stat().st_mtime_ns
+    except OSError:
+        modified_ns = 0  # `load_eds` reports it
+    return _read_as_of(modified_ns, path, node_id)
 
 
 @lru_cache(maxsize=8)
