@@ -286,6 +286,7 @@ def stepped_daemon(
     setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
     truth: Path | Truth = PROFILE / "truth.yaml",
     character: Character = FRIENDLY,
+    bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
     """A control loop with simulated axes, none verified yet; with the article's model by default."""
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
@@ -306,7 +307,7 @@ def stepped_daemon(
             return None if spoilt.down is not None else Link(spoilt, clock)
 
         def begin() -> Controller:
-            cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=1_000_000)
+            cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=bitrate_bps)
             setups = [
                 setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
             ]

@@ -11,9 +11,11 @@ import json
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
 
 from hdbridge.client.messages.problem import CONTENT_TYPE, Problem
 from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, Rate, too_deep
@@ -91,7 +93,8 @@ class Guard:
         problem = self._refused(scope)
         if problem is None:
             _log.info("websocket", _about(scope))
-            with self._traffic.under_way("websocket"):
+            # A client may go at any moment, also while it is told why its WebSocket is closed.
+            with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
             return

@@ -145,8 +145,9 @@ class _WebSocket(WebSocketsSansIOProtocol):
 
 
 def _worth_telling(record: logging.LogRecord) -> bool:
-    """Not what the server takes for an error of the application: a WebSocket that was refused."""
-    return "without completing handshake" not in record.getMessage()
+    """Drops what a client has done: a WebSocket that was refused, and a message that is not UTF-8."""
+    words = record.getMessage()
+    return "without completing handshake" not in words and "Invalid UTF-8" not in words
 
 
 def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:
