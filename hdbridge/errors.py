@@ -69,6 +69,11 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
 
     exit_status = 5
 
+    def __init__(self, text: str, hint: str = "") -> None:
+        """``text`` says what happened, ``hint`` what a person does about it."""
+        super().__init__(f"{text}; {hint}" if hint else text)
+        self.text, self.hint = text, hint
+
 
 class OutputError(HdbridgeError):
     """A file could not be written after all, such as on a full disk; the old one stands."""

@@ -159,7 +159,9 @@ class AxisCycle:
         stop = supervision.error()
         if supervision.reaction is not Reaction.QUICK_STOP or self.riding or self.confirmed:
             return stop
-        return SafetyStop(f"{stop}; the drive did not confirm it: its own watchdogs have to stop it")
+        return SafetyStop(
+            f"{stop.text}; the drive did not confirm it: its own watchdogs have to stop it", stop.hint
+        )
 
     # ---------------------------------------------------------------- for the bus
 

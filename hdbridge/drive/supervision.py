@@ -109,7 +109,8 @@ EMERGENCIES_TOLD: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
 """What a drive does by itself, and for reasons that it knows best."""
 _EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
-_AS_IT_SAYS: Final = f"remove that cause, then reset the fault: {RESET}"
+EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
+"""What to do about a stop that an emergency message of the drive explains."""
 
 
 class Event(NamedTuple):
@@ -214,9 +215,9 @@ class Supervision:
         then = "" if gravest.fault is stop.fault else f"; then {gravest.fault.value}"
         said = self._emergencies(stop.cycle - 1)
         told = f"; the drive sent {', '.join(said)}" if said else ""
-        hint = _AS_IT_SAYS if said and stop.fault in _BY_THE_DRIVE else row.hint
+        hint = EXPLAINED_HINT if said and stop.fault in _BY_THE_DRIVE else row.hint
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched; {hint}"
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched", hint
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:

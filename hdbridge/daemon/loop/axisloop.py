@@ -24,7 +24,7 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.supervision import Reaction, Supervision
+from hdbridge.drive.supervision import EXPLAINED_HINT, Reaction, Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
 from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
@@ -394,7 +394,10 @@ class AxisLoop:
         self.stands = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
-        self._tell(self.index, EventKind.STOPPED, 0, code, self._stop_words())
+        error = self.cycle.stopped
+        explained = error is not None and error.hint == EXPLAINED_HINT
+        text = error.text if error is not None else self._why
+        self._tell(self.index, EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
         """Whether the quick stop of a command is over: the motor stands, or the time for it has passed."""

@@ -111,7 +111,9 @@ class EventKind(IntEnum):
     FAULT = 4
     """``code`` is the index in ``list(Fault)``, ``text`` the detail."""
     STOPPED = 5
-    """The supervision has latched; ``text`` is the whole explanation, ``code`` the index of its cause."""
+    """The supervision has latched; ``text`` explains it, ``code`` is the index of its cause (`NO_FAULT`: a
+    command), ``id`` is 1 if an emergency message of the drive explains it.
+    """
     MOTION_ENDED = 6
     """The set-point has come to rest; ``code`` is the `MotionMode` that has ended, ``id`` its command."""
     UNDERRUN = 7

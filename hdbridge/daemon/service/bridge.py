@@ -29,6 +29,7 @@ from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.daemon.service.power import UNKNOWN
+from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
 
@@ -152,8 +153,11 @@ class ServiceBridge:
             event = entry.event
             if event is None:
                 continue
-            if event.kind is EventKind.STOPPED and 0 <= event.axis < len(self._names):
-                self._stopped[self._names[event.axis]] = entry
+            name = self._names[event.axis] if event.axis >= 0 else ""
+            if event.kind is EventKind.STOPPED:
+                self._stopped[name] = entry
+            elif event.kind is EventKind.STATE and event.code in LATCHED:
+                self._stopped.pop(name, None)  # why it stopped is told when it stands
             elif event.kind is EventKind.BUS_DOWN:
                 self._bus_up = False
             elif event.kind is EventKind.BUS_UP:
@@ -243,6 +247,7 @@ class ServiceBridge:
 
     def axis_state(self, name: str) -> messages.AxisState:
         """Everything about one axis at the newest cycle."""
+        self._look()
         adaptation = self.adaptations.get(name)
         return reports.axis_state(
             self._axis(name),

@@ -19,6 +19,7 @@ from hdbridge.daemon.service.activity import Activity
 from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
 from hdbridge.daemon.service.power import POWER_S
 from hdbridge.daemon.service.procedures import DaemonBench
+from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.errors import DaemonError, HdbridgeError, SafetyStop
 from hdbridge.model import TransmissionModel
 
@@ -137,7 +138,8 @@ class DaemonRig:
         while clock.now() < deadline_s:
             told = [each for each in log.of_axis(self.index, since) if each.kind is EventKind.STOPPED]
             if told:
-                return SafetyStop(f"{self._axis.name}: {told[-1].text}")
+                name = self._axis.name
+                return SafetyStop(f"{name}: {told[-1].text}", stop_hint(told[-1], name))
             self.wait(self.period_s)
         why = self._activity.over or f"the axis was stopped; reset it: hdbridge ctl reset {self._axis.name}"
         return SafetyStop(f"{self._axis.name}: {why}")
