@@ -8,7 +8,7 @@ import socket
 import sys
 from contextlib import ExitStack
 
-from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
+from hdbridge.daemon.api.sockets import file_of, tcp_socket, unix_socket
 from hdbridge.daemon.keeper import Keeper
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
@@ -53,10 +53,9 @@ def hold(
         if page is not None:
             _tell_page(listeners[-1], token)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
-        bound = path.lstat()
         start = Start(
             machine, memory.fd, os.getpid(), simulation=simulation, force=force, socket=path,
-            socket_file=(bound.st_dev, bound.st_ino), page_token=token, log=log,
+            socket_file=file_of(path), page_token=token, log=log,
         )  # fmt: skip
         return Keeper(start, memory, listeners, Notifier.of_environment()).run()
 

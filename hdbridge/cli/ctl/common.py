@@ -79,7 +79,9 @@ def _who_holds(at: str | None) -> str:
     with suppress(HdbridgeError, OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as raw:
         raw.settimeout(STOP_S)
         raw.connect(str(find(at).socket))
-        number, _, _ = struct.unpack("3i", raw.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        listens, _, _ = struct.unpack("3i", raw.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        # The service listens; its parent is the keeper, which holds the interface.
+        number = int(Path(f"/proc/{listens}/stat").read_text().rpartition(")")[2].split()[1])
         found.setdefault(number, f"the daemon is {process_words(number)}")
     if not found:
         return "no process of this machine holds an interface"

@@ -60,6 +60,12 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
     return listener
 
 
+def file_of(path: Path) -> tuple[int, int]:
+    """Device and inode of a socket file: another file of that name is not the one that was bound."""
+    found = path.lstat()
+    return found.st_dev, found.st_ino
+
+
 def tcp_socket(port: int, option: str = "api.tcp.port") -> socket.socket:
     """A listening TCP socket that only this machine reaches.
 

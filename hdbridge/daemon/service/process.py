@@ -19,7 +19,7 @@ from typing import Final
 from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
-from hdbridge.daemon.api.sockets import unix_socket
+from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
@@ -134,24 +134,25 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
 
 async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
     """Bind the Unix socket again whenever its file is gone; connections that are open stay."""
-    path, ours, noted = start.socket, start.socket_file, ""
+    path, bound, noted = start.socket, start.socket_file, ""
     while True:
-        await asyncio.sleep(LOOK_S)
+        found = (0, 0)
         with suppress(OSError):
-            found = path.lstat()
-            if (found.st_dev, found.st_ino) == ours:
-                continue
+            found = file_of(path)
+        if found == bound:
+            await asyncio.sleep(LOOK_S)
+            continue
         try:
             if start.machine.api.socket is None:
                 runtime_folder()
             listener = unix_socket(path, start.machine.api.group)
-            found = path.lstat()
+            bound, noted = file_of(path), ""
         except (HdbridgeError, OSError) as problem:
             if str(problem) != noted:
                 noted = str(problem)
                 note(f"clients cannot connect: the socket file is gone and cannot be bound again: {problem}")
+            await asyncio.sleep(LOOK_S)
             continue
-        ours, noted = (found.st_dev, found.st_ino), ""
         server.add(Listener(listener, Policy()))
         note(f"{path}: the socket file was gone; it is bound again")
 

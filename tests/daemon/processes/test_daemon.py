@@ -48,12 +48,6 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         daemon.ask("compensate", scheme="hysteresis")
         (control,), (service,) = daemon.pids("control"), daemon.pids("service")
 
-        daemon.socket.unlink()
-        daemon.until(daemon.socket.exists, "the socket file is bound again")
-        assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o660
-        with httpx.Client(transport=httpx.HTTPTransport(uds=str(daemon.socket), verify=False)) as new:
-            assert new.get("http://hdbridge/api/v1/state").status_code == 200
-
         os.kill(service, signal.SIGSTOP)
         stop = run_to_its_end(tmp_path, "stop", command="ctl")
         os.kill(service, signal.SIGCONT)
@@ -78,6 +72,12 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         daemon.ask("enable")
         assert daemon.ask("move", target_deg=2.0).json()["correction_arcsec"] != 0.0
         assert len(daemon.pids("service")) == 2
+
+        daemon.socket.unlink()
+        daemon.until(daemon.socket.exists, "the socket file is bound again")
+        assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o660
+        with httpx.Client(transport=httpx.HTTPTransport(uds=str(daemon.socket), verify=False)) as new:
+            assert new.get("http://hdbridge/api/v1/state").status_code == 200
 
         daemon.process.send_signal(signal.SIGHUP)
         assert daemon.ended() == 0
