@@ -359,6 +359,11 @@ class AxisConfig(OtherChannels):
         return f"{self.path}:{line}:{column}: {key}"
 
     @property
+    def is_from_file(self) -> bool:
+        """The axis was read from a file, so its EDS file is known."""
+        return self._eds_path is not None
+
+    @property
     def eds_path(self) -> Path:
         """The drive's EDS file, absolute; InputError where the axis was not read from a file and has none."""
         if self._eds_path is None:

@@ -13,6 +13,7 @@ from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO
 from hdbridge.bringup.scan import scan_bus
 from hdbridge.bringup.slow import SlowAxis
 from hdbridge.drive import objects
+from hdbridge.drive.dictionary import load_eds
 from hdbridge.drive.nameplate import (
     IDENTITY,
     device_type_complaints,
@@ -23,7 +24,7 @@ from hdbridge.drive.nameplate import (
     torque_notes,
 )
 from hdbridge.drive.objects import Address, IntegerType
-from hdbridge.drive.sdo import SdoAbortError, load_eds
+from hdbridge.drive.sdo import SdoAbortError
 from hdbridge.drive.writes import left_out, plan
 from hdbridge.errors import SdoError
 

@@ -26,10 +26,11 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
-from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient, shared_eds
+from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, TransitionError
+from hdbridge.files.edsfile import shared_eds
 
 if TYPE_CHECKING:
     import can
@@ -73,7 +74,7 @@ class Drive:
         self.monitor = NetworkMonitor(axis.drive.node_id)
         self.image = ProcessImage(axis)
         if od is None:
-            od = shared_eds(axis.eds_path, axis.drive.node_id)
+            od = shared_eds(axis.eds_path, axis.drive.node_id).dictionary
         self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
         self._clients = {axis.drive.node_id: self.sdo}
         encoder = axis.load_encoder.source.node
