@@ -70,4 +70,3 @@ def held(variable: ODVariable) -> int | None:
     """What the object holds by the EDS: its value in a DCF, else its default. None if neither is given."""
     value = variable.value if variable.value is not None else variable.default
     return value if isinstance(value, int) else None
-

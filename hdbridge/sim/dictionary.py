@@ -273,4 +273,3 @@ def _variables(od: ObjectDictionary) -> dict[tuple[int, int], ODVariable]:
         for each in [item] if isinstance(item, ODVariable) else item.subindices.values():
             found[each.index, each.subindex] = each
     return found
-

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import PdoLengthError, ProcessImage, State
+from hdbridge.drive.image import Frames
 from hdbridge.errors import InputError
 
 
@@ -19,10 +20,17 @@ def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:
     return struct.pack("<Hih", statusword, position, torque)
 
 
+def sent(frames: Frames) -> tuple[int, ...]:
+    """Controlword and target of the one RPDO."""
+    ((can_id, data),) = frames
+    assert can_id == 0x201
+    return struct.unpack("<Hi", data)
+
+
 def test_layout_of_the_cycle(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
     assert image.tpdo_ids == (0x181, 0x281)
-    assert image.rpdo_id == 0x201
+    assert [(layout.number, layout.can_id) for layout in image.rpdos] == [(1, 0x201)]
     assert image.heartbeat_id == 0x77F
     assert [str(entry) for layout in image.tpdos for entry in layout.codec.entries] == [
         "6041h:00 uint16",
@@ -110,7 +118,7 @@ def test_only_targets_within_the_limits_are_packed(
     image = ProcessImage(build_axis())
     least, greatest = image.limits_counts
     if isinstance(counts, int) and least <= counts <= greatest:
-        assert image.rpdo.unpack(image.pack_rpdo(counts)) == (0, counts)
+        assert sent(image.pack_rpdo(counts)) == (0, counts)
     else:
         with pytest.raises(InputError, match="not sent"):
             image.pack_rpdo(counts)  # type: ignore[arg-type]
@@ -130,7 +138,7 @@ def test_before_power_the_target_is_where_the_axis_is(axis: AxisConfig) -> None:
     image.accept(0x181, tpdo1(0x0040, -(2**31) + 10))
     assert image.motor_counts == 2**31 + 10
     image.power.go(State.OPERATION_ENABLED)
-    assert image.rpdo.unpack(image.pack_rpdo_idle()) == (0x06, -(2**31) + 10)
+    assert sent(image.pack_rpdo_idle()) == (0x06, -(2**31) + 10)
 
 
 def test_halt_sets_its_bit(axis: AxisConfig) -> None:
@@ -138,4 +146,4 @@ def test_halt_sets_its_bit(axis: AxisConfig) -> None:
     image.accept(0x181, tpdo1(0x0027, 0))
     image.power.go(State.OPERATION_ENABLED)
     image.halt = True
-    assert image.rpdo.unpack(image.pack_rpdo(0)) == (0x010F, 0)
+    assert sent(image.pack_rpdo(0)) == (0x010F, 0)

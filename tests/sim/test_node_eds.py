@@ -148,7 +148,7 @@ def test_what_the_eds_lacks_is_not_on_the_bus_and_the_drive_works_without_it(ben
         assert motor.motor_counts == target  # its period is that of SYNC
         for _ in range(3):
             master.cycle(0x02, target)
-        assert master.state == "quick stop"
+        assert master.state == "disabled"
 
 
 def test_an_object_removed_from_a_drive_is_gone(master):
