@@ -24,7 +24,6 @@ from hdbridge.control.sensed import Sensed
 from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import new_tuple
-from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
@@ -96,6 +95,8 @@ def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
     table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
     columns = dict(zip(names, table.T, strict=True))
     columns.pop("load_target_deg")
+    if np.isnan(columns["motor_torque_nm"]).any():
+        del columns["motor_torque_nm"]  # the drive does not send it
     for place, key in enumerate(axis.channels):
         reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
         if not np.isnan(reading).any():
@@ -283,7 +284,7 @@ class Bench:
 
     def _enable(self) -> None:
         """Enable the drive by PDO, standing still, and begin from where it stands."""
-        self._drive.enable(Mode.CSP)
+        self._drive.enable()
         self.cycle.restart()
         feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
         feedback = self._await_channels(feedback)
