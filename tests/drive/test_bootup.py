@@ -23,7 +23,7 @@ def drive(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> Drive:
 def test_a_drive_comes_up_configured_operational_and_disabled(drive: Drive, tiny: Any) -> None:
     report = drive.boot()
     assert report.state is State.SWITCH_ON_DISABLED
-    assert set(report.modes) == {Mode.PP, Mode.HM, Mode.CSP}
+    assert set(report.modes) == {Mode.PP, Mode.HM, Mode.IP, Mode.CSP}
     assert report.identity["vendor_id"] == 0x4844
     assert report.names["device"]
     assert report.notes == ()

@@ -76,7 +76,7 @@ def state_of(drive: Drive) -> State:
 def test_it_boots_as_the_axis_file_says(drive: Drive) -> None:
     assert drive.report is not None
     assert drive.report.state is State.SWITCH_ON_DISABLED
-    assert drive.report.modes == (Mode.PP, Mode.HM, Mode.CSP)
+    assert drive.report.modes == (Mode.PP, Mode.HM, Mode.IP, Mode.CSP)
     assert drive.report.notes == ()
     assert drive.monitor.nodes[1].boot_ups == 1
 
