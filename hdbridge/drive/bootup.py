@@ -218,7 +218,7 @@ class BootUp:
             return tuple(Mode)
         bits = self._sdo.fetch(objects.SUPPORTED_MODES)
         self._refuse(mode_complaints(self._axis, bits))
-        return tuple(mode for mode in Mode if bits & mode.supported_bit)
+        return tuple(mode for mode in Mode if not bits or bits & mode.supported_bit)
 
     def _check_scaling(self) -> None:
         """User units per motor turn, by every object that says something about them."""

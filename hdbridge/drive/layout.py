@@ -304,9 +304,8 @@ def _laid_out(node_id: int, first: int, chosen: _Choice, taken: set[int], every:
                 "that cannot be changed; expected a drive with a free one"
             )
         taken.add(can_id)
-        yield Layout(
-            node_id, offer.number, can_id, PdoCodec(entries), offer.every or every, offer.fixed is not None
-        )
+        own = every if offer.every is None else offer.every
+        yield Layout(node_id, offer.number, can_id, PdoCodec(entries), own, offer.fixed is not None)
 
 
 # -- what the EDS says of it ------------------------------------------------------------------------------

@@ -88,8 +88,8 @@ def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Comp
 
 
 def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
-    """Whether 6502h has the mode of the control cycle."""
-    if modes & cyclic_mode(axis).mode.supported_bit:
+    """Whether 6502h has the mode of the control cycle; 0 says nothing."""
+    if not modes or modes & cyclic_mode(axis).mode.supported_bit:
         return []
     key = "drive.mode"
     return [
@@ -117,9 +117,12 @@ def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
     try:
         increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
         feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT) if axis.drive.feed_scales else None
-        gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
+        gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT)
     except _NotARatioError as problem:
         return [Complaint(problem.key, str(problem))]
+    if gear is None:  # the feed may be per turn of the motor or of the load: nothing says which
+        per_load_turn = Fraction(axis.gear.ratio) * axis.motor_encoder.counts_per_turn
+        gear = Fraction(axis.gear.ratio) if feed == per_load_turn else Fraction(1)
     return [
         *_gear(axis, gear, feed),
         *_motor_counts(axis, increments, None if feed is None else feed / gear),

@@ -111,14 +111,14 @@ class Entry:
         self.mappable: Final = bool(variable.pdo_mappable) and code is not None
         self.low: Final[int | None] = variable.min
         self.high: Final[int | None] = variable.max
-        other_type = own is not None and own.data_type != variable.data_type
+        other_type = own is None or own.data_type != variable.data_type
         self._bits = self.bits if other_type and code not in {*"fd"} else 0
         default = variable.default if variable.default is not None or own is None else own.default
         empty: int | str = 0 if code else ""
         self.default: Any = empty if default is None else default
         if isinstance(self.default, str):
             self.default = self.default.encode()
-        elif self._bits:
+        elif self._bits and isinstance(self.default, int):
             self.default = self._wrapped(self.default)
         self.value: Any = self.default  # of what the codec says
         self.bound: Callable[[], int] | None = None
@@ -138,7 +138,7 @@ class Entry:
         self.bound = (lambda: self._wrapped(read())) if self._bits else read
 
     def _wrapped(self, value: int) -> int:
-        """A value of the bundled EDS's type in the type of this EDS."""
+        """A value of any integer type in the type of this EDS."""
         assert self.codec is not None
         size = self.codec.size
         wrapped: int = self.codec.unpack((value % (1 << 8 * size)).to_bytes(size, "little"))[0]
@@ -212,8 +212,17 @@ class Dictionary:
         self._path = eds_path
         self._entries: dict[tuple[int, int], Entry] = {}
         own = _variables(shared_eds(BUNDLED, node_id).dictionary)
-        for variable in _variables(shared_eds(eds_path, node_id).dictionary).values():
-            self._add(variable, own.get((variable.index, variable.subindex)))
+        declared = shared_eds(eds_path, node_id).dictionary
+        variables = _variables(declared)
+        for key, variable in variables.items():
+            self._add(variable, own.get(key))
+        device = declared.device_information
+        for sub, number in enumerate(
+            (device.vendor_number, device.product_number, device.revision_number), 1
+        ):
+            named = variables.get((0x1018, sub))
+            if named is not None and named.default is None and number is not None:
+                self._entries[0x1018, sub].default = number  # only [DeviceInfo] gives it
         for key, variable in own.items():
             if key not in self._entries and not _PDOS[0] <= variable.index <= _PDOS[1]:
                 self._add(variable, variable).hidden = True

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from hdbridge.sim.dictionary import Dictionary
+
+LOAD_OBJECT: Final = (0x60E4, 1)
 
 
 @dataclass(frozen=True)
@@ -17,6 +20,8 @@ class Nameplate:
     gear_motor_turns: int = 50
     gear_load_turns: int = 1
     rated_torque_mnm: int = 320
+    load_object: tuple[int, int] = LOAD_OBJECT
+    """Index and sub-index of the object that the load encoder is read from."""
 
     def engrave(self, dictionary: Dictionary) -> None:
         """Make these the values, and the defaults to which a reset returns."""

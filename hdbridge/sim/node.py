@@ -81,6 +81,8 @@ class SimulatedDrive:
         self.dictionary.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
         self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour)
+        if nameplate.load_object in self.dictionary:
+            self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
         self._sdo = SdoServer(self.dictionary)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in self._pdos(0x1800)]
         holds, receiving = self.behaviour.holds_rpdo, self._pdos(0x1400)
