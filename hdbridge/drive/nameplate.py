@@ -117,12 +117,9 @@ def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
     try:
         increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
         feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT) if axis.drive.feed_scales else None
-        gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT)
+        gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
     except _NotARatioError as problem:
         return [Complaint(problem.key, str(problem))]
-    if gear is None:  # the feed may be per turn of the motor or of the load: nothing says which
-        per_load_turn = Fraction(axis.gear.ratio) * axis.motor_encoder.counts_per_turn
-        gear = Fraction(axis.gear.ratio) if feed == per_load_turn else Fraction(1)
     return [
         *_gear(axis, gear, feed),
         *_motor_counts(axis, increments, None if feed is None else feed / gear),

@@ -26,11 +26,12 @@ TARGETS = {"csp": 0x607A, "ip": 0x60C1}
 MODE = "\ndrive:\n"
 
 
-def objects_of(text: str) -> list[int]:
-    return [int(name, 16) for name in re.findall(r"^\[(\w{4})\]$", text, flags=re.MULTILINE)]
-
-
-OPTIONAL = sorted({each for each in objects_of(OWN) if not 0x1400 <= each <= 0x1BFF} - NEEDED)
+DESCRIBED = re.findall(r"^\[(\w{4})(?:sub(\w))?\]$", OWN, flags=re.MULTILINE)
+INDICES = {int(index, 16) for index, _ in DESCRIBED}
+OPTIONAL = sorted({each for each in INDICES if not 0x1400 <= each <= 0x1BFF} - NEEDED)
+MEMBERS = sorted(
+    (int(index, 16), int(sub, 16)) for index, sub in DESCRIBED if sub and int(index, 16) in OPTIONAL
+)
 WRITTEN = {
     0x1016, 0x1017, 0x1029, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E, 0x6065, 0x6066, 0x6072, 0x607D,
     0x6080, 0x6085, 0x60C2,
@@ -59,20 +60,19 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> Record:
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     absent=st.sets(st.sampled_from(OPTIONAL)) | st.just(set(OPTIONAL)),
+    members=st.sets(st.sampled_from([*MEMBERS, (0x1400, 5), (0x1400, 3), (0x1802, 5)]), max_size=4),
     mode=st.sampled_from(["csp", "ip"]),
-    timer=st.booleans(),
 )
 def test_any_optional_objects_may_be_absent(
-    tmp_path: Path, usual: Record, absent: set[int], mode: str, timer: bool
+    tmp_path: Path, usual: Record, absent: set[int], members: set[tuple[int, int]], mode: str
 ) -> None:
     absent = absent - {TARGETS[mode]}
-    eds = without(OWN, *sorted(absent))
-    eds = eds if timer else without(eds, (0x1400, 5))
+    members = {each for each in members if each[0] not in absent and each != (0x60C1, 1)}
+    eds = without(without(OWN, *sorted(absent)), *sorted(members))
     axis = profile_with(tmp_path, eds, (MODE, f"{MODE}  mode: {mode}\n"))
-    left = {each.index for each in left_to_drive(axis)}
-    assert left == (absent & (WRITTEN | READ | ({0x60C0} if mode == "ip" else set()))) | (
-        set() if timer else {0x1400}
-    )
+    used = {*WRITTEN, *READ, *({0x60C0} if mode == "ip" else set())}
+    partly = {index for index, sub in members if (sub and index in WRITTEN) or (index, sub) == (0x1400, 5)}
+    assert {each.index for each in left_to_drive(axis)} == (absent & used) | partly
     _, record = stepped(axis)
     assert ("motor_torque_nm" in record.columns) == (0x6077 not in absent)
     for name, column in record.columns.items():

@@ -62,6 +62,61 @@ def test_an_absent_drive_is_named_within_a_bounded_time(
     assert clock.now() < 3.0
 
 
+def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
+    """After a reset its boot-up message and its SDO server come that late, counted from the reset."""
+    nmt, sdo, clock = tiny.nmt, tiny.sdo, tiny.clock
+    reset_s = [0.0]
+    told = [True]
+
+    def command(value: int) -> None:
+        if value == 0x82:
+            reset_s[0], told[0] = clock.now(), boot_up_s is None
+        elif clock.now() >= reset_s[0] + sdo_s:
+            nmt(value)
+
+    def request(data: bytes) -> None:
+        if clock.now() >= reset_s[0] + sdo_s:
+            sdo(data)
+
+    def call() -> None:
+        if not told[0] and clock.now() >= reset_s[0] + (boot_up_s or 0.0):
+            told[0] = True
+            tiny.send(0x700, b"\x00")
+
+    tiny.nmt, tiny.sdo = command, request
+    tiny.bus_peers.append(call)
+
+
+@pytest.mark.parametrize(
+    ("boot_up_s", "sdo_s"), [(0.1, 1.0), (0.1, 3.5), (1.9, 5.2), (2.8, 5.0), (3.4, 6.8), (None, 3.0)]
+)
+def test_a_drive_that_answers_seconds_after_its_boot_up_message(
+    tiny: Any, bus: Any, axis: AxisConfig, clock: Any, boot_up_s: float | None, sdo_s: float
+) -> None:
+    tiny.bus_peers = bus.peers
+    booting(tiny, boot_up_s, sdo_s)
+    assert Drive(bus, axis, clock, tiny.od).boot().state is State.SWITCH_ON_DISABLED
+
+
+def test_a_drive_that_boots_and_never_answers_was_heard(
+    drive: Drive, tiny: Any, bus: Any, clock: Any
+) -> None:
+    tiny.bus_peers = bus.peers
+    booting(tiny, 0.5, 1e9)
+    with pytest.raises(DriveError, match=r"does not answer \(heard of it: its boot-up message\); ") as caught:
+        drive.boot()
+    assert "no other node" not in str(caught.value)
+    assert 4.0 <= clock.now() <= 5.0
+
+
+def test_a_node_that_is_stopped_was_heard(drive: Drive, tiny: Any) -> None:
+    tiny.values[0x1017, 0] = 100
+    tiny.nmt_state = 4
+    tiny.nmt = tiny.sdo = lambda _: None
+    with pytest.raises(DriveError, match=r"heard of it: a heartbeat \(04h\)"):
+        drive.boot()
+
+
 def test_an_absent_drive_and_who_is_there_instead(
     drive: Drive, tiny: Any, bus: Any, peer_bus: can.BusABC
 ) -> None:
