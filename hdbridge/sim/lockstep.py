@@ -266,9 +266,7 @@ def simulated_bench(
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
     machine = Machine(known, seed, may_compile=True)
     nameplate, behaviour = nameplate_of(known, load_object=load_object), known.firmware
-    with lockstep_bench(
-        machine, eds_path, node_id, channel, nameplate, behaviour=behaviour
-    ) as bench:
+    with lockstep_bench(machine, eds_path, node_id, channel, nameplate, behaviour=behaviour) as bench:
         yield bench
 
 
