@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.dictionary import dictionary_of, find, held
 from hdbridge.drive.layout import Layout, cyclic_mode, layouts
 from hdbridge.drive.objects import Address
-from hdbridge.drive.pdo import PdoCodec, PdoEntry
+from hdbridge.drive.pdo import PdoEntry
 from hdbridge.drive.states import Command, PowerWalk, State
 from hdbridge.drive.supervision import Fault
 from hdbridge.drive.unwrap import INT32_RANGE, Unwrap, wrap_int32
@@ -73,6 +73,7 @@ class ProcessImage:
         self.axis = axis
         self.node_id: int = axis.drive.node_id
         self.cyclic = cyclic_mode(axis)
+        self._enabling = self.cyclic.enabling
         self.tpdos, self.channel_tpdos, self.rpdos, absent = layouts(axis, od)
         self.sync_id: int = objects.COB_SYNC
         self.heartbeat_id: int = objects.COB_HEARTBEAT + axis.drive.master_node_id
@@ -107,7 +108,7 @@ class ProcessImage:
         self._handlers = self._handlers_of((*self.tpdos, *self.channel_tpdos))
         self.tpdo_ids: tuple[int, ...] = tuple(layout.can_id for layout in self.tpdos)
         """Identifiers of the frames that each cycle needs."""
-        self._templates = tuple(self._template(layout, od) for layout in self.rpdos)
+        self._packers = tuple(self._packer(layout, od) for layout in self.rpdos)
         self.statusword: int | None = None
         """Newest statusword; None before the first."""
         self.motor_counts = 0
@@ -228,22 +229,33 @@ class ProcessImage:
 
     # -- sent ---------------------------------------------------------------------------------------------
 
-    def _template(self, layout: Layout, od: ObjectDictionary | None) -> _Template:
-        """The values of an RPDO, and where controlword and target stand in it.
+    def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
+        """What makes the frame of an RPDO from controlword and target; either may be in another one.
 
         A mapping that cannot be written may have other objects: the mode of operation is that of the cycle,
         any other holds what the EDS says, else 0.
         """
-        keys = [(entry.index, entry.sub) for entry in layout.codec.entries]
-        values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in layout.codec.entries]
-        mode = objects.MODE
-        if (mode.index, mode.sub) in keys:
-            values[keys.index((mode.index, mode.sub))] = self.cyclic.mode
-        places = [
-            keys.index(key) if (key := (address.index, address.sub)) in keys else None
-            for address in (objects.CONTROLWORD, self.cyclic.target)
-        ]
-        return _Template(layout.can_id, layout.codec, values, places[0], places[1])
+        entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
+        values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]
+        words, targets, modes = (
+            [
+                place
+                for place, entry in enumerate(entries)
+                if (entry.index, entry.sub) == (each.index, each.sub)
+            ]
+            for each in (objects.CONTROLWORD, self.cyclic.target, objects.MODE)
+        )
+        for place in modes:
+            values[place] = self.cyclic.mode
+
+        def frame(word: int, target_counts: int) -> tuple[int, bytes]:
+            for place in words:
+                values[place] = word
+            for place in targets:
+                values[place] = target_counts
+            return can_id, pack(values)
+
+        return frame
 
     def check_target(self, counts: int) -> None:
         """`InputError` unless ``counts`` is an integer within the position limits."""
@@ -277,19 +289,17 @@ class ProcessImage:
 
         They enable no drive in any state, and replace RPDOs that a drive has buffered.
         """
-        return self._frames(Command.QUICK_STOP.word, wrap_int32(self.motor_counts))
-
-    def _frames(self, word: int, target_counts: int) -> Frames:
-        return tuple([each.frame(word, target_counts) for each in self._templates])
+        word, target_counts = Command.QUICK_STOP.word, wrap_int32(self.motor_counts)
+        return tuple([frame(word, target_counts) for frame in self._packers])
 
     def _pack(self, target_counts: int) -> Frames:
         power = self.power
         word = power.controlword()
-        if power.state is _ENABLED and word == _ENABLE_OPERATION:
-            word |= self.cyclic.enabling
+        if self._enabling and word == _ENABLE_OPERATION and power.state is _ENABLED:
+            word |= self._enabling
         if self.halt:
             word |= HALT_BIT
-        frames = self._frames(word, target_counts)
+        frames = tuple([frame(word, target_counts) for frame in self._packers])
         self.target_counts = target_counts
         if not self._has_demand:
             self.demand_counts = self._under_way
@@ -321,25 +331,6 @@ class ProcessImage:
         counts = round(self._motor.counts(motor_deg))
         self.check_target(counts)
         return counts
-
-
-class _Template(NamedTuple):
-    """An RPDO but for its controlword and its target; either may be in another one."""
-
-    can_id: int
-    codec: PdoCodec
-    values: list[int]
-    word_place: int | None
-    target_place: int | None
-
-    def frame(self, word: int, target_counts: int) -> tuple[int, bytes]:
-        """The frame to send."""
-        can_id, codec, values, word_place, target_place = self
-        if word_place is not None:
-            values[word_place] = word
-        if target_place is not None:
-            values[target_place] = target_counts
-        return can_id, codec.pack(values)
 
 
 def _held(od: ObjectDictionary, entry: PdoEntry) -> int:
