@@ -146,7 +146,7 @@ class SlowAxis:
     def enabled(self) -> Iterator[Feedback]:
         """Power on at rest, off again at the end; gives the first feedback under power."""
         drive, power = self._drive, self.image.power
-        if drive.sdo.has(objects.MAX_TORQUE.index, objects.MAX_TORQUE.sub):
+        if drive.can_set(objects.MAX_TORQUE):
             drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
         drive.enable()
         self.cycle.restart()

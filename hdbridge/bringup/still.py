@@ -40,10 +40,10 @@ def files(context: BringUpContext) -> Verdict:
     od = load_eds(axis.eds_path, axis.drive.node_id)
     rows, left = plan(axis, od), left_to_drive(axis, od)
     context.admit(axis, od)
-    names = "; ".join(map(str, left))
+    names = ", ".join(f"{each.index:04X}h:{each.sub:02X}" for each in left)
     return passed(
         f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to compare and write"
-        + (f"; left to the drive: {names}" if left else ""),
+        + (f"; left to the drive, see `hdbridge check`: {names}" if left else ""),
         axis_file=str(axis.path),
         eds=str(axis.eds_path),
         writes=len(rows),

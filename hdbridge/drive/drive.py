@@ -26,8 +26,8 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
-from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient
+from hdbridge.drive.objects import Address, IntegerType, Mode, NmtCommand
+from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
@@ -118,6 +118,8 @@ class Drive:
         self.report = None
         self._mode = None
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients, self._heard).run(reset=reset)
+        for note in self.report.notes:
+            _log.warning("boot-up", {"node": self.axis.drive.node_id, "note": note})
         _log.info("booted", {"node": self.axis.drive.node_id, "bus": self.link.name, **self.report.identity})
         return self.report
 
@@ -299,6 +301,12 @@ class Drive:
         load = client.read(source.index, source.subindex, IntegerType.named(source.type))
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
+    def can_set(self, address: Address) -> bool:
+        """The drive has an object that can be written, by its EDS and by what it took in the boot-up."""
+        variable = find(self.sdo.od, address.index, address.sub)
+        left = self.report.left if self.report is not None else ()
+        return variable is not None and is_writable(variable) and (address.index, address.sub) not in left
+
     def close(self) -> list[str]:
         """Stop and disable the drive, take it out of OPERATIONAL; what did not work, in words.
 
@@ -344,15 +352,8 @@ class Drive:
         Without power nothing can move, and the master may be busy with files. A drive begins to watch with
         the first heartbeat that it hears after this object was written.
         """
-        if self._can_watch():
+        if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)
-
-    def _can_watch(self) -> bool:
-        """The drive has a heartbeat consumer that can be set."""
-        key = objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub
-        variable = find(self.sdo.od, *key)
-        left = self.report.left if self.report is not None else ()
-        return variable is not None and is_writable(variable) and key not in left
 
     def _power_off(self) -> None:
         quick = SdoClient(
@@ -369,9 +370,10 @@ class Drive:
             commander.wait_for(
                 "'switch on disabled'", lambda word: decode(word) in _OFF, STEP_TIMEOUT_S, allow_fault=True
             )
-        if self._can_watch():
+        if self.can_set(objects.HEARTBEAT_CONSUMER):
             # The master leaves on purpose; its silence from now on is no fault.
-            quick.store(objects.HEARTBEAT_CONSUMER, 0)
+            with suppress(SdoAbortError):  # a drive that refuses this has never watched
+                quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
         """The same without an answer: as frames that a drive which only listens can still obey."""

@@ -329,43 +329,38 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
             f"{axis.where('drive.following_error_deg')} {drive.following_error_deg:g} is less than half a "
             "motor count, and 0 in object 6065h means no supervision; raise it"
         )
-    rows = {
-        objects.LIMIT_MIN: (least, f"lower end in motor counts ({margin})", ends[0]),
-        objects.LIMIT_MAX: (greatest, f"upper end in motor counts ({margin})", ends[1]),
-        objects.MAX_MOTOR_SPEED: (
-            math.ceil(limits.velocity_deg_s * axis.gear.ratio / 6.0),
-            "speed limit in rpm of the motor",
-            "limits.velocity_deg_s",
-        ),
-        objects.QUICK_STOP_DECELERATION: (
-            motor_rate(axis, limits.acceleration_deg_s2),
-            "ramp of a quick stop, motor counts/s2",
-            "limits.acceleration_deg_s2",
-        ),
-        objects.MAX_TORQUE: (
-            round(limits.torque_percent * 10.0),
-            "torque limit in per mille of the rated torque",
-            "limits.torque_percent",
-        ),
-        objects.FOLLOWING_WINDOW: (
-            window,
-            "following error window, motor counts",
-            "drive.following_error_deg",
-        ),
-        objects.FOLLOWING_TIME: (
-            drive.following_error_time_ms,
-            "time after which a following error counts, ms",
-            "drive.following_error_time_ms",
-        ),
-    }
-    alone = {
-        objects.LIMIT_MIN: "; only hdbridge keeps to it",
-        objects.LIMIT_MAX: "; only hdbridge keeps to it",
-        objects.FOLLOWING_WINDOW: "; hdbridge watches by its own",
-    }
-    for address, (value, why, field) in rows.items():
-        without = why.split(" (", 1)[0].split(", ", 1)[0] + alone.get(address, "")
-        yield _row(axis, address, value, why, field, without=without)
+    alone = "only hdbridge keeps to it"
+    rpm = math.ceil(limits.velocity_deg_s * axis.gear.ratio / 6.0)
+    ramp = motor_rate(axis, limits.acceleration_deg_s2)
+    late = "time after which a following error counts"
+    yield _row(
+        axis, objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
+        without=f"lower end of travel; {alone}",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
+        without=f"upper end of travel; {alone}",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.MAX_MOTOR_SPEED, rpm, "speed limit in rpm of the motor", "limits.velocity_deg_s",
+        without=f"speed limit; {alone}",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
+        "limits.acceleration_deg_s2", without="ramp of a quick stop",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
+        "torque limit in per mille of the rated torque", "limits.torque_percent", without="torque limit",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
+        "drive.following_error_deg", without="following error window; hdbridge watches by its own",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
+        "drive.following_error_time_ms", without=late,
+    )  # fmt: skip
 
 
 def motor_rate(axis: AxisConfig, load_deg: float) -> int:
