@@ -31,6 +31,7 @@ PANELS: Final = {
         "simulate": "Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.",
     },
     "Before the first move": {
+        "setup": "Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.",
         "new": "Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of "
         "itself.",
         "check": "Read the files of an axis or of a machine; say what they mean, or what is wrong and where.",

@@ -63,13 +63,14 @@ def simulate(
     known = Truth.load(simulated_by(files, truth))
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
+        nameplate = nameplate_of(known, load_object=axis.load_encoder.source.address)
         node = SimulatedDrive(
             bus,
             Machine(known, seed),
             axis.eds_path,
             axis.drive.node_id,
             clock,
-            nameplate_of(known),
+            nameplate,
             known.firmware,
         )
         notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")

@@ -8,28 +8,36 @@ bound functions.
 
 from __future__ import annotations
 
-import configparser
 import struct
 from collections.abc import Callable, Iterator
 from enum import IntEnum
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-import canopen
-from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.edsfile import shared_eds
 
-INTEGERS: Final = {
+BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
+"""The objects that the firmware works with."""
+NUMBERS: Final = {
+    datatypes.BOOLEAN: "B",
     datatypes.INTEGER8: "b",
     datatypes.INTEGER16: "h",
     datatypes.INTEGER32: "i",
+    datatypes.INTEGER64: "q",
     datatypes.UNSIGNED8: "B",
     datatypes.UNSIGNED16: "H",
     datatypes.UNSIGNED32: "I",
+    datatypes.UNSIGNED64: "Q",
+    datatypes.REAL32: "f",
+    datatypes.REAL64: "d",
 }
-"""CANopen data types that the drive knows, as ``struct`` format characters."""
+"""Data types of numbers, as ``struct`` format characters; an object of any other type holds bytes."""
+_PDOS: Final = (0x1400, 0x1BFF)
+"""PDOs exist or not: the firmware does without those that the EDS does not list."""
 
 MAX_STRING: Final = 64
 """Longest string, in bytes, that can be written to a writable string object."""
@@ -68,15 +76,17 @@ class Entry:
 
     ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
     value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is told after it was
-    stored.
+    stored. The firmware uses a ``hidden`` entry, and the bus does not see it.
     """
 
     __slots__ = (
+        "_bits",
         "bound",
         "codec",
         "default",
         "follower",
         "guard",
+        "hidden",
         "high",
         "index",
         "low",
@@ -88,24 +98,28 @@ class Entry:
         "writable",
     )
 
-    def __init__(self, variable: ODVariable) -> None:
+    def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
+        """``own`` is the same object in the bundled EDS: its default serves if the drive's EDS gives none."""
         self.index: Final[int] = variable.index
         self.sub: Final[int] = variable.subindex
         self.name: Final[str] = variable.name
-        code = INTEGERS.get(variable.data_type or 0)
-        if code is None and variable.data_type != datatypes.VISIBLE_STRING:
-            raise InputError(
-                f"object {self.index:04X}h:{self.sub:02X} is of data type {variable.data_type}; expected "
-                "an integer of up to 32 bits or a VISIBLE_STRING; correct the EDS"
-            )
+        code = NUMBERS.get(variable.data_type or 0)
         self.codec: Final = struct.Struct("<" + code) if code else None
+        self.hidden = False
         self.readable: Final = "r" in variable.access_type or variable.access_type == "const"
         self.writable: Final = "w" in variable.access_type
         self.mappable: Final = bool(variable.pdo_mappable) and code is not None
         self.low: Final[int | None] = variable.min
         self.high: Final[int | None] = variable.max
+        other_type = own is None or own.data_type != variable.data_type
+        self._bits = self.bits if other_type and code not in {*"fd"} else 0
+        default = variable.default if variable.default is not None or own is None else own.default
         empty: int | str = 0 if code else ""
-        self.default: int | bytes = _stored(empty if variable.default is None else variable.default)
+        self.default: Any = empty if default is None else default
+        if isinstance(self.default, str):
+            self.default = self.default.encode()
+        elif self._bits and isinstance(self.default, int):
+            self.default = self._wrapped(self.default)
         self.value: Any = self.default  # of what the codec says
         self.bound: Callable[[], int] | None = None
         self.guard: Callable[[int], None] | None = None
@@ -121,7 +135,14 @@ class Entry:
 
     def bind(self, read: Callable[[], int]) -> None:
         """Make reads, by SDO and by PDO, call ``read``."""
-        self.bound = read
+        self.bound = (lambda: self._wrapped(read())) if self._bits else read
+
+    def _wrapped(self, value: int) -> int:
+        """A value of any integer type in the type of this EDS."""
+        assert self.codec is not None
+        size = self.codec.size
+        wrapped: int = self.codec.unpack((value % (1 << 8 * size)).to_bytes(size, "little"))[0]
+        return wrapped
 
     def reader(self) -> Callable[[], int]:
         """What a TPDO calls to get the value."""
@@ -181,58 +202,83 @@ class Entry:
 
 
 class Dictionary:
-    """All entries of one node, by (index, sub-index)."""
+    """All entries of one node, by (index, sub-index).
+
+    The firmware works with every object of the bundled EDS. Those that ``eds_path`` does not list are hidden:
+    no SDO or PDO reaches them, and they keep the bundled default.
+    """
 
     def __init__(self, eds_path: Path, node_id: int) -> None:
-        try:
-            declared = _read_eds(eds_path, eds_path.stat().st_mtime_ns, node_id)
-        except (OSError, ValueError, LookupError, configparser.Error) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"{eds_path}: cannot be read as an EDS ({reason}); expected a CiA 306 file; name another"
-            ) from error
+        self._path = eds_path
         self._entries: dict[tuple[int, int], Entry] = {}
-        for item in declared.values():
-            for variable in [item] if isinstance(item, ODVariable) else item.values():
-                self._entries[variable.index, variable.subindex] = Entry(variable)
-        self._indices = {index for index, _ in self._entries}
+        own = _variables(shared_eds(BUNDLED, node_id).dictionary)
+        declared = shared_eds(eds_path, node_id).dictionary
+        variables = _variables(declared)
+        for key, variable in variables.items():
+            self._add(variable, own.get(key))
+        device = declared.device_information
+        for sub, number in enumerate(
+            (device.vendor_number, device.product_number, device.revision_number), 1
+        ):
+            named = variables.get((0x1018, sub))
+            if named is not None and named.default is None and number is not None:
+                self._entries[0x1018, sub].default = number  # only [DeviceInfo] gives it
+        for key, variable in own.items():
+            if key not in self._entries and not _PDOS[0] <= variable.index <= _PDOS[1]:
+                self._add(variable, variable).hidden = True
+        self._note_indices()
+
+    def _add(self, variable: ODVariable, own: ODVariable | None) -> Entry:
+        entry = Entry(variable, own)
+        if own is not None and (entry.codec is None) != (own.data_type not in NUMBERS):
+            raise InputError(
+                f"{self._path}: {entry} is of data type {variable.data_type:04X}h, and the simulated drive's "
+                f"of {own.data_type:04X}h; a drive with this EDS cannot be simulated"
+            )
+        self._entries[entry.index, entry.sub] = entry
+        return entry
+
+    def _note_indices(self) -> None:
+        self._indices = {entry.index for entry in self}
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
-        entry = self._entries.get(key)
-        if entry is None:
-            code = Abort.NO_SUBINDEX if key[0] in self._indices else Abort.NO_OBJECT
-            raise SdoAbortError(code, f"there is no object {key[0]:04X}h:{key[1]:02X}")
+        """An entry for the firmware, hidden or not."""
+        return self._entries[key]
+
+    def open(self, index: int, sub: int) -> Entry:
+        """An entry for the bus; refuses those that the drive does not show."""
+        entry = self._entries.get((index, sub))
+        if entry is None or entry.hidden:
+            code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT
+            raise SdoAbortError(code, f"there is no object {index:04X}h:{sub:02X}")
         return entry
 
     def __contains__(self, key: tuple[int, int]) -> bool:
-        return key in self._entries
+        entry = self._entries.get(key)
+        return entry is not None and not entry.hidden
 
     def __iter__(self) -> Iterator[Entry]:
-        return iter(self._entries.values())
+        return (entry for entry in self._entries.values() if not entry.hidden)
 
     def remove(self, index: int, sub: int) -> None:
         """Be a drive that does not have this object."""
-        del self._entries[index, sub]
-        self._indices = {index for index, _ in self._entries}
+        self._entries[index, sub].hidden = True
+        self._note_indices()
 
     def value(self, index: int, sub: int = 0) -> int:
         """The present number behind an integer entry."""
-        return self[index, sub].number()
+        return self._entries[index, sub].number()
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
         """Put the defaults back into all stored values of these indices; no guard is asked."""
-        for entry in self:
+        for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default
 
 
-@lru_cache(maxsize=8)
-def _read_eds(path: Path, _modified_ns: int, node_id: int) -> canopen.ObjectDictionary:
-    """Parse an EDS once: it takes longer than everything else in starting a bench. Not to be changed."""
-    if "[DeviceInfo]" not in path.read_text(encoding="latin-1"):
-        raise ValueError("no section DeviceInfo")
-    return canopen.import_od(str(path), node_id)
-
-
-def _stored(value: int | str) -> int | bytes:
-    return value.encode() if isinstance(value, str) else value
+def _variables(od: ObjectDictionary) -> dict[tuple[int, int], ODVariable]:
+    found = {}
+    for item in od.values():
+        for each in [item] if isinstance(item, ODVariable) else item.subindices.values():
+            found[each.index, each.subindex] = each
+    return found

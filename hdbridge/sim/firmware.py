@@ -12,7 +12,13 @@ from hdbridge.sim.behaviour import Behaviour, Controlword
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
 from hdbridge.sim.faults import Faults
-from hdbridge.sim.modes import CyclicSynchronousPosition, Homing, Mode, ProfilePosition
+from hdbridge.sim.modes import (
+    CyclicSynchronousPosition,
+    Homing,
+    InterpolatedPosition,
+    Mode,
+    ProfilePosition,
+)
 from hdbridge.sim.motion import Machine, Motion, wrap_int32
 from hdbridge.sim.powerstate import POWERED, Control, State, Status, next_state
 from hdbridge.sim.profile import Profile, stop
@@ -72,6 +78,7 @@ class Firmware:
             Mode(self.motion),
             ProfilePosition(self.motion),
             self._homing,
+            InterpolatedPosition(self.motion),
             CyclicSynchronousPosition(self.motion),
         )
         self._modes = {mode.number: mode for mode in modes}
@@ -163,7 +170,8 @@ class Firmware:
             self._old_status_s = self._status_delay_s
 
     def _check_mode(self, mode: int) -> None:
-        if mode not in self._modes:
+        has = self._dictionary.value(0x6502)
+        if mode not in self._modes or (mode and has and not has >> mode - 1 & 1):
             raise SdoAbortError(Abort.RANGE)
 
     def _refuse_while_powered(self, _: int) -> None:
@@ -339,7 +347,7 @@ class Firmware:
     @property
     def follows_the_bus(self) -> bool:
         """Whether set-points must keep coming: enabled in a cyclic mode."""
-        return self.state is State.OPERATION_ENABLED and self._mode.number == CyclicSynchronousPosition.number
+        return self.state is State.OPERATION_ENABLED and isinstance(self._mode, CyclicSynchronousPosition)
 
     def _reset_fault(self) -> None:
         self._error_code = 0

@@ -27,7 +27,7 @@ from hdbridge.errors import InputError
 from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.motion import Machine as AnyMachine
-from hdbridge.sim.nameplate import Nameplate
+from hdbridge.sim.nameplate import LOAD_OBJECT, Nameplate
 from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 
@@ -257,13 +257,16 @@ def simulated_bench(
     node_id: int = 1,
     seed: int = 0,
     channel: str | None = None,
+    load_object: tuple[int, int] = LOAD_OBJECT,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
-    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames."""
+    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames.
+
+    ``load_object`` is the index and sub-index from which its load encoder is read.
+    """
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
     machine = Machine(known, seed, may_compile=True)
-    with lockstep_bench(
-        machine, eds_path, node_id, channel, nameplate_of(known), behaviour=known.firmware
-    ) as bench:
+    nameplate, behaviour = nameplate_of(known, load_object=load_object), known.firmware
+    with lockstep_bench(machine, eds_path, node_id, channel, nameplate, behaviour=behaviour) as bench:
         yield bench
 
 
@@ -276,6 +279,7 @@ class SimulatedAxis:
     eds_path: Path
     node_id: int
     seed: int = 0
+    load_object: tuple[int, int] = LOAD_OBJECT
 
 
 @contextmanager
@@ -305,7 +309,7 @@ def simulated_benches(
                 axis.eds_path,
                 axis.node_id,
                 clock,
-                nameplate_of(known, serial),
+                nameplate_of(known, serial, axis.load_object),
                 known.firmware,
             )
             node.poll(clock.now())
@@ -315,7 +319,7 @@ def simulated_benches(
         yield bus, clock, tuple(node for node in clock.nodes if isinstance(node, SimulatedDrive))
 
 
-def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
+def nameplate_of(truth: Truth, serial: int = 1, load_object: tuple[int, int] = LOAD_OBJECT) -> Nameplate:
     """What a drive that controls this axis says of itself."""
     # The drive knows the ratio that the gear was sold with, not by how little the real one is off.
     ratio = Fraction(truth.gear.ratio).limit_denominator(100)
@@ -326,4 +330,5 @@ def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
         gear_motor_turns=ratio.numerator,
         gear_load_turns=ratio.denominator,
         rated_torque_mnm=round(1000.0 * truth.motor.rated_torque_nm),
+        load_object=load_object,
     )

@@ -1,4 +1,4 @@
-"""The operating modes of the simulated drive: profile position, cyclic synchronous position, homing.
+"""The operating modes of the simulated drive: PP, homing, interpolated and cyclic synchronous position.
 
 A mode turns set-points into the demand of the next period. Power states, stopping and supervision are the
 firmware's.
@@ -66,11 +66,15 @@ class CyclicSynchronousPosition(Mode):
         self._target = motion.dictionary[0x607A, 0]
         self._offset = motion.dictionary[0x60B0, 0]
 
+    def _aim(self) -> int:
+        """The user's position to be reached with the next period."""
+        target: int = self._target.value + self._offset.value
+        return target
+
     def step(self, period_s: float) -> tuple[float, float]:
         motion = self.motion
         motion.limited = False
-        target = self._target.value + self._offset.value
-        goal = motion.goal(target)
+        goal = motion.goal(self._aim())
         step = goal - motion.demand_counts
         longest = motion.max_speed_counts_s * period_s
         if abs(step) > longest:
@@ -81,6 +85,34 @@ class CyclicSynchronousPosition(Mode):
 
     def status(self) -> int:
         return _BIT_12
+
+
+class InterpolatedPosition(CyclicSynchronousPosition):
+    """IP: interpolate linearly to 60C1h:01 over one period while bit 4 is set; hold the position else."""
+
+    number = 7
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__(motion)
+        self._data = motion.dictionary[0x60C1, 1]
+        self._active = False
+        motion.dictionary[0x60C0, 0].guard = _check_submode
+
+    def _aim(self) -> int:
+        data: int = self._data.value
+        return data
+
+    def enter(self) -> None:
+        self._active = False
+
+    def control(self, word: int, rising: int) -> None:
+        self._active = bool(word & _NEW)
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        return super().step(period_s) if self._active else (self.motion.demand_counts, 0.0)
+
+    def status(self) -> int:
+        return _BIT_12 if self._active else 0
 
 
 class ProfilePosition(Mode):
@@ -241,6 +273,11 @@ class Homing(Mode):
         if self._profile is not None:
             return 0
         return _REACHED | (_BIT_12 if self._attained else 0) | (_BIT_13 if self._failed else 0)
+
+
+def _check_submode(submode: int) -> None:
+    if submode != 0:  # linear interpolation
+        raise SdoAbortError(Abort.RANGE)
 
 
 def _check_method(method: int) -> None:

@@ -69,7 +69,7 @@ class Motion:
         self.load_jump_counts = 0
         self.load_reading: Callable[[int], int] | None = None
         self._owed_s = 0.0
-        self._target = dictionary[0x607A, 0]
+        self._targets = dictionary[0x607A, 0], dictionary[0x60C1, 1]
         for index, sub in ((0x607D, 1), (0x607D, 2), (0x607E, 0), (0x6080, 0)):
             dictionary[index, sub].follower = lambda _: self.take_parameters()
         self.take_parameters()
@@ -123,7 +123,8 @@ class Motion:
 
     def preload_target(self) -> None:
         """Make the demand the target, so that a mode that begins does not move."""
-        self._target.value = wrap_int32(self.user(self.demand_counts))
+        for target in self._targets:
+            target.value = wrap_int32(self.user(self.demand_counts))
 
     def take_actual_as_demand(self) -> None:
         """Demand rest where the axis is."""

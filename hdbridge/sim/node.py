@@ -18,7 +18,6 @@ import can
 
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
-from hdbridge.errors import InputError
 from hdbridge.sim.behaviour import Behaviour, HeartbeatConsumer
 from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
 from hdbridge.sim.emergency import Emergency, ErrorCode
@@ -30,7 +29,7 @@ from hdbridge.sim.nmt import Nmt, NmtCommand
 from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
 from hdbridge.sim.sdo_server import SdoServer
 
-PDO_COUNT: Final = 4
+PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
 """A node that was not polled for longer than this does not make up for it."""
 
@@ -70,15 +69,11 @@ class SimulatedDrive:
         self.behaviour = behaviour or Behaviour()
         self.faults = Faults()
         self.lost_frames = 0
+        self._sync_s = -_NEVER
         self.dictionary = Dictionary(Path(eds_path), node_id)
         self._clock = clock
         self._now_s = clock.now()
-        try:
-            self._assemble(machine, nameplate or Nameplate())
-        except SdoAbortError as error:
-            raise InputError(
-                f"{eds_path}: {error}, which the simulated drive needs; use the bundled hdbridge-402.eds"
-            ) from error
+        self._assemble(machine, nameplate or Nameplate())
         self._begin()
 
     def _assemble(self, machine: Machine, nameplate: Nameplate) -> None:
@@ -86,11 +81,12 @@ class SimulatedDrive:
         self.dictionary.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
         self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour)
+        if nameplate.load_object in self.dictionary:
+            self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
         self._sdo = SdoServer(self.dictionary)
-        numbers = range(1, PDO_COUNT + 1)
-        self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in numbers]
-        holds = self.behaviour.holds_rpdo
-        self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in numbers]
+        self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in self._pdos(0x1800)]
+        holds, receiving = self.behaviour.holds_rpdo, self._pdos(0x1400)
+        self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in receiving]
         entry = self.dictionary
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()
@@ -99,6 +95,12 @@ class SimulatedDrive:
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
         for sub in (1, 2):
             entry[0x60C2, sub].follower = lambda _: self._take_period()
+
+    def _pdos(self, first: int) -> list[int]:
+        """Numbers of the PDOs that the dictionary has, by their first communication parameter."""
+        own = self.dictionary
+        numbers = range(1, PDO_COUNT + 1)
+        return [n for n in numbers if (first + n - 1, 1) in own and (first + 0x200 + n - 1, 0) in own]
 
     def _begin(self) -> None:
         """Start from the dictionary as it stands; the boot-up message is still to come."""
@@ -121,6 +123,13 @@ class SimulatedDrive:
     def _take_period(self) -> None:
         value = self.dictionary.value
         self._period_s = value(0x60C2, 1) / 10.0 ** -value(0x60C2, 2)
+        self._measures_period = (0x60C2, 1) not in self.dictionary
+
+    def _measure_period(self, now_s: float) -> None:
+        """A drive without object 60C2h takes its period from SYNC."""
+        since_s, self._sync_s = now_s - self._sync_s, now_s
+        if 0.0 < since_s < LONGEST_CATCH_UP_S:
+            self._period_s = since_s
 
     def _watch_heartbeat(self) -> None:
         """Object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
@@ -223,6 +232,8 @@ class SimulatedDrive:
             self._send(can_id, data)
 
     def _on_sync(self, _: bytearray, now_s: float) -> None:
+        if self._measures_period:
+            self._measure_period(now_s)
         if self.behaviour.rpdo_before_tpdo:
             self._apply_rpdos()
         tpdos: list[Outgoing] = []

@@ -10,6 +10,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from canopen.objectdictionary import ODVariable
+
 from hdbridge.sim.dictionary import Abort, Dictionary, Entry, SdoAbortError
 
 INVALID: Final = 1 << 31
@@ -20,6 +22,8 @@ SYNC_ACYCLIC: Final = 0
 SYNC_EVERY: Final = 1
 SYNC_LAST: Final = 240
 EVENT_DRIVEN: Final = (254, 255)
+DUMMIES: Final = range(0x0002, 0x0008)
+"""Data types that an RPDO maps instead of an object to leave a gap."""
 
 
 class Pdo:
@@ -47,16 +51,16 @@ class Pdo:
         self.compile()
 
     def _install(self) -> None:
-        entry = self._dictionary
-        entry[self._communication, 1].guard = self._check_can_id
-        entry[self._communication, 2].guard = _check_type
-        entry[self._communication, 3].guard = self._check_inhibit
-        entry[self._mapping, 0].guard = self._check_count
-        for sub in (1, 2, 3, 5):
-            entry[self._communication, sub].follower = self._recompile
-        entry[self._mapping, 0].follower = self._recompile
+        guards = {1: self._check_can_id, 2: _check_type, 3: self._check_inhibit, 5: None}
+        for sub, guard in guards.items():
+            if (self._communication, sub) in self._dictionary:
+                entry = self._dictionary[self._communication, sub]
+                entry.guard, entry.follower = guard, self._recompile
+        count = self._dictionary[self._mapping, 0]
+        count.guard, count.follower = self._check_count, self._recompile
         for sub in range(1, MAX_ENTRIES + 1):
-            entry[self._mapping, sub].guard = self._check_mapped
+            if (self._mapping, sub) in self._dictionary:
+                self._dictionary[self._mapping, sub].guard = self._check_mapped
 
     def _recompile(self, _: int) -> None:
         self.compile()
@@ -64,19 +68,35 @@ class Pdo:
 
     def compile(self) -> None:
         """Take over the parameters as they stand."""
-        value = self._dictionary.value
-        can_id = value(self._communication, 1)
+        can_id = self._parameter(1)
         self.valid = not can_id & INVALID
         self.can_id = can_id & 0x7FF
-        self.transmission_type = value(self._communication, 2)
+        self.transmission_type = self._parameter(2)
         self.is_synchronous = self.transmission_type <= SYNC_LAST
-        self.inhibit_s = value(self._communication, 3) * 1e-4
-        self.event_timer_s = value(self._communication, 5) * 1e-3
-        entries = [self._mapped(value(self._mapping, sub)) for sub in range(1, value(self._mapping, 0) + 1)]
-        self._codec = struct.Struct(
-            "<" + "".join(entry.codec.format.removeprefix("<") for entry in entries if entry.codec)
-        )
+        self.inhibit_s = self._parameter(3) * 1e-4
+        self.event_timer_s = self._parameter(5) * 1e-3
+        count = self._dictionary.value(self._mapping, 0)
+        try:
+            entries = self._entries(count)
+        except SdoAbortError:  # a default of the EDS that this drive cannot map: it has no such PDO
+            self._dictionary[self._mapping, 0].value = 0
+            self._dictionary[self._communication, 1].value |= INVALID
+            self.valid, entries = False, []
+        self._codec = struct.Struct("<" + "".join(_format(entry) for entry in entries))
         self._link(entries)
+
+    def _parameter(self, sub: int) -> int:
+        """A communication parameter; 0 if the drive does not have it."""
+        there = (self._communication, sub) in self._dictionary
+        return self._dictionary.value(self._communication, sub) if there else 0
+
+    def _entries(self, count: int) -> list[Entry]:
+        """The mapped entries; refuses what cannot be mapped here."""
+        words = [self._dictionary.open(self._mapping, sub).number() for sub in range(1, count + 1)]
+        entries = [self._mapped(word) for word in words]
+        if sum(entry.bits for entry in entries) > MAX_BITS:
+            raise SdoAbortError(Abort.PDO_LENGTH)
+        return entries
 
     def _link(self, entries: list[Entry]) -> None:
         raise NotImplementedError
@@ -90,7 +110,8 @@ class Pdo:
 
     def _mapped(self, word: int) -> Entry:
         """The entry that a mapping word names; refuses what cannot be mapped here."""
-        entry = self._dictionary[word >> 16, word >> 8 & 0xFF]
+        index, sub = word >> 16, word >> 8 & 0xFF
+        entry = _gap(index) if index in DUMMIES and sub == 0 else self._dictionary.open(index, sub)
         if not entry.mappable or not self._may_map(entry) or entry.bits != word & 0xFF:
             raise SdoAbortError(Abort.NOT_MAPPABLE)
         return entry
@@ -119,9 +140,7 @@ class Pdo:
             raise SdoAbortError(Abort.STATE)
         if count > MAX_ENTRIES:
             raise SdoAbortError(Abort.PDO_LENGTH)
-        words = [self._dictionary.value(self._mapping, sub) for sub in range(1, count + 1)]
-        if sum(self._mapped(word).bits for word in words) > MAX_BITS:
-            raise SdoAbortError(Abort.PDO_LENGTH)
+        self._entries(count)
 
 
 class TransmitPdo(Pdo):
@@ -224,6 +243,17 @@ class ReceivePdo(Pdo):
                 write(value)
             except SdoAbortError:
                 continue  # nobody to tell: a PDO has no answer
+
+
+def _gap(data_type: int) -> Entry:
+    variable = ODVariable("gap", data_type)
+    variable.data_type, variable.access_type, variable.pdo_mappable = data_type, "wo", True
+    return Entry(variable)
+
+
+def _format(entry: Entry) -> str:
+    assert entry.codec is not None  # only such entries can be mapped
+    return entry.codec.format.removeprefix("<")
 
 
 def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Callable[[], bytes]:

@@ -39,7 +39,7 @@ class Command(Enum):
 class Control(IntEnum):
     """Controlword bits beyond the state commands."""
 
-    NEW_SET_POINT = 1 << 4  # PP: new set-point; HM: start
+    NEW_SET_POINT = 1 << 4  # PP: new set-point; HM: start; IP: interpolate
     CHANGE_IMMEDIATELY = 1 << 5
     RELATIVE = 1 << 6
     FAULT_RESET = 1 << 7
@@ -54,7 +54,7 @@ class Status(IntEnum):
     REMOTE = 1 << 9
     TARGET_REACHED = 1 << 10
     INTERNAL_LIMIT = 1 << 11
-    MODE_12 = 1 << 12  # PP: set-point acknowledged; CSP: follows; HM: attained
+    MODE_12 = 1 << 12  # PP: set-point acknowledged; CSP: follows; IP: interpolates; HM: attained
     MODE_13 = 1 << 13  # PP, CSP: following error; HM: homing error
     REFERENCED = 1 << 14  # ours: homing has been done
 

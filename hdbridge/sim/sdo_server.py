@@ -70,7 +70,7 @@ class SdoServer:
         """Begin a transfer; one that was under way is forgotten, as the client evidently has."""
         self._entry = None
         _, *self._object = _HEAD.unpack_from(request)
-        return self._dictionary[self._object[0], self._object[1]]
+        return self._dictionary.open(self._object[0], self._object[1])
 
     def _upload(self, entry: Entry) -> bytes:
         data = entry.read()

@@ -66,7 +66,10 @@ class Line:
                 f"{axis.path}: another simulated drive on this bus is node {node_id}; expected a free one"
             )
         with self.opened() as bus:
-            node = WatchedDrive(bus, settings.truth, settings.seed, axis.eds_path, node_id, self.clock)
+            source = axis.load_encoder.source.address
+            node = WatchedDrive(
+                bus, settings.truth, settings.seed, axis.eds_path, node_id, self.clock, source
+            )
             self.nodes.append(node)
             try:
                 node.poll(self.clock.now())

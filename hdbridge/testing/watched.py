@@ -15,6 +15,7 @@ from hdbridge.clock import Clock
 from hdbridge.drive.emergencies import error_name
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
+from hdbridge.sim.nameplate import LOAD_OBJECT
 from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from hdbridge.testing.history import Event, Frame, History, TrueState
@@ -88,12 +89,19 @@ class WatchedDrive(SimulatedDrive):
     """
 
     def __init__(
-        self, bus: can.BusABC, truth: Truth, seed: int, eds_path: Path, node_id: int, clock: Clock
+        self,
+        bus: can.BusABC,
+        truth: Truth,
+        seed: int,
+        eds_path: Path,
+        node_id: int,
+        clock: Clock,
+        load_object: tuple[int, int] = LOAD_OBJECT,
     ) -> None:
         self.lock = threading.RLock()
         self.history = History()
         self.machine = Machine(truth, seed)
-        self.nameplate = nameplate_of(truth)
+        self.nameplate = nameplate_of(truth, load_object=load_object)
         self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
         self.last_tpdos: dict[int, bytes] = {}
         """The data last sent, by identifier."""

@@ -86,7 +86,7 @@ def test_a_drive_and_an_encoder_are_found_and_described() -> None:
     assert (drive.kind, encoder.kind) == ("drive (CiA 402)", "encoder (CiA 406)")
     assert drive.identity == {"vendor_id": 0x4844, "product_code": 0x402, "revision": 0x10000, "serial": 1}
     assert drive.names["device"]
-    assert drive.mode_names == ["PP", "HM", "CSP"]
+    assert drive.mode_names == ["PP", "HM", "IP", "CSP"]
     assert drive.usable
     assert not encoder.usable
     assert encoder.identity == {"vendor_id": 0x55}

@@ -17,7 +17,6 @@ from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
-from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
@@ -92,7 +91,7 @@ class Rig:
     bad: float | None = None
 
     def enable(self) -> None:
-        self.drive.enable(Mode.CSP)
+        self.drive.enable()
         self.cycle.restart()
         for _ in range(50):
             feedback = self.cycle.tick()

@@ -18,11 +18,60 @@ def set_point(master, target: int, bits: int = 0) -> None:
 
 
 def test_mode_is_displayed_and_others_are_refused(master):
-    for mode in (1, 6, 8, 0):
+    for mode in (1, 6, 7, 8, 0):
         master.put(0x6060, 0, mode, 1)
         assert master.read(0x6061) == mode
-    assert master.write(0x6060, 0, 7, 1) == 0x06090030
+    assert master.write(0x6060, 0, 3, 1) == 0x06090030
     assert master.read(0x6061) == 0
+
+
+# interpolated position
+
+
+@pytest.fixture
+def ip(master):
+    """A cycle in IP: ``ip(word, target)``; the node is started and RPDO1 carries 6040h and 60C1h:01."""
+    for index, sub, value, size in (
+        (0x1400, 1, 0x80000201, 4), (0x1600, 0, 0, 1), (0x1600, 2, 0x60C10120, 4), (0x1600, 0, 2, 1),
+        (0x1400, 1, 0x201, 4), (0x6060, 0, 7, 1),
+    ):  # fmt: skip
+        master.put(index, sub, value, size)
+    master.nmt(1)
+    for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
+        master.cycle(word)
+    return master.cycle
+
+
+def test_ip_holds_its_position_until_interpolation_is_enabled(ip, master, motor):
+    for _ in range(3):
+        feedback = ip(0x0F, 500)
+    assert (master.state, motor.motor_counts, feedback[0] & 0x1000) == ("enabled", 0, 0)
+    for _ in range(3):
+        feedback = ip(0x1F, 500)
+    assert (motor.motor_counts, feedback[0] & 0x1000) == (500, 0x1000)
+    for _ in range(3):
+        feedback = ip(0x0F, 900)
+    assert (motor.motor_counts, feedback[0] & 0x1000) == (500, 0)
+
+
+def test_ip_begins_where_the_axis_stands_whatever_was_in_its_record(ip, master, motor):
+    for word in (0x07, 0x07, 0x0F, 0x0F):
+        ip(word, 12_345)
+    assert motor.motor_counts == 0
+    assert master.read(0x60C1, 1) == 12_345  # of the RPDO; interpolation is not enabled
+
+
+def test_ip_knows_linear_interpolation_only(master):
+    assert master.write(0x60C0, 0, -1, 2) == 0x06090030
+    master.put(0x60C0, 0, 0, 2)
+
+
+def test_a_lost_master_stops_an_axis_in_ip(ip, master):
+    master.put(0x6007, 0, 3, 2)
+    ip(0x1F, 10)
+    ip(0x1F, 20)
+    master.nmt(0x80)
+    assert master.state in ("quick stop", "disabled")
 
 
 # cyclic synchronous position
@@ -344,4 +393,4 @@ def test_the_units_are_counts(master):
     feed = master.read(0x6092, 1) // master.read(0x6092, 2)
     assert (resolution, gear, feed) == (8000, 50, 400_000)
     assert master.read(0x60E6, 1) == 2_880_000
-    assert struct.pack("<i", master.read(0x6502)) == b"\xa1\0\0\0"
+    assert struct.pack("<i", master.read(0x6502)) == b"\xe1\0\0\0"

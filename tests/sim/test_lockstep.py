@@ -61,7 +61,7 @@ def test_a_wait_for_nobody_ends():
 
 def test_a_frame_sent_is_answered_before_send_returns(master):
     master.send(0x601, struct.pack("<BHBI", 0x40, 0x6502, 0, 0))
-    assert master.bus.recv(0).data == bytes.fromhex("43026500a1000000")
+    assert master.bus.recv(0).data == bytes.fromhex("43026500e1000000")
 
 
 def test_filters_hold(master):

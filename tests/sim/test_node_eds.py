@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
+import re
+import struct
 from configparser import RawConfigParser
+from contextlib import contextmanager
 from pathlib import Path
 
-import can
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
 from hdbridge.errors import InputError
 from hdbridge.sim.dictionary import Dictionary
-from hdbridge.sim.lockstep import VirtualClock
-from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.lockstep import lockstep_bench
+from tests.sim.conftest import RawMaster
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 
@@ -114,11 +116,95 @@ def test_what_is_no_eds_is_refused_in_one_line(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-def test_an_eds_without_an_object_that_the_drive_needs_is_refused(tmp_path, motor):
-    path = tmp_path / "less.eds"
-    path.write_text(EDS.read_text().replace("[6041]", "[5041]"))
+NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
+
+
+@pytest.fixture
+def bench(tmp_path, motor):
+    """A master of raw frames, and a drive with an edited EDS: ``bench(edit)`` is a context manager."""
+
+    @contextmanager
+    def make(*edits):
+        text = EDS.read_text()
+        for pattern, new in edits:
+            text, count = re.subn(pattern, new, text)
+            assert count, pattern
+        path = tmp_path / "own.eds"
+        path.write_text(text)
+        with lockstep_bench(motor, path) as (bus, clock, node):
+            yield RawMaster(bus, clock, node, motor)
+
+    return make
+
+
+def test_what_the_eds_lacks_is_not_on_the_bus_and_the_drive_works_without_it(bench, motor):
+    with bench((r"\[6085\][^[]*", ""), (r"\[60C2(sub\d)?\][^[]*", ""), (r"\[607Dsub2\][^[]*", "")) as master:
+        assert master.abort_of_read(0x6085) == NO_OBJECT
+        assert master.write(0x60C2, 1, 4, 1) == NO_OBJECT
+        assert master.abort_of_read(0x607D, 2) == NO_SUBINDEX
+        master.enable_csp()
+        target = master.cruise(40, 25)
+        master.cycle(0x0F, target)
+        assert motor.motor_counts == target  # its period is that of SYNC
+        for _ in range(3):
+            master.cycle(0x02, target)
+        assert master.state == "disabled"
+
+
+def test_an_object_removed_from_a_drive_is_gone(master):
+    master.node.dictionary.remove(0x6085, 0)
+    assert master.abort_of_read(0x6085) == NO_OBJECT
+    assert (0x6085, 0) not in master.node.dictionary
+
+
+def test_objects_have_the_type_that_the_eds_gives_them(bench, motor):
+    with bench((r"(\[6064\][^[]*DataType=)0x0004", r"\g<1>0x0003")) as master:
+        motor.position = 40_000.0
+        master.wait(0.1)
+        assert master.read(0x6064) == 40_000 - 65_536
+
+
+def test_a_number_that_is_a_text_by_the_eds_cannot_be_simulated(bench):
     with (
-        can.Bus(interface="virtual", channel="less", ignore_config=True) as bus,
-        pytest.raises(InputError, match="no object 6041h:00, which the simulated drive needs"),
+        pytest.raises(InputError, match=r"own\.eds: 6064h:00 .* data type 0009h"),
+        bench((r"(\[6064\][^[]*DataType=)0x0004", r"\g<1>0x0009")),
     ):
-        SimulatedDrive(bus, motor, path, 1, VirtualClock())
+        pass
+
+
+def test_a_fixed_mapping_with_a_gap_in_it(bench, motor):
+    words = "ro\nDefaultValue=3", "ro\nDefaultValue=0x00050008", "ro\nDefaultValue=0x60400010"
+    fixed = [(rf"(\[1600sub{sub}\][^[]*AccessType=).*\n.*", rf"\g<1>{new}") for sub, new in enumerate(words)]
+    with bench(*fixed, (r"(\[1600sub3\][^[]*DefaultValue=).*", r"\g<1>0x607A0020")) as master:
+        assert master.write(0x1600, 0, 0, 1) == READ_ONLY
+        master.nmt(1)
+        master.send(0x201, struct.pack("<BHi", 0xFF, 0x06, 77))
+        master.send(0x080)
+        assert (master.state, master.read(0x607A)) == ("ready", 77)
+
+
+def test_a_default_mapping_of_an_object_that_is_not_there_is_no_pdo(bench):
+    with bench((r"\[6062\][^[]*", "")) as master:
+        assert (master.read(0x1A01, 0), master.read(0x1A00, 0)) == (0, 3)
+        master.nmt(1)
+        master.take()
+        master.send(0x080)
+        assert [can_id for can_id, _ in master.take()] == [0x181]
+
+
+def test_there_are_as_many_pdos_as_the_eds_describes(bench):
+    with bench((r"\[(1[8A])03(sub\d)?\]", r"[\g<1>04\g<2>]"), (r"\[1[46]0[23](sub\d)?\][^[]*", "")) as master:
+        assert master.abort_of_read(0x1803, 1) == NO_OBJECT
+        assert master.abort_of_read(0x1402, 1) == NO_OBJECT
+        for step in (
+            (0x1804, 1, 0x80000481, 4),
+            (0x1A04, 1, 0x60410010, 4),
+            (0x1A04, 0, 1, 1),
+            (0x1804, 2, 1, 1),
+        ):
+            master.put(*step)
+        master.put(0x1804, 1, 0x481, 4)
+        master.nmt(1)
+        master.take()
+        master.send(0x080)
+        assert 0x481 in [can_id for can_id, _ in master.take()]

@@ -58,7 +58,7 @@ def test_a_stopped_node_answers_nothing_but_nmt(master):
     master.send(0x080)
     assert master.take() == []
     master.nmt(128)
-    assert master.read(0x6502) == 0xA1
+    assert master.read(0x6502) == 0xE1
 
 
 def test_reset_communication_restores_the_communication_profile_alone(master):

@@ -28,7 +28,6 @@ from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
-from hdbridge.drive.objects import Mode
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
@@ -226,7 +225,7 @@ class SteppedDaemon:
     def prepare(self, axis: int = 0) -> dict[str, int]:
         """What is done by SDO before ENABLE; the command's fields."""
         drive = self.drive(axis)
-        drive.enable(Mode.CSP)
+        drive.enable()
         image = drive.image
         return {"i": image.motor_counts, "j": image.load_counts, "k": image.statusword or 0}
 

@@ -117,7 +117,13 @@ def _simulated(machine: Machine, simulation: Simulation) -> Iterator[tuple[Link,
     from hdbridge.sim.paced import PacedClock  # noqa: PLC0415
 
     axes = [
-        SimulatedAxis(truth, axis.config.eds_path, axis.config.drive.node_id, simulation.seed + place)
+        SimulatedAxis(
+            truth,
+            axis.config.eds_path,
+            axis.config.drive.node_id,
+            simulation.seed + place,
+            axis.config.load_encoder.source.address,
+        )
         for place, (axis, truth) in enumerate(zip(machine.axes, simulation.truths, strict=True))
     ]
     clock = PacedClock(time.monotonic(), simulation.speed)

@@ -1,0 +1,170 @@
+"""`hdbridge setup`: unattended on a simulated drive, interrupted, resumed, and its questions."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.command import run_here
+
+from hdbridge.axis import AxisConfig
+from hdbridge.cli.setup import QUESTIONS, value_of, with_value
+from hdbridge.files.bundled import bundled_profile
+from hdbridge.model import TransmissionModel
+
+PLAN = """schema: hdbridge.plan/1
+name: short
+procedures:
+  - {procedure: standstill, duration_s: 1}
+  - {procedure: sweep, motor_turns: 12, motor_turns_per_s: 0.5}
+  - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 2}
+"""
+STEPS = ("new", "check", "doctor", "calibrate", "model diff", "model commit", "move")
+ARTICLE = (bundled_profile("article") / "axis.yaml").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A set-up of a simulated axis, from nothing to the end."""
+    folder = tmp_path_factory.mktemp("setup")
+    (folder / "short.yaml").write_text(PLAN)
+    return folder, run_here(folder, "setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")
+
+
+def steps(text: str) -> list[str]:
+    return [
+        next(each for each in STEPS if line.startswith(each))
+        for line in re.findall(r"^\$ hdbridge (.*)", text, re.M)
+    ]
+
+
+def test_it_goes_from_nothing_to_a_compensated_axis(finished):
+    folder, done = finished
+    assert done.returncode == 0, done.stderr
+    assert steps(done.stdout) == list(STEPS)
+    TransmissionModel.load(folder / "arm" / "model.yaml").check_bound_to(AxisConfig.load(folder / "arm"))
+    assert (folder / "arm" / "setup-calibration" / "report.html").exists()
+    assert "hdbridge run arm --page --simulate" in done.stdout
+
+
+def test_the_commands_are_ordinary_ones(finished, tmp_path):
+    """Printed, they can be typed: the first three, in another folder, do the same."""
+    _, done = finished
+    for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
+        again = run_here(tmp_path, *line.split())
+        assert again.returncode == 0, again.stderr
+    assert "all right" in again.stdout
+
+
+def test_what_is_done_is_not_done_again(finished):
+    folder, _ = finished
+    again = run_here(folder, "setup", "arm")
+    assert again.returncode == 0, again.stderr
+    assert steps(again.stdout) == ["check"]
+
+
+def test_a_changed_axis_file_is_examined_again(finished, tmp_path):
+    folder, _ = finished
+    shutil.copytree(folder / "arm", tmp_path / "arm")
+    path = tmp_path / "arm" / "axis.yaml"
+    path.write_text(with_value(path.read_text(), "load_encoder.direction", "-1"))
+    again = run_here(tmp_path, "setup", "arm", "--yes")
+    assert again.returncode == 4
+    assert steps(again.stdout) == ["check", "doctor"]
+    assert "resume: hdbridge setup arm" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("missing", "left"),
+    [(("move",), ["move"]), (("doctor",), ["doctor"]), (("doctor", "move"), ["doctor", "move"])],
+)
+def test_it_resumes_with_the_steps_that_are_missing(finished, missing, left, tmp_path):
+    folder, _ = finished
+    shutil.copytree(folder / "arm", tmp_path / "arm")
+    path = tmp_path / "arm" / "setup.json"
+    state = json.loads(path.read_text())
+    state["done"] = {step: digest for step, digest in state["done"].items() if step not in missing}
+    path.write_text(json.dumps(state))
+    again = run_here(tmp_path, "setup", "arm", "--yes")
+    assert again.returncode == 0, again.stderr
+    assert steps(again.stdout) == ["check", *left]
+
+
+def test_a_calibration_that_is_interrupted_is_resumed(tmp_path):
+    (tmp_path / "short.yaml").write_text(PLAN)
+    command = ("setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hdbridge", *command],
+        cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    recording = tmp_path / "arm" / "setup-calibration" / "recording.yaml"
+    while not recording.exists() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 130, err
+    assert "resume: hdbridge setup arm" in err
+    again = run_here(tmp_path, *command)
+    assert again.returncode == 0, again.stderr
+    assert "$ hdbridge calibrate arm --resume arm/setup-calibration" in again.stdout
+    assert steps(again.stdout) == ["check", "calibrate", "model diff", "model commit", "move"]
+
+
+@given(st.sampled_from([key for key, _ in QUESTIONS]), st.floats(0.1, 1000).map(lambda x: f"{x:.6g}"))
+def test_an_answer_changes_its_value_and_nothing_else(key, value):
+    text = with_value(ARTICLE, key, value)
+    assert value_of(text, key) == (value, False)
+    changed = [(a, b) for a, b in zip(ARTICLE.splitlines(), text.splitlines(), strict=True) if a != b]
+    assert len(changed) <= 1
+    assert value_of(with_value(text, key, value_of(ARTICLE, key)[0]), key) == value_of(ARTICLE, key)
+
+
+def test_what_is_left_to_fill_in_is_marked():
+    text = ARTICLE.replace("  ratio: 50", "  ratio: 0         # fill in: motor turns per load turn")
+    assert value_of(text, "gear.ratio") == ("0", True)
+    assert "fill in" not in with_value(text, "gear.ratio", "50")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (("arm",), 2, "give --interface and --channel"),
+        (
+            ("arm", "--interface", "socketcan", "--channel", "nocan7"),
+            3,
+            "sudo ip link set nocan7 up type can",
+        ),
+        (("arm", "--simulate"), 2, "Answer on a terminal, or give --yes"),
+    ],
+)
+def test_what_it_needs_is_said(arguments, status, said, tmp_path):
+    done = run_here(tmp_path, "setup", *arguments)
+    assert done.returncode == status
+    assert said in done.stderr
+
+
+def test_nothing_moves_without_a_yes(tmp_path):
+    """On a terminal, with a no to the first question."""
+    parent, child = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hdbridge", "setup", "arm", "--simulate"],
+        cwd=tmp_path, stdin=child, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    os.write(parent, b"n\n")
+    out, err = process.communicate(timeout=240)
+    os.close(parent)
+    os.close(child)
+    assert process.returncode == 130
+    assert steps(out) == ["new", "check"]
+    assert "Move now?" in err
+    assert json.loads((tmp_path / "arm" / "setup.json").read_text())["done"].keys() == {"facts"}
