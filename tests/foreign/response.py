@@ -62,17 +62,12 @@ def motor_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray,
         command = position * lag(law.first_filter_ms) * lag(law.second_filter_ms)
         rate = math.tau * law.observer_hz
         estimate = lag(1000.0 / rate) * back
-        loop = gain * (1.0 + 1000.0 * period / law.integral_time_ms * total) / (1.0 - estimate)
+        supplied = 1.0 - law.observer_gain * estimate
+        loop = gain * (1.0 + 1000.0 * period / law.integral_time_ms * total) / supplied
         forward = loop * law.position_gain_per_s * command
-        feedback = loop * (law.position_gain_per_s + measured) + rate * law.nominal_inertia_kg_m2 * measured
+        momentum = law.observer_gain * rate * law.nominal_inertia_kg_m2 * (1.0 - estimate) / supplied
+        feedback = loop * (law.position_gain_per_s + measured) + momentum * measured
     return _held_motor(mechanics, servo, omega) * forward / (1.0 + feedback * sampled)
-
-
-def command_delay_s(mechanics: Mechanics, servo: Servo, cycle_s: float) -> float:
-    """Time by which the motor follows the set-points at even speed."""
-    omega = math.tau * 0.05
-    response = motor_response(mechanics, servo, np.array([0.05]), cycle_s)
-    return float(-np.angle(response[0]) / omega)
 
 
 def _held_motor(mechanics: Mechanics, servo: Servo, omega: np.ndarray) -> np.ndarray:

@@ -64,6 +64,8 @@ class Observed:
     second_filter_ms: float
     speed_filter_ms: float
     observer_hz: float
+    observer_gain: float
+    """Share of the estimated disturbance that is supplied; below 1 the observer does not integrate at rest."""
     nominal_inertia_kg_m2: float
     tracking_time_ms: float
     """Time constant by which the integral gives way to the torque limit."""
@@ -105,6 +107,8 @@ class Servo:
     rated_torque_nm: float
     torque_limit_percent: float
     speed_limit_rad_s: float
+    rest_window_deg: float
+    """Motor error within which integrals and disturbance observers rest while the demand does: no hunting."""
 
     @property
     def period_s(self) -> float:
@@ -113,11 +117,11 @@ class Servo:
 
 _PARAMETERS = (
     "period_s gain speed_gain integral_rate velocity_ff inertia_ff speed_share first_share second_share "
-    "b0 b1 b2 a1 a2 torque_share observer_share observer_rad_s inertia tracking_rate "
-    "reference_rad_s reference_damping l1 l2 l3 k1 k2 current_share current_mean speed_limit torque_limit"
+    "b0 b1 b2 a1 a2 torque_share observer_share observer_gain observer_rad_s inertia tracking_rate "
+    "reference_rad_s reference_damping l1 l2 l3 k1 k2 current_share current_mean speed_limit torque_limit rest_window"
 ).split()
 _STATE = (
-    "before speed integral first second command n1 n2 filtered q "
+    "before speed target active integral first second command n1 n2 filtered q "
     "seen seen_speed seen_disturbance reference reference_speed torque_nm actual_nm"
 ).split()
 PARAMETERS = np.dtype(
@@ -155,7 +159,7 @@ def loops_of(servo: Servo) -> Loops:
     p["interpolation"] = INTERPOLATIONS.index(servo.interpolation)
     p["substeps"], p["period_s"] = round(period / DT_S), period
     p["torque_limit"] = servo.torque_limit_percent / 100.0 * servo.rated_torque_nm
-    p["speed_limit"] = servo.speed_limit_rad_s
+    p["speed_limit"], p["rest_window"] = servo.speed_limit_rad_s, math.radians(servo.rest_window_deg)
     p["current_share"] = 1.0
     if servo.current_lag_ms > 0.0:
         ratio = 1000.0 * DT_S / servo.current_lag_ms
@@ -188,6 +192,7 @@ def loops_of(servo: Servo) -> Loops:
     elif isinstance(law, Observed):
         p["integral_rate"], p["inertia"] = 1000.0 / law.integral_time_ms, law.nominal_inertia_kg_m2
         p["first_share"], p["second_share"] = share(law.first_filter_ms), share(law.second_filter_ms)
+        p["observer_gain"] = law.observer_gain
         p["observer_rad_s"] = math.tau * law.observer_hz
         p["observer_share"] = -math.expm1(-math.tau * law.observer_hz * period)
         p["tracking_rate"] = 1000.0 / law.tracking_time_ms
@@ -199,7 +204,7 @@ def loops_of(servo: Servo) -> Loops:
 def settle(loops: Loops, position: float) -> None:
     """Loops at rest at a position in radians, without torque: as after the power stage was switched on."""
     loops.state[:] = 0
-    for name in ("before", "first", "second", "command", "seen", "reference"):
+    for name in ("before", "target", "first", "second", "command", "seen", "reference"):
         loops.state[0][name] = position
     loops.delay[:] = position, 0.0, 0.0
     loops.average[:] = position
@@ -237,6 +242,8 @@ def torque(loops, position, target, target_speed, target_acceleration, limit_nm)
         s.delay_at = (s.delay_at + 1) % loops.delay.shape[0]
     s.speed += p.speed_share * ((position - s.before) / p.period_s - s.speed)
     s.before = position
+    s.active = 0.0 if target == s.target and abs(target - position) <= p.rest_window else 1.0
+    s.target = target
     if p.structure == 0:
         wanted = _pi_notch(loops, position, target, limit_nm)
     elif p.structure == 1:
@@ -261,7 +268,7 @@ def _pi_notch(loops, position, target, limit_nm):
     error = min(p.speed_limit, max(-p.speed_limit, wanted_speed)) - s.speed
     raw = p.speed_gain * (error + s.integral)
     if abs(s.filtered) < limit_nm or error * s.filtered < 0.0:
-        s.integral += p.period_s * p.integral_rate * error
+        s.integral += s.active * p.period_s * p.integral_rate * error
     notched = p.b0 * raw + s.n1  # transposed direct form
     s.n1 = p.b1 * raw - p.a1 * notched + s.n2
     s.n2 = p.b2 * raw - p.a2 * notched
@@ -276,7 +283,7 @@ def _piv(p, s, position, target, target_speed, target_acceleration, limit_nm):
     wanted_speed = min(p.speed_limit, max(-p.speed_limit, wanted_speed))
     wanted = p.speed_gain * (wanted_speed - s.speed) + p.inertia_ff * target_acceleration
     if abs(wanted) < limit_nm or error * wanted < 0.0:
-        s.integral += p.period_s * p.integral_rate * error
+        s.integral += s.active * p.period_s * p.integral_rate * error
     return wanted
 
 
@@ -287,10 +294,11 @@ def _observed(p, s, position, target, limit_nm):
     wanted_speed = p.gain * (s.second - position)
     error = min(p.speed_limit, max(-p.speed_limit, wanted_speed)) - s.speed
     momentum = p.observer_rad_s * p.inertia * s.speed
-    wanted = p.speed_gain * (error + s.integral) + s.q - momentum
+    wanted = p.speed_gain * (error + s.integral) + p.observer_gain * (s.q - momentum)
     given = min(limit_nm, max(-limit_nm, wanted))
-    s.integral += p.period_s * (p.integral_rate * error + p.tracking_rate * (given - wanted) / p.speed_gain)
-    s.q += p.observer_share * (given + momentum - s.q)
+    give_way = p.tracking_rate * (given - wanted) / p.speed_gain
+    s.integral += s.active * p.period_s * (p.integral_rate * error + give_way)
+    s.q += s.active * p.observer_share * (given + momentum - s.q)
     return given
 
 
@@ -307,5 +315,5 @@ def _state_feedback(p, s, position, target, limit_nm):
     miss, seen_speed = position - s.seen, s.seen_speed
     s.seen += period * (seen_speed + p.l1 * miss)
     s.seen_speed += period * ((given + s.seen_disturbance) / p.inertia + p.l2 * miss)
-    s.seen_disturbance += period * p.l3 * p.inertia * miss
+    s.seen_disturbance += s.active * period * p.l3 * p.inertia * miss
     return given
