@@ -8,20 +8,28 @@ The profile folder has an axis file and nothing else: what the axis is like is i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import can
+
 from foreign.draw import Truth, draw
 from foreign.machine import ForeignMachine
 from hdbridge.axis import AxisConfig
+from hdbridge.clock import Clock
 from hdbridge.sim.dictionary import Dictionary
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
 from hdbridge.sim.nameplate import Nameplate
 from hdbridge.sim.node import SimulatedDrive
+from hdbridge.sim.run import run
 
 REACH_DEG = 4000.0
+TORQUE = """load_torque:
+  source: {index: 0x2101, subindex: 0, type: int32, via: tpdo}
+  newton_metres_per_count: 0.001
+"""
 
 
 @dataclass(frozen=True)
@@ -42,10 +50,26 @@ def foreign_bench(
     seed: int, structure: str, folder: Path, cycle_ms: float | None = None
 ) -> Iterator[ForeignBench]:
     """The foreign axis of a seed, switched on; its axis file is written to ``folder``."""
-    truth = draw(seed, structure, cycle_ms)
+    with bench_of(draw(seed, structure, cycle_ms), folder) as bench:
+        yield bench
+
+
+@contextmanager
+def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
+    """The same for a truth that the judge has changed."""
     axis, machine = AxisConfig.load(write_axis(truth, folder)), truth.machine()
     with lockstep_bench(machine, axis.eds_path, axis.drive.node_id, nameplate=nameplate(truth)) as (bus, clock, node):
         yield ForeignBench(bus, clock, node, axis, machine, truth)
+
+
+def serve(truth: Truth, axis: AxisConfig, bus: can.BusABC, clock: Clock, should_stop: Callable[[], bool]) -> None:
+    """The foreign drive in real time on any bus, for daemons and commands in other processes."""
+    machine = truth.machine()
+    machine.coast(1, True)  # loads or compiles what has to run in real time
+    machine.follow(0.0, 0.0, 1)
+    machine.coast(1, True)
+    node = SimulatedDrive(bus, machine, axis.eds_path, axis.drive.node_id, clock, nameplate(truth))
+    run(bus, node, clock, should_stop)
 
 
 class Commissioned(Nameplate):
@@ -101,5 +125,5 @@ limits:
   jerk_deg_s3: {20.0 * truth.acceleration_deg_s2:g}
   torque_percent: {truth.servo.torque_limit_percent:g}
 compensation: {{maximum_arcsec: 600, slew_arcsec_s: 100000}}
-""")
+{TORQUE if truth.mechanics.gravity_nm else ""}""")
     return path

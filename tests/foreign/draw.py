@@ -14,7 +14,7 @@ import numpy as np
 
 from foreign.machine import Encoders, ForeignMachine
 from foreign.mechanics import ARCSEC, BoucWen, MaxwellSlip, Mechanics, Order
-from foreign.response import motor_response
+from foreign.response import motor_response, tooth_response
 from foreign.servos import STRUCTURES, Law, Observed, PiNotch, Piv, Servo, StateFeedback
 
 PERIOD_MS = {"pi_notch": 0.25, "piv": 0.1, "observed": 0.5, "state_feedback": 0.2}
@@ -24,9 +24,9 @@ INTERPOLATION = {
     "observed": ("hold", "linear"),
     "state_feedback": ("hold", "linear", "cubic"),
 }
-STEPS_DEG = (5.0, 2.0, 3.0, 2.5)
-"""Motor angles that the axis is sent to at once, in turn; it has to settle at each."""
-WAIT_S, WATCH_S = 0.8, 0.2
+MOVES_DEG = (43.56, 87.12, 82.12, 43.56, 0.0)
+"""Motor angles that the axis moves to in turn, `MOVE_S` each; it has to settle at each."""
+MOVE_S, WAIT_S, WATCH_S = 0.2, 0.25, 0.2
 REST_DEG = 0.02
 """How far from its target the settled motor may be, or one count if that is more."""
 
@@ -56,6 +56,10 @@ class Truth:
     def response(self, frequency_hz: np.ndarray) -> np.ndarray:
         """Linear response from set-point to motor angle; see `motor_response`."""
         return motor_response(self.mechanics, self.servo, frequency_hz, self.cycle_ms / 1000.0)
+
+    def ripple(self, frequency_hz: np.ndarray) -> np.ndarray:
+        """Load angle per tooth error without compensation; see `tooth_response`."""
+        return tooth_response(self.mechanics, self.servo, frequency_hz, self.cycle_ms / 1000.0)
 
     def by_place(self) -> dict[str, float]:
         """True values by their place in a truth file; what has no such place, or another meaning there, is left out."""
@@ -141,24 +145,27 @@ def candidates(seed: int, structure: str, cycle_ms: float | None = None) -> Iter
 
 
 def settles(truth: Truth) -> bool:
-    """The criterion of stability: steps of the motor settle, without friction and with it (no hunting)."""
+    """The criterion of stability: the motor settles after moves, without friction and with it (no hunting)."""
     fine = replace(truth.encoders, motor_counts_per_turn=1 << 20, motor_interpolation=16, motor_flicker_counts=0.0)
     slippery = replace(truth.mechanics, coulomb_nm=0.0)
-    return _steps_settle(truth, slippery, fine) and _steps_settle(truth, truth.mechanics, truth.encoders)
+    return _moves_settle(truth, slippery, fine) and _moves_settle(truth, truth.mechanics, truth.encoders)
 
 
-def _steps_settle(truth: Truth, mechanics: Mechanics, encoders: Encoders) -> bool:
+def _moves_settle(truth: Truth, mechanics: Mechanics, encoders: Encoders) -> bool:
     machine = ForeignMachine(mechanics, truth.servo, encoders, truth.seed)
     count_deg = 360.0 / encoders.motor_counts_per_turn
-    cycle_s, start = truth.cycle_ms / 1000.0, 0
-    for step_deg in STEPS_DEG:
-        target = round(step_deg / count_deg)
-        for at in range(round((WAIT_S + WATCH_S) / cycle_s)):
-            machine.follow(start, target, round(cycle_s / machine.dt_s))
-            start = target
+    cycle_s, before, from_deg = truth.cycle_ms / 1000.0, 0, 0.0
+    for to_deg in MOVES_DEG:
+        for at in range(1, round((MOVE_S + WAIT_S + WATCH_S) / cycle_s)):
+            share = min(1.0, at * cycle_s / MOVE_S)
+            way = share - math.sin(math.tau * share) / math.tau
+            target = round((from_deg + (to_deg - from_deg) * way) / count_deg)
+            machine.follow(before, target, round(cycle_s / machine.dt_s))
+            before = target
             off_deg = abs(machine.true_motor_deg - target * count_deg)
-            if not off_deg < (max(REST_DEG, count_deg) if at * cycle_s > WAIT_S else 50.0):
+            if not off_deg < (max(REST_DEG, count_deg) if at * cycle_s > MOVE_S + WAIT_S else 90.0):
                 return False
+        from_deg = to_deg
     return True
 
 
@@ -261,14 +268,14 @@ def _observed(lot: _Lot, mechanics: Mechanics) -> Law:
 
 
 def _state_feedback(lot: _Lot, mechanics: Mechanics) -> Law:
-    feedback = lot.log(8.0, 30.0)
+    feedback = lot.log(10.0, 30.0)
     return StateFeedback(
         reference_hz=lot.even(10.0, 60.0),
         reference_damping=lot.even(0.8, 1.1),
         acceleration_feedforward=lot.even(0.7, 1.0),
         feedback_hz=feedback,
         feedback_damping=lot.even(0.8, 1.2),
-        observer_hz=feedback * lot.even(3.0, 6.0),
+        observer_hz=feedback * lot.even(3.0, 7.0),
         nominal_inertia_kg_m2=lot.even(0.4, 1.0) * mechanics.inertia_kg_m2,
     )
 

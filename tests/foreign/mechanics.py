@@ -120,7 +120,7 @@ def plant_of(mechanics: Mechanics) -> Plant:
         pairs: tuple[tuple[float, float], ...] = ((law.offset_arcsec, law.yield_deg),)
     else:
         pairs = law.elements
-    elements = np.array([(limit * ARCSEC, math.radians(travel), 0.0) for limit, travel in pairs])
+    elements = np.array([(limit * ARCSEC, math.radians(travel), 0.0) for limit, travel in pairs]).reshape(-1, 3)
     orders = np.zeros((len(mechanics.motor_orders), 3))
     for row, each in zip(orders, mechanics.motor_orders, strict=True):
         phase = math.radians(each.phase_deg)

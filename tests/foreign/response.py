@@ -22,15 +22,38 @@ def motor_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray,
     The motor's spectrum over that of the set-points, at any frequency: above half the cycle rate it is the
     response to the images of the set-points.
     """
-    period = servo.period_s
     omega = math.tau * np.asarray(frequency_hz, dtype=float)
+    forward, feedback = _servo(servo, omega, cycle_s)
+    return _held_motor(mechanics, servo, omega) * forward / (1.0 + feedback * _sampled_motor(mechanics, servo, omega))
+
+
+def load_response(mechanics: Mechanics, frequency_hz: np.ndarray) -> np.ndarray:
+    """Load angle per angle of the gear's output, complex, shape of ``frequency_hz``."""
+    load, spring = _load_and_spring(mechanics, 2j * math.pi * np.asarray(frequency_hz, dtype=float))
+    return spring / (spring + load)
+
+
+def tooth_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float) -> np.ndarray:
+    """Load angle per tooth error at even speed, complex, shape of ``frequency_hz``: the load's ripple.
+
+    The tooth error shakes load and motor, and the servo holds the motor.
+    """
+    omega = math.tau * np.asarray(frequency_hz, dtype=float)
+    load, spring = _load_and_spring(mechanics, 1j * omega)
+    _, feedback = _servo(servo, omega, cycle_s)
+    push = spring * load / (spring + load) / mechanics.ratio * _motor(mechanics, 1j * omega)
+    held = _held_motor(mechanics, servo, omega) * feedback
+    motor = push * (held / (1.0 + feedback * _sampled_motor(mechanics, servo, omega)) - 1.0)
+    return spring / (spring + load) * (1.0 + motor / mechanics.ratio)
+
+
+def _servo(servo: Servo, omega: np.ndarray, cycle_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Torque samples per set-point, and per motor reading with the sign turned."""
+    period, law = servo.period_s, servo.law
     back = np.exp(-1j * omega * period)  # z^-1
     difference = (1.0 - back) / period
-    position, speed, acceleration = _demand(servo.interpolation, omega, cycle_s, period)
     late = back ** round(servo.dead_time_ms / servo.period_ms)
-    position, speed, acceleration = position * late, speed * late, acceleration * late
-    sampled = _held_motor(mechanics, servo, omega + math.tau / period * ALIASES).sum(axis=0)
-    law = servo.law
+    position, speed, acceleration = (late * each for each in _demand(servo.interpolation, omega, cycle_s, period))
     total = back / (1.0 - back)  # sum of all samples before
 
     def lag(time_ms: float) -> np.ndarray:
@@ -38,8 +61,7 @@ def motor_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray,
         return (1.0 - keep) / (1.0 - keep * back)
 
     if isinstance(law, StateFeedback):
-        forward, feedback = _state_feedback(law, position, back, period)
-        return _held_motor(mechanics, servo, omega) * forward / (1.0 + feedback * sampled)
+        return _state_feedback(law, position, back, period)
     gain = law.velocity_gain_nm_s_per_rad
     measured = lag(law.speed_filter_ms) * difference
     if isinstance(law, PiNotch):
@@ -67,18 +89,32 @@ def motor_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray,
         forward = loop * law.position_gain_per_s * command
         momentum = law.observer_gain * rate * law.nominal_inertia_kg_m2 * (1.0 - estimate) / supplied
         feedback = loop * (law.position_gain_per_s + measured) + momentum * measured
-    return _held_motor(mechanics, servo, omega) * forward / (1.0 + feedback * sampled)
+    return forward, feedback
+
+
+def _load_and_spring(mechanics: Mechanics, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Torque per angle of the load, and of the spring."""
+    load = mechanics.load_inertia_kg_m2 * s**2 + mechanics.load_viscous_nm_s_per_rad * s
+    return load, mechanics.stiffness_nm_per_rad + mechanics.damping_nm_s_per_rad * s
+
+
+def _motor(mechanics: Mechanics, s: np.ndarray) -> np.ndarray:
+    """Motor angle per torque, the load on its spring."""
+    load, spring = _load_and_spring(mechanics, s)
+    motor = mechanics.motor_inertia_kg_m2 * s**2 + mechanics.viscous_nm_s_per_rad * s
+    return 1.0 / (motor + spring * load / (spring + load) / mechanics.ratio**2)
 
 
 def _held_motor(mechanics: Mechanics, servo: Servo, omega: np.ndarray) -> np.ndarray:
     """Motor angle per torque sample that is held for one period, through the lag of the current loop."""
     s = 1j * omega
-    load = mechanics.load_inertia_kg_m2 * s**2 + mechanics.load_viscous_nm_s_per_rad * s
-    spring = mechanics.stiffness_nm_per_rad + mechanics.damping_nm_s_per_rad * s
-    motor = mechanics.motor_inertia_kg_m2 * s**2 + mechanics.viscous_nm_s_per_rad * s
-    reflected = spring * load / (spring + load) / mechanics.ratio**2
     held = -np.expm1(-s * servo.period_s) / (s * servo.period_s)
-    return held / (1.0 + s * servo.current_lag_ms / 1000.0) / (motor + reflected)
+    return held / (1.0 + s * servo.current_lag_ms / 1000.0) * _motor(mechanics, s)
+
+
+def _sampled_motor(mechanics: Mechanics, servo: Servo, omega: np.ndarray) -> np.ndarray:
+    """Motor reading per torque sample."""
+    return _held_motor(mechanics, servo, omega + math.tau / servo.period_s * ALIASES).sum(axis=0)
 
 
 def _demand(

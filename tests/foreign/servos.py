@@ -88,6 +88,8 @@ class StateFeedback:
 Law = PiNotch | Piv | Observed | StateFeedback
 STRUCTURES = {"pi_notch": PiNotch, "piv": Piv, "observed": Observed, "state_feedback": StateFeedback}
 INTERPOLATIONS = ("hold", "linear", "cubic")
+AT_REST = 1e-6
+"""Speed of a demand that rests, rad/s: what rounding leaves of a cubic."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ _PARAMETERS = (
     "reference_rad_s reference_damping l1 l2 l3 k1 k2 current_share current_mean speed_limit torque_limit rest_window"
 ).split()
 _STATE = (
-    "before speed target active integral first second command n1 n2 filtered q "
+    "before speed active integral first second command n1 n2 filtered q "
     "seen seen_speed seen_disturbance reference reference_speed torque_nm actual_nm"
 ).split()
 PARAMETERS = np.dtype(
@@ -204,7 +206,7 @@ def loops_of(servo: Servo) -> Loops:
 def settle(loops: Loops, position: float) -> None:
     """Loops at rest at a position in radians, without torque: as after the power stage was switched on."""
     loops.state[:] = 0
-    for name in ("before", "target", "first", "second", "command", "seen", "reference"):
+    for name in ("before", "first", "second", "command", "seen", "reference"):
         loops.state[0][name] = position
     loops.delay[:] = position, 0.0, 0.0
     loops.average[:] = position
@@ -242,8 +244,7 @@ def torque(loops, position, target, target_speed, target_acceleration, limit_nm)
         s.delay_at = (s.delay_at + 1) % loops.delay.shape[0]
     s.speed += p.speed_share * ((position - s.before) / p.period_s - s.speed)
     s.before = position
-    s.active = 0.0 if target == s.target and abs(target - position) <= p.rest_window else 1.0
-    s.target = target
+    s.active = 0.0 if abs(target_speed) < AT_REST and abs(target - position) <= p.rest_window else 1.0
     if p.structure == 0:
         wanted = _pi_notch(loops, position, target, limit_nm)
     elif p.structure == 1:
