@@ -243,7 +243,7 @@ def _piv(lot: _Lot, mechanics: Mechanics) -> Law:
     return Piv(
         position_gain_per_s=gain,
         velocity_gain_nm_s_per_rad=_velocity_gain(lot, mechanics, gain * lot.even(2.5, 5.0)),
-        integral_gain_per_s2=gain**2 * lot.even(0.1, 0.4),
+        integral_gain_per_s2=gain**2 * lot.even(0.2, 0.5),
         velocity_feedforward=forward,
         inertia_feedforward_kg_m2=lot.even(0.7, 1.05) * mechanics.inertia_kg_m2 if forward else 0.0,
         speed_filter_ms=lot.even(0.1, 0.4),
