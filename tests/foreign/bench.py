@@ -1,9 +1,9 @@
-"""A foreign axis on the virtual bus, as the project's own simulated drive would be: bus, clock, node, axis file.
+"""A foreign axis on the virtual bus: bus, clock, node and axis file.
 
     with foreign_bench(3, "piv", tmp_path) as bench, Drive(bench.bus, bench.axis, bench.clock) as drive:
         drive.boot()
 
-The profile folder has an axis file and nothing else: what the axis is like is in ``bench.truth``, for the judge.
+The profile folder has an axis file and nothing else. The truth is in ``bench.truth``, for the judge.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import can
-
 from foreign.draw import Truth, draw
 from foreign.machine import ForeignMachine
+
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
 from hdbridge.sim.dictionary import Dictionary
@@ -58,11 +58,17 @@ def foreign_bench(
 def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
     """The same for a truth that the judge has changed."""
     axis, machine = AxisConfig.load(write_axis(truth, folder)), truth.machine()
-    with lockstep_bench(machine, axis.eds_path, axis.drive.node_id, nameplate=nameplate(truth)) as (bus, clock, node):
+    with lockstep_bench(machine, axis.eds_path, axis.drive.node_id, nameplate=nameplate(truth)) as (
+        bus,
+        clock,
+        node,
+    ):
         yield ForeignBench(bus, clock, node, axis, machine, truth)
 
 
-def serve(truth: Truth, axis: AxisConfig, bus: can.BusABC, clock: Clock, should_stop: Callable[[], bool]) -> None:
+def serve(
+    truth: Truth, axis: AxisConfig, bus: can.BusABC, clock: Clock, should_stop: Callable[[], bool]
+) -> None:
     """The foreign drive in real time on any bus, for daemons and commands in other processes."""
     machine = truth.machine()
     machine.coast(1, True)  # loads or compiles what has to run in real time
@@ -122,7 +128,7 @@ limits:
   position_max_deg: {REACH_DEG:g}
   velocity_deg_s: {truth.velocity_deg_s:g}
   acceleration_deg_s2: {truth.acceleration_deg_s2:g}
-  jerk_deg_s3: {20.0 * truth.acceleration_deg_s2:g}
+  jerk_deg_s3: {truth.jerk_deg_s3:g}
   torque_percent: {truth.servo.torque_limit_percent:g}
 compensation: {{maximum_arcsec: 600, slew_arcsec_s: 100000}}
 {TORQUE if truth.mechanics.gravity_nm else ""}""")

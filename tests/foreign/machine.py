@@ -9,10 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-
 from foreign.mechanics import ARCSEC, DT_S, Mechanics, plant_of, substep
 from foreign.servos import Servo, demand, loops_of, settle, torque
+from numba import njit
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,11 @@ class ForeignMachine:
         self.plant, self.loops = plant_of(mechanics), loops_of(servo)
         self._noise = np.random.default_rng([0xF0E, seed])
         self._steps = np.array(
-            [math.tau / encoders.motor_counts_per_turn, encoders.motor_interpolation, encoders.motor_flicker_counts]
+            [
+                math.tau / encoders.motor_counts_per_turn,
+                encoders.motor_interpolation,
+                encoders.motor_flicker_counts,
+            ]
         )
         self._powered = False
         self._most_permille = 10.0 * servo.torque_limit_percent
@@ -61,7 +64,9 @@ class ForeignMachine:
     def torque_limit_permille(self, permille: float) -> None:
         self._limit_permille = min(max(0.0, permille), self._most_permille)
 
-    def follow(self, start_counts: float, end_counts: float, substeps: int, trace: np.ndarray | None = None) -> None:
+    def follow(
+        self, start_counts: float, end_counts: float, substeps: int, trace: np.ndarray | None = None
+    ) -> None:
         """Closed loop for one cycle whose set-points are ``start_counts`` before and ``end_counts`` now.
 
         ``trace``, one row per substep, takes the motor angle, the load angle in radians and the torque in Nm.

@@ -1,14 +1,14 @@
 """A harmonic-drive axis: motor, gear with transmission error, spring, load and friction.
 
-Parameters carry the names and units of docs/truth-file.md. The equations, with q = motor angle, p = load angle:
+Parameters have the names and units of docs/truth-file.md. With q the motor angle and p the load angle:
 
     output  u(q) = q / N + tooth(q) + h(q)          h: hysteresis, a function of the motor's travel
     spring  T    = K (u - p) + D (u' - p')
     motor   Jm q" = torque - du/dq T - viscous q' - Coulomb(q') sgn q'
     load    Jl p" = T - viscous p' + gravity(p)
 
-The gear passes on power without loss (du/dq on both sides), so only friction and damping dissipate. A substep is
-a drift of half a step, a kick, a drift of half a step: second order, and conservative without losses. Coulomb
+The gear passes on power without loss (du/dq on both sides), so only friction and damping dissipate. A substep
+is a drift of half a step, a kick and another drift: second order, and conservative without losses. Coulomb
 friction is an impulse that at most stops the motor, so a motor below its friction stands still exactly.
 """
 
@@ -47,7 +47,7 @@ class BoucWen:
 
 @dataclass(frozen=True)
 class MaxwellSlip:
-    """Springs with sliders in parallel: pairs of the limit in arcsec and the travel in degrees that reaches it."""
+    """Springs with sliders in parallel: pairs of limit in arcsec and motor travel to the limit in degrees."""
 
     elements: tuple[tuple[float, float], ...]
 
@@ -91,22 +91,25 @@ class Mechanics:
 _NUMBERS = [each.name for each in fields(Mechanics) if each.type == "float"]
 PLANT = np.dtype([(name, "f8") for name in (*_NUMBERS, "bouc_wen_exponent", "bouc_wen_beta")])
 STATE = np.dtype(
-    [(name, "f8") for name in ("motor", "motor_speed", "load", "load_speed", "middle", "spring_rate", "spring_nm")]
+    [
+        (name, "f8")
+        for name in ("motor", "motor_speed", "load", "load_speed", "middle", "spring_rate", "spring_nm")
+    ]
 )
 
 
 class Plant(NamedTuple):
-    """What `substep` computes with: parameters, tooth error by order, hysteresis elements and their states."""
+    """Parameters and state of the mechanics, as `substep` takes them."""
 
     parameters: np.ndarray
     """Record `PLANT`; SI."""
     orders: np.ndarray
     """(order, a, b) rows: a cos(order q) + b sin(order q), radians."""
     elements: np.ndarray
-    """(limit, yield, state) rows, radians; state -1 to 1. One row is a Bouc-Wen law where its exponent is not 0."""
+    """(limit, yield, state) rows, radians, state -1 to 1; one row if the law is Bouc-Wen."""
     state: np.ndarray
-    """Record `STATE`; SI. ``middle`` is the motor angle that the hysteresis was last computed for, ``spring_rate``
-    the spring's stretching in the last substep."""
+    """Record `STATE`; SI. ``middle`` is the motor angle at which the hysteresis was last computed,
+    ``spring_rate`` the rate at which the spring stretched in the last substep."""
 
 
 def plant_of(mechanics: Mechanics) -> Plant:
@@ -120,7 +123,9 @@ def plant_of(mechanics: Mechanics) -> Plant:
         pairs: tuple[tuple[float, float], ...] = ((law.offset_arcsec, law.yield_deg),)
     else:
         pairs = law.elements
-    elements = np.array([(limit * ARCSEC, math.radians(travel), 0.0) for limit, travel in pairs]).reshape(-1, 3)
+    elements = np.array([(limit * ARCSEC, math.radians(travel), 0.0) for limit, travel in pairs]).reshape(
+        -1, 3
+    )
     orders = np.zeros((len(mechanics.motor_orders), 3))
     for row, each in zip(orders, mechanics.motor_orders, strict=True):
         phase = math.radians(each.phase_deg)
@@ -185,7 +190,9 @@ def substep(parameters, orders, elements, state, torque_nm, brake_nm):
     loop, loop_slope = hysteresis(elements, p.bouc_wen_exponent, p.bouc_wen_beta, motor - s.middle)
     slope += loop_slope + 1.0 / p.ratio
     output = motor / p.ratio + tooth + loop
-    rate = slope * s.motor_speed - s.load_speed  # of the spring; at the middle of the kick 1.5 - 0.5 of the last
+    rate = (
+        slope * s.motor_speed - s.load_speed
+    )  # of the spring; at the middle of the kick 1.5 - 0.5 of the last
     spring = p.stiffness_nm_per_rad * (output - load)
     spring += p.damping_nm_s_per_rad * (1.5 * rate - 0.5 * s.spring_rate)
 
@@ -246,6 +253,8 @@ def energy_j(plant: Plant) -> float:
     law = p["bouc_wen_exponent"], p["bouc_wen_beta"]
     loop, _ = hysteresis(plant.elements.copy(), *law, s["motor"] - s["middle"])
     wind = s["motor"] / p["ratio"] + tooth_error(plant.orders, s["motor"])[0] + loop - s["load"]
-    kinetic = p["motor_inertia_kg_m2"] * s["motor_speed"] ** 2 + p["load_inertia_kg_m2"] * s["load_speed"] ** 2
+    kinetic = (
+        p["motor_inertia_kg_m2"] * s["motor_speed"] ** 2 + p["load_inertia_kg_m2"] * s["load_speed"] ** 2
+    )
     elastic = p["stiffness_nm_per_rad"] * wind**2
     return float(0.5 * (kinetic + elastic) + p["gravity_nm"] * (1.0 - math.cos(s["load"])))

@@ -1,7 +1,7 @@
 """Linear response of a foreign axis from its set-points to its motor angle, in closed form.
 
 Independent of the compiled servo: each structure is written down once more in z, the mechanics in s, and the
-sampled mechanics are summed over aliases. Coulomb friction, quantisation, limits and tooth error are left out.
+sampled mechanics are summed over aliases. Coulomb friction, quantisation and limits are left out.
 """
 
 from __future__ import annotations
@@ -9,22 +9,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from foreign.mechanics import Mechanics
 from foreign.servos import Observed, PiNotch, Piv, Servo, StateFeedback
 
 ALIASES = np.arange(-200, 201)[:, None]
 
 
-def motor_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float) -> np.ndarray:
-    """Motor angle per set-point, complex, shape of ``frequency_hz``; a set-point's time is the end of its cycle.
+def motor_response(
+    mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float
+) -> np.ndarray:
+    """Motor angle per set-point, complex, shape of ``frequency_hz``. A set-point is due at its cycle's end.
 
     The motor's spectrum over that of the set-points, at any frequency: above half the cycle rate it is the
     response to the images of the set-points.
     """
     omega = math.tau * np.asarray(frequency_hz, dtype=float)
     forward, feedback = _servo(servo, omega, cycle_s)
-    return _held_motor(mechanics, servo, omega) * forward / (1.0 + feedback * _sampled_motor(mechanics, servo, omega))
+    return (
+        _held_motor(mechanics, servo, omega)
+        * forward
+        / (1.0 + feedback * _sampled_motor(mechanics, servo, omega))
+    )
 
 
 def load_response(mechanics: Mechanics, frequency_hz: np.ndarray) -> np.ndarray:
@@ -33,7 +38,9 @@ def load_response(mechanics: Mechanics, frequency_hz: np.ndarray) -> np.ndarray:
     return spring / (spring + load)
 
 
-def tooth_response(mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float) -> np.ndarray:
+def tooth_response(
+    mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float
+) -> np.ndarray:
     """Load angle per tooth error at even speed, complex, shape of ``frequency_hz``: the load's ripple.
 
     The tooth error shakes load and motor, and the servo holds the motor.
@@ -53,7 +60,9 @@ def _servo(servo: Servo, omega: np.ndarray, cycle_s: float) -> tuple[np.ndarray,
     back = np.exp(-1j * omega * period)  # z^-1
     difference = (1.0 - back) / period
     late = back ** round(servo.dead_time_ms / servo.period_ms)
-    position, speed, acceleration = (late * each for each in _demand(servo.interpolation, omega, cycle_s, period))
+    position, speed, acceleration = (
+        late * each for each in _demand(servo.interpolation, omega, cycle_s, period)
+    )
     total = back / (1.0 - back)  # sum of all samples before
 
     def lag(time_ms: float) -> np.ndarray:
@@ -71,7 +80,9 @@ def _servo(servo: Servo, omega: np.ndarray, cycle_s: float) -> tuple[np.ndarray,
         notch = (warped**2 + law.notch_depth * law.notch_width * warped + 1.0) / (
             warped**2 + law.notch_width * warped + 1.0
         )
-        loop = gain * (1.0 + 1000.0 * period / law.integral_time_ms * total) * notch * lag(law.torque_filter_ms)
+        loop = (
+            gain * (1.0 + 1000.0 * period / law.integral_time_ms * total) * notch * lag(law.torque_filter_ms)
+        )
         forward = loop * (law.position_gain_per_s + law.velocity_feedforward * difference) * command
         feedback = loop * (law.position_gain_per_s + measured)
     elif isinstance(law, Piv):

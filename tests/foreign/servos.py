@@ -4,11 +4,11 @@
 |---|---|---|---|
 | `PiNotch` | position P, velocity PI on filtered speed, notch, torque low-pass | moving average | velocity |
 | `Piv` | torque = Kv (Kp e + Ki integral of e - speed) | as it is | velocity, acceleration |
-| `Observed` | position P, velocity PI, disturbance observer, back-calculation against wind-up | two lags | none |
-| `StateFeedback` | position and speed of an extended state observer | second-order reference model | acceleration |
+| `Observed` | position P, velocity PI, disturbance observer, anti-windup | two lags | none |
+| `StateFeedback` | position and speed of an extended state observer | reference model | acceleration |
 
 A servo samples the demand and the motor encoder once per period and holds its torque until the next sample.
-Parameters that docs/truth-file.md has carry its names and units. Gains refer to motor radians.
+Parameters that docs/truth-file.md has keep its names and units. Gains refer to motor radians.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-
 from foreign.mechanics import DT_S
+from numba import njit
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Observed:
     speed_filter_ms: float
     observer_hz: float
     observer_gain: float
-    """Share of the estimated disturbance that is supplied; below 1 the observer does not integrate at rest."""
+    """Supplied share of the estimated disturbance. Below 1 the observer does not integrate at rest."""
     nominal_inertia_kg_m2: float
     tracking_time_ms: float
     """Time constant by which the integral gives way to the torque limit."""
@@ -117,15 +116,19 @@ class Servo:
         return self.period_ms / 1000.0
 
 
-_PARAMETERS = (
-    "period_s gain speed_gain integral_rate velocity_ff inertia_ff speed_share first_share second_share "
-    "b0 b1 b2 a1 a2 torque_share observer_share observer_gain observer_rad_s inertia tracking_rate "
-    "reference_rad_s reference_damping l1 l2 l3 k1 k2 current_share current_mean speed_limit torque_limit rest_window"
-).split()
-_STATE = (
-    "before speed active integral first second command n1 n2 filtered q "
-    "seen seen_speed seen_disturbance reference reference_speed torque_nm actual_nm"
-).split()
+# fmt: off
+_PARAMETERS = [
+    "period_s", "gain", "speed_gain", "integral_rate", "velocity_ff", "inertia_ff", "speed_share",
+    "first_share", "second_share", "b0", "b1", "b2", "a1", "a2", "torque_share", "observer_share",
+    "observer_gain", "observer_rad_s", "inertia", "tracking_rate", "reference_rad_s", "reference_damping",
+    "l1", "l2", "l3", "k1", "k2", "current_share", "current_mean", "speed_limit", "torque_limit",
+    "rest_window",
+]
+_STATE = [
+    "before", "speed", "active", "integral", "first", "second", "command", "n1", "n2", "filtered", "q",
+    "seen", "seen_speed", "seen_disturbance", "reference", "reference_speed", "torque_nm", "actual_nm",
+]
+# fmt: on
 PARAMETERS = np.dtype(
     [(name, "f8") for name in _PARAMETERS]
     + [(name, "i8") for name in ("structure", "interpolation", "substeps")]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import can
 import numpy as np
 import pytest
-
 from foreign.bench import bench_of, foreign_bench, serve, write_axis
 from foreign.draw import draw
 from foreign.servos import STRUCTURES
+
 from hdbridge import AxisConfig, Bench, Drive, Stepping, Trajectory
 from hdbridge.clock import MonotonicClock
 
@@ -50,7 +50,11 @@ def test_an_axis_boots_moves_and_follows_a_trajectory(structure, tmp_path):
     assert np.abs(error_arcsec).max() < 700.0
     assert np.ptp(error_arcsec[-20:]) < 30.0
     torque_nm = record.columns["motor_torque_nm"]
-    assert 0.02 * bench.truth.servo.rated_torque_nm < np.abs(torque_nm).max() < 3.0 * bench.truth.servo.rated_torque_nm
+    assert (
+        0.02 * bench.truth.servo.rated_torque_nm
+        < np.abs(torque_nm).max()
+        < 3.0 * bench.truth.servo.rated_torque_nm
+    )
 
 
 @every_structure

@@ -2,12 +2,10 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
 from foreign.draw import candidates
 from foreign.mechanics import (
     ARCSEC,
@@ -22,6 +20,8 @@ from foreign.mechanics import (
     substep,
 )
 from foreign.servos import STRUCTURES
+from hypothesis import given
+from hypothesis import strategies as st
 
 AXES = [next(candidates(seed, structure)) for seed in range(3) for structure in STRUCTURES]
 LAWS = [
@@ -33,11 +33,17 @@ LAWS = [
 
 def lossless(mechanics):
     return replace(
-        mechanics, coulomb_nm=0.0, viscous_nm_s_per_rad=0.0, damping_nm_s_per_rad=0.0, load_viscous_nm_s_per_rad=0.0
+        mechanics,
+        coulomb_nm=0.0,
+        viscous_nm_s_per_rad=0.0,
+        damping_nm_s_per_rad=0.0,
+        load_viscous_nm_s_per_rad=0.0,
     )
 
 
-def advance(plant: Plant, seconds: float, torque_nm: float = 0.0, brake_nm: float = 0.0, every: int = 1) -> np.ndarray:
+def advance(
+    plant: Plant, seconds: float, torque_nm: float = 0.0, brake_nm: float = 0.0, every: int = 1
+) -> np.ndarray:
     """Rows of motor angle, motor speed, load angle, load speed, energy."""
     rows = []
     for at in range(round(seconds / DT_S)):
@@ -52,7 +58,7 @@ def frequency_and_damping(signal: np.ndarray, step_s: float) -> tuple[float, flo
     """Hz and damping ratio of a ring-down about zero, by its zero crossings and peaks."""
     at = np.flatnonzero(np.diff(np.sign(signal)))
     crossings = at + signal[at] / (signal[at] - signal[at + 1])
-    peaks = [np.abs(signal[a : b + 1]).max() for a, b in zip(at, at[1:], strict=False)]
+    peaks = [np.abs(signal[a : b + 1]).max() for a, b in pairwise(at)]
     decay = -np.polyfit(np.arange(len(peaks)), np.log(peaks), 1)[0] / math.pi
     return 0.5 / (np.diff(crossings).mean() * step_s), decay / math.hypot(1.0, decay)
 
@@ -67,7 +73,9 @@ def test_the_compiled_hysteresis_is_the_law_whatever_the_steps(law, travels):
         for _ in range(count):
             value, _ = hysteresis(plant.elements, exponent, beta, math.radians(travel / count))
         got.append(value / ARCSEC)
-    expected = static_error_arcsec(replace(AXES[0].mechanics, hysteresis=law, motor_orders=()), np.cumsum(travels))
+    expected = static_error_arcsec(
+        replace(AXES[0].mechanics, hysteresis=law, motor_orders=()), np.cumsum(travels)
+    )
     assert got == pytest.approx(expected, abs=0.01)
     assert np.abs(got).max() <= (abs(law.offset_arcsec) if isinstance(law, BoucWen) else 30.0) + 1e-9
 
@@ -118,7 +126,9 @@ def test_coulomb_friction_stops_the_axis_after_the_way_that_its_energy_allows():
 
 
 def test_viscous_friction_and_stribeck_set_the_speed_at_which_a_torque_drives():
-    mechanics = replace(AXES[0].mechanics, stribeck_rise=0.3, stribeck_speed_rad_s=10.0, damping_nm_s_per_rad=30.0)
+    mechanics = replace(
+        AXES[0].mechanics, stribeck_rise=0.3, stribeck_speed_rad_s=10.0, damping_nm_s_per_rad=30.0
+    )
     mechanics = replace(mechanics, load_viscous_nm_s_per_rad=0.0, motor_orders=(), hysteresis=MaxwellSlip(()))
     torque_nm = mechanics.coulomb_nm + 100.0 * mechanics.viscous_nm_s_per_rad
     assert not np.any(advance(plant_of(mechanics), 0.2, mechanics.coulomb_nm * 1.29)[:, 0])

@@ -1,11 +1,10 @@
-"""The foreign servos do what their structure says: response in closed form, settling, limits, orders in motion."""
+"""The foreign servos: response in closed form, settling, limits, orders in motion."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from foreign.draw import REST_DEG, Truth, draw
 from foreign.machine import Encoders, ForeignMachine
 from foreign.mechanics import ARCSEC, DT_S, MaxwellSlip, static_error_arcsec
@@ -13,8 +12,12 @@ from foreign.response import motor_response
 from foreign.servos import INTERPOLATIONS, STRUCTURES, Piv, StateFeedback
 
 FINE = Encoders(1 << 20, 64, 0.0, 1 << 23, 0.0)
-AXES = {(seed, structure): draw(seed, structure) for seed in (1, 2) for structure in STRUCTURES}
-by_axis = pytest.mark.parametrize("axis", AXES.values(), ids=[f"{name}-{seed}" for seed, name in AXES])
+AXES = [(seed, structure) for seed in (1, 2) for structure in STRUCTURES]
+
+
+@pytest.fixture(params=AXES, ids=[f"{structure}-{seed}" for seed, structure in AXES])
+def axis(request) -> Truth:
+    return draw(*request.param)
 
 
 def linear(truth: Truth):
@@ -23,7 +26,7 @@ def linear(truth: Truth):
 
 
 def run(machine: ForeignMachine, targets: np.ndarray, cycle_s: float) -> np.ndarray:
-    """Motor angle, load angle (radians) and torque (Nm) after every substep; a set-point in counts per cycle."""
+    """Motor and load angle (rad) and torque (Nm) after each substep; one set-point in counts per cycle."""
     substeps = round(cycle_s / DT_S)
     trace = np.zeros((targets.size, substeps, 3))
     before = machine.motor_counts
@@ -38,7 +41,7 @@ def counts(truth: Truth, motor_deg):
 
 
 def cruise(truth: Truth, speed_deg_s: float, duration_s: float) -> tuple[ForeignMachine, np.ndarray]:
-    """The axis at even speed of the load: what it did after a run-up of half a second and a second of rest."""
+    """The axis at even speed of the load: `run` after the first one and a half seconds."""
     cycle_s, machine = truth.cycle_ms / 1000.0, truth.machine()
     time_s = np.arange(1, round((duration_s + 1.5) / cycle_s)) * cycle_s
     path_deg = np.where(time_s < 0.5, time_s**2, time_s - 0.25) * speed_deg_s * truth.mechanics.ratio
@@ -46,7 +49,6 @@ def cruise(truth: Truth, speed_deg_s: float, duration_s: float) -> tuple[Foreign
 
 
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-@by_axis
 def test_a_chirp_finds_the_response_in_closed_form(axis, interpolation):
     servo = replace(axis.servo, interpolation=interpolation, torque_limit_percent=1e6, speed_limit_rad_s=1e6)
     mechanics, cycle_s = linear(axis), 0.004
@@ -82,7 +84,7 @@ def stiff(truth: Truth):
 
 
 def test_on_a_stiff_axis_the_steps_are_those_of_the_textbook():
-    truth = AXES[1, "piv"]
+    truth = draw(1, "piv")
     mechanics = stiff(truth)
     inertia = mechanics.inertia_kg_m2
     time_s = (np.arange(round(0.4 / DT_S)) + 1) * DT_S
@@ -109,7 +111,6 @@ def test_on_a_stiff_axis_the_steps_are_those_of_the_textbook():
     assert settled_s == pytest.approx(5.83 / rate, rel=0.05)  # (1 + x) exp(-x) = 0.02 at x = 5.83
 
 
-@by_axis
 def test_at_rest_the_load_stands_where_the_static_law_puts_it(axis):
     machine, cycle_s = axis.machine(), axis.cycle_ms / 1000.0
     motor_deg, ratio = [], axis.mechanics.ratio
@@ -119,13 +120,16 @@ def test_at_rest_the_load_stands_where_the_static_law_puts_it(axis):
         turns = np.flatnonzero(np.diff(np.sign(np.diff(path))) != 0) + 1
         motor_deg += [*path[turns], path[-1]]
         expected = static_error_arcsec(axis.mechanics, np.array(motor_deg))[-1]
-        assert (machine.true_load_deg - machine.true_motor_deg / ratio) * 3600.0 == pytest.approx(expected, abs=0.05)
+        assert (machine.true_load_deg - machine.true_motor_deg / ratio) * 3600.0 == pytest.approx(
+            expected, abs=0.05
+        )
         count_deg = 360.0 / axis.encoders.motor_counts_per_turn
-        assert machine.true_motor_deg == pytest.approx(target_deg, abs=max(REST_DEG, count_deg) + 0.5 * count_deg)
+        assert machine.true_motor_deg == pytest.approx(
+            target_deg, abs=max(REST_DEG, count_deg) + 0.5 * count_deg
+        )
         assert np.ptp(path[-round(0.2 / DT_S) :]) <= 0.05  # does not hunt
 
 
-@by_axis
 @pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
 def test_at_even_speed_each_order_shows_at_its_frequency_with_the_amplitude_in_closed_form(axis, share):
     speed = share * axis.velocity_deg_s
@@ -144,7 +148,6 @@ def test_at_even_speed_each_order_shows_at_its_frequency_with_the_amplitude_in_c
     assert np.abs(measured - expected) == pytest.approx(0.0, abs=0.06 * np.abs(expected).max())
 
 
-@by_axis
 def test_limits_hold_and_what_was_wound_up_comes_down_again(axis):
     machine, cycle_s = axis.machine(), axis.cycle_ms / 1000.0
     machine.torque_limit_permille = 800.0
@@ -183,15 +186,15 @@ def test_one_seed_one_record_whatever_ran_before():
             rows.append((machine.motor_counts, machine.load_counts, machine.torque_permille))
         return rows
 
-    axis = AXES[1, "piv"]
+    axis = draw(1, "piv")
     first = record(axis)
-    record(AXES[2, "observed"])
+    record(draw(2, "observed"))
     assert record(axis) == first
     assert record(replace(axis, seed=99)) != first
 
 
 def test_an_axis_that_is_switched_off_coasts_and_wakes_up_where_it_stands():
-    axis = AXES[1, "pi_notch"]
+    axis = draw(1, "pi_notch")
     machine, _ = cruise(axis, 20.0, 0.1)
     machine.coast(20, braked=False)
     assert machine.torque_permille < 30
