@@ -34,7 +34,7 @@ TORQUE = """load_torque:
 
 @dataclass(frozen=True)
 class ForeignBench:
-    """What `foreign_bench` gives."""
+    """A foreign axis on the bus."""
 
     bus: LockstepBus
     clock: VirtualClock
@@ -49,14 +49,14 @@ class ForeignBench:
 def foreign_bench(
     seed: int, structure: str, folder: Path, cycle_ms: float | None = None
 ) -> Iterator[ForeignBench]:
-    """The foreign axis of a seed, switched on; its axis file is written to ``folder``."""
+    """Switches on the foreign axis of a seed and writes its axis file to ``folder``."""
     with bench_of(draw(seed, structure, cycle_ms), folder) as bench:
         yield bench
 
 
 @contextmanager
 def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
-    """The same for a truth that the judge has changed."""
+    """Switches on the axis of a given truth, for example one that was changed."""
     axis, machine = AxisConfig.load(write_axis(truth, folder)), truth.machine()
     with lockstep_bench(machine, axis.eds_path, axis.drive.node_id, nameplate=nameplate(truth)) as (
         bus,
@@ -69,9 +69,9 @@ def bench_of(truth: Truth, folder: Path) -> Iterator[ForeignBench]:
 def serve(
     truth: Truth, axis: AxisConfig, bus: can.BusABC, clock: Clock, should_stop: Callable[[], bool]
 ) -> None:
-    """The foreign drive in real time on any bus, for daemons and commands in other processes."""
+    """Runs the foreign drive in real time on any bus, for a daemon or a command in another process."""
     machine = truth.machine()
-    machine.coast(1, True)  # loads or compiles what has to run in real time
+    machine.coast(1, True)  # compiles before time counts
     machine.follow(0.0, 0.0, 1)
     machine.coast(1, True)
     node = SimulatedDrive(bus, machine, axis.eds_path, axis.drive.node_id, clock, nameplate(truth))
@@ -79,7 +79,7 @@ def serve(
 
 
 class Commissioned(Nameplate):
-    """A drive whose limits were set for its motor: the EDS has those of 8000 counts per turn."""
+    """Nameplate, and limits for this motor; those of the EDS suit 8000 counts per turn."""
 
     def engrave(self, dictionary: Dictionary) -> None:
         super().engrave(dictionary)
@@ -95,7 +95,7 @@ class Commissioned(Nameplate):
 
 
 def nameplate(truth: Truth) -> Nameplate:
-    """What the drive says of itself."""
+    """Identity, units and limits that the drive reports."""
     return Commissioned(
         serial=truth.seed + 1,
         motor_counts_per_turn=truth.encoders.motor_counts_per_turn,
@@ -107,7 +107,7 @@ def nameplate(truth: Truth) -> Nameplate:
 
 
 def write_axis(truth: Truth, folder: Path) -> Path:
-    """The axis file, with what a person knows who installed the axis."""
+    """Writes the axis file: what a person knows who installed the axis."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "axis.yaml"
     path.write_text(f"""schema: hdbridge.axis/1

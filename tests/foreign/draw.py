@@ -25,17 +25,17 @@ INTERPOLATION = {
     "state_feedback": ("hold", "linear", "cubic"),
 }
 MOVES_DEG = (43.56, 87.12, 82.12, 43.56, 0.0)
-"""Motor angles that the axis moves to in turn; it has to settle at each."""
+"""Motor angles to which the axis moves in turn. It has to settle at each."""
 WAIT_S, WATCH_S = 0.15, 0.2
 JERKS_DEG_S3 = tuple(12_000.0 / 2**step for step in range(6))
-"""Limits that a commissioning engineer tries, at the load, with a quarter of it per s2 at most."""
+"""Jerk limits tried in turn, at the load. The acceleration is at most a quarter of the jerk, per s2."""
 REST_DEG = 0.03
-"""How far from its target the settled motor may be, or one count if that is more."""
+"""Largest error of the settled motor; one count if that is more."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a foreign axis is: sealed, for the judge only."""
+    """Sealed truth of a foreign axis, for the judge only."""
 
     seed: int
     structure: str
@@ -53,7 +53,7 @@ class Truth:
     """Window of the axis file, at the motor."""
 
     def machine(self) -> ForeignMachine:
-        """The axis itself, with its noise."""
+        """The axis at rest at zero, with the noise of its seed."""
         return ForeignMachine(self.mechanics, self.servo, self.encoders, self.seed)
 
     def response(self, frequency_hz: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ class Truth:
 
 
 class _Lot:
-    """Random numbers by their kind."""
+    """Random draws of a seed: even, log-even, one of several."""
 
     def __init__(self, *seed: int) -> None:
         self._rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ class _Lot:
 
 @cache
 def draw(seed: int, structure: str, cycle_ms: float | None = None) -> Truth:
-    """The foreign axis of a seed; the same seed and structure give the same axis."""
+    """Foreign axis of a seed. The same seed, structure and cycle give the same axis."""
     for rejected, truth in enumerate(candidates(seed, structure, cycle_ms)):
         if (axis := commissioned(truth)) is not None:
             return replace(axis, rejected=rejected)
@@ -124,7 +124,7 @@ def draw(seed: int, structure: str, cycle_ms: float | None = None) -> Truth:
 
 
 def candidates(seed: int, structure: str, cycle_ms: float | None = None) -> Iterator[Truth]:
-    """Draws without end, stable or not."""
+    """Candidate axes of a seed without end, stable or not."""
     lot = _Lot(seed, list(STRUCTURES).index(structure))
     while True:
         size, cycle = lot.log(0.7, 4.0), lot.one(4.0, 4.0, 2.0)
@@ -139,9 +139,8 @@ def candidates(seed: int, structure: str, cycle_ms: float | None = None) -> Iter
             rated_torque_nm=round(0.32 * size, 3),
             torque_limit_percent=lot.one(200.0, 300.0),
             speed_limit_rad_s=628.0,
-            rest_window_deg=max(1.5, 3.0 * encoders.motor_flicker_counts * encoders.motor_interpolation)
-            * 360.0
-            / (encoders.motor_counts_per_turn * encoders.motor_interpolation),
+            rest_window_deg=max(1.5 / encoders.motor_interpolation, 3.0 * encoders.motor_flicker_counts)
+            * (360.0 / encoders.motor_counts_per_turn),
         )
         cycle = cycle if cycle_ms is None else cycle_ms
         limits = _speed_deg_s(mechanics, servo), _acceleration_deg_s2(mechanics, servo)
@@ -149,10 +148,10 @@ def candidates(seed: int, structure: str, cycle_ms: float | None = None) -> Iter
 
 
 def commissioned(truth: Truth) -> Truth | None:
-    """The axis with the highest jerk and acceleration at which it settles, and a following error window.
+    """The axis with the highest jerk limit at which it settles, and with a following error window.
 
-    None if it does not settle at any of them: the criterion of instability. Without friction the servo itself
-    has to be stable, with friction it must neither hunt nor stick beside the target.
+    None if it does not settle at any jerk limit: the criterion of instability. Without friction the servo has
+    to be stable; with friction it must neither hunt nor stick next to the target.
     """
     fine = replace(
         truth.encoders, motor_counts_per_turn=1 << 20, motor_interpolation=16, motor_flicker_counts=0.0
@@ -170,6 +169,7 @@ def commissioned(truth: Truth) -> Truth | None:
 
 
 def _settles(truth: Truth, mechanics: Mechanics, encoders: Encoders, wait_s: float) -> bool:
+    """True if the motor is at rest at each target of `MOVES_DEG` from ``wait_s`` after the move."""
     machine = ForeignMachine(mechanics, truth.servo, encoders, truth.seed)
     count_deg = 360.0 / encoders.motor_counts_per_turn
     cycle_s, before, from_deg = truth.cycle_ms / 1000.0, 0, 0.0
@@ -204,6 +204,7 @@ def _mechanics(lot: _Lot, size: float) -> Mechanics:
     else:
         shares = [lot.even(0.5, 1.5) for _ in range(5)]
         hysteresis = MaxwellSlip(tuple((offset * each / sum(shares), lot.log(1.0, 25.0)) for each in shares))
+    wind_up = lot.one(0.0, lot.even(1.0, 10.0)) * ARCSEC  # at 100 deg/s
     return Mechanics(
         motor_inertia_kg_m2=motor,
         coulomb_nm=friction,
@@ -214,11 +215,7 @@ def _mechanics(lot: _Lot, size: float) -> Mechanics:
         stiffness_nm_per_rad=stiffness,
         damping_nm_s_per_rad=2.0 * lot.even(0.03, 0.2) * load * held,
         load_inertia_kg_m2=load,
-        # winds the spring up by so many arcsec at 100 deg/s
-        load_viscous_nm_s_per_rad=lot.one(0.0, lot.even(1.0, 10.0))
-        * ARCSEC
-        * stiffness
-        / math.radians(100.0),
+        load_viscous_nm_s_per_rad=wind_up * stiffness / math.radians(100.0),
         motor_orders=tuple(
             Order(order, lot.even(*span), lot.even(-180.0, 180.0)) for order, span in orders.items()
         ),

@@ -1,4 +1,4 @@
-"""A foreign axis as a drive's firmware has it (`hdbridge.sim.motion.Machine`): servo, mechanics, encoders.
+"""A foreign axis as the firmware sees it (`hdbridge.sim.motion.Machine`): servo, mechanics, encoders.
 
 Deterministic: the same parameters and seed, driven alike, give the same numbers bit for bit.
 """
@@ -16,11 +16,11 @@ from numba import njit
 
 @dataclass(frozen=True)
 class Encoders:
-    """Both encoders. A count's middle is its angle."""
+    """Motor and load encoder. A count's middle is its angle."""
 
     motor_counts_per_turn: int
     motor_interpolation: int
-    """Steps per count on which the loops close; whole counts are reported."""
+    """Steps per count in the loops. The bus has whole counts."""
     motor_flicker_counts: float
     """Rms noise of each motor reading, in the loops and on the bus."""
     load_counts_per_turn: int
@@ -67,9 +67,9 @@ class ForeignMachine:
     def follow(
         self, start_counts: float, end_counts: float, substeps: int, trace: np.ndarray | None = None
     ) -> None:
-        """Closed loop for one cycle whose set-points are ``start_counts`` before and ``end_counts`` now.
+        """Follows a demand for one cycle, from set-point ``start_counts`` to set-point ``end_counts``.
 
-        ``trace``, one row per substep, takes the motor angle, the load angle in radians and the torque in Nm.
+        ``trace`` takes one row per substep: motor and load angle in radians, torque in Nm.
         """
         if substeps < 1:
             return
@@ -78,7 +78,7 @@ class ForeignMachine:
         if not self._powered:
             settle(self.loops, start_counts * step)
             self._powered = True
-        elif knots[3] != start_counts * step:  # the demand was set anew
+        elif knots[3] != start_counts * step:  # a new start of the demand
             knots[:4] = start_counts * step
         knots[:3] = knots[1:4]
         knots[3] = end_counts * step
@@ -93,7 +93,7 @@ class ForeignMachine:
         self._sample()
 
     def coast(self, substeps: int, braked: bool) -> None:
-        """Power stage off: friction, or the brake, slows the motor and holds it."""
+        """Runs without torque; friction and, if closed, the brake slow the motor."""
         self._powered = False
         self._torque_nm = 0.0
         _roll(self.plant, self.mechanics.brake_nm if braked else 0.0, substeps)
@@ -119,7 +119,7 @@ class ForeignMachine:
         return self._noise.standard_normal(count)
 
     def _sample(self) -> None:
-        """Read the encoders and the torque, as the drive reports them."""
+        """Samples encoders and torque as the drive reports them."""
         encoders, state = self.encoders, self.plant.state[0]
         motor, load, current = self._normals(3).tolist()
         self.motor_counts = round(state["motor"] / self._steps[0] + encoders.motor_flicker_counts * motor)
@@ -132,7 +132,7 @@ class ForeignMachine:
 
 @njit(cache=True)
 def _drive(plant, loops, encoder, noise, count, limit_nm, trace):
-    """Advance by ``count`` substeps; encoder: radians per count, steps per count, flicker in counts."""
+    """Advances by ``count`` substeps. ``encoder``: radians per count, steps per count, flicker in counts."""
     p, s, sample = loops.parameters[0], loops.state[0], 0
     limit_nm = min(limit_nm, p.torque_limit)
     for i in range(count):
@@ -152,6 +152,6 @@ def _drive(plant, loops, encoder, noise, count, limit_nm, trace):
 
 @njit(cache=True)
 def _roll(plant, brake_nm, count):
-    """Advance by ``count`` substeps without torque."""
+    """Advances by ``count`` substeps without torque."""
     for _ in range(count):
         substep(plant.parameters, plant.orders, plant.elements, plant.state, 0.0, brake_nm)

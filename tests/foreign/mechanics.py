@@ -54,7 +54,7 @@ class MaxwellSlip:
 
 @dataclass(frozen=True)
 class Mechanics:
-    """Everything behind the motor's torque."""
+    """Parameters of motor, gear and load."""
 
     motor_inertia_kg_m2: float
     coulomb_nm: float
@@ -70,7 +70,7 @@ class Mechanics:
     hysteresis: BoucWen | MaxwellSlip
     brake_nm: float = 1.0
     gravity_nm: float = 0.0
-    """Torque of the mass on the load at a right angle; it hangs straight down at the load angle zero."""
+    """Torque of a mass on the load that is held level. It hangs straight down at the load angle zero."""
 
     @property
     def inertia_kg_m2(self) -> float:
@@ -149,7 +149,7 @@ def tooth_error(orders, motor):
 
 @njit(cache=True)
 def hysteresis(elements, exponent, beta, travel):
-    """Advance by motor travel; returns the error and its derivative by the motor angle, radians."""
+    """Advances by motor travel. Returns the error and its derivative by the motor angle, radians."""
     value, slope = 0.0, 0.0
     for i in range(elements.shape[0]):
         limit, stretch, before = elements[i, 0], elements[i, 1], elements[i, 2]
@@ -181,7 +181,7 @@ def _bouc_wen(z, sign, exponent, beta):
 
 @njit(cache=True)
 def substep(parameters, orders, elements, state, torque_nm, brake_nm):
-    """Advance the axis by `DT_S` under a motor torque."""
+    """Advances the axis by `DT_S` under a motor torque."""
     p, s = parameters[0], state[0]
     half = 0.5 * DT_S
     motor = s.motor + half * s.motor_speed
@@ -212,10 +212,9 @@ def substep(parameters, orders, elements, state, torque_nm, brake_nm):
 
 
 def static_error_arcsec(mechanics: Mechanics, motor_deg: np.ndarray) -> np.ndarray:
-    """Load error at rest along a path of motor angles from a fresh start at zero; gravity excluded.
+    """Load error at rest at each stop of a motor path that starts at zero, without gravity.
 
-    ``motor_deg`` has the stops in order; the motor turns straight from one to the next. In numpy, independent
-    of the compiled law.
+    The motor turns straight from stop to stop of ``motor_deg``. Independent of the compiled law.
     """
     angle = np.radians(motor_deg)
     error = sum(

@@ -67,7 +67,7 @@ class Observed:
     """Supplied share of the estimated disturbance. Below 1 the observer does not integrate at rest."""
     nominal_inertia_kg_m2: float
     tracking_time_ms: float
-    """Time constant by which the integral gives way to the torque limit."""
+    """Time constant of the back-calculation at the torque limit."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ AT_REST = 1e-6
 
 @dataclass(frozen=True)
 class Servo:
-    """One structure with what all have."""
+    """A servo: its structure, and the parameters that all structures have."""
 
     law: Law
     period_ms: float
     """Sampling period; a multiple of the plant's substep."""
     interpolation: str
-    """Demand between set-points: the new one at once, a straight line to it, or a cubic spline (Catmull-Rom)
-    through the last four, one cycle late."""
+    """Between set-points: the new one at once (hold), a straight line (linear), or a Catmull-Rom spline through
+    the last four, one cycle late (cubic)."""
     dead_time_ms: float
     """Age of the demand; a multiple of the period."""
     current_lag_ms: float
@@ -109,7 +109,7 @@ class Servo:
     torque_limit_percent: float
     speed_limit_rad_s: float
     rest_window_deg: float
-    """Motor error within which integrals and disturbance observers rest while the demand does: no hunting."""
+    """Motor error within which integrals and observers pause at rest, so that nothing hunts."""
 
     @property
     def period_s(self) -> float:
@@ -137,14 +137,14 @@ LOOPS = np.dtype([(name, "f8") for name in _STATE] + [(name, "i8") for name in (
 
 
 class Loops(NamedTuple):
-    """What `torque` computes with."""
+    """Parameters and state of a servo, as `torque` takes them."""
 
     parameters: np.ndarray
     """Record `PARAMETERS`."""
     state: np.ndarray
     """Record `LOOPS`."""
     delay: np.ndarray
-    """Ring of demands (position, speed, acceleration) that wait for the dead time."""
+    """Ring of demands (position, speed, acceleration) for the dead time."""
     average: np.ndarray
     """Ring of the moving average."""
     knots: np.ndarray
@@ -152,12 +152,12 @@ class Loops(NamedTuple):
 
 
 def loops_of(servo: Servo) -> Loops:
-    """The servo's parameters per sample; call `settle` before use."""
+    """Parameters and state of a servo. Call `settle` before use."""
     record, law = np.zeros(1, PARAMETERS), servo.law
     p, period = record[0], servo.period_s
 
     def share(time_ms: float) -> float:
-        """Part of the way that a first-order lag takes per sample."""
+        """Gain per sample of a first-order lag."""
         return -math.expm1(-1000.0 * period / time_ms) if time_ms > 0.0 else 1.0
 
     p["structure"] = list(STRUCTURES.values()).index(type(law))
@@ -207,7 +207,7 @@ def loops_of(servo: Servo) -> Loops:
 
 
 def settle(loops: Loops, position: float) -> None:
-    """Loops at rest at a position in radians, without torque: as after the power stage was switched on."""
+    """Puts the loops to rest at a position in radians, without torque, as at power-on."""
     loops.state[:] = 0
     for name in ("before", "first", "second", "command", "seen", "reference"):
         loops.state[0][name] = position
@@ -237,7 +237,7 @@ def demand(kind, knots, share, cycle_s):
 
 @njit(cache=True)
 def torque(loops, position, target, target_speed, target_acceleration, limit_nm):
-    """Take one sample: motor position and demand in radians; returns the torque to hold until the next."""
+    """Takes one sample of motor position and demand (radians). Returns the torque until the next one."""
     p, s = loops.parameters[0], loops.state[0]
     if loops.delay.shape[0] > 0:
         row = loops.delay[s.delay_at]
