@@ -99,8 +99,8 @@ class Servo:
     period_ms: float
     """Sampling period; a multiple of the plant's substep."""
     interpolation: str
-    """Between set-points: the new one at once (hold), a straight line (linear), or a Catmull-Rom spline through
-    the last four, one cycle late (cubic)."""
+    """Between set-points: the new one at once (hold), a straight line (linear), or a Catmull-Rom spline
+    through the last four, one cycle late (cubic)."""
     dead_time_ms: float
     """Age of the demand; a multiple of the period."""
     current_lag_ms: float
