@@ -37,7 +37,7 @@ class Character:
 _RESTLESS: Final = {"controlword": Controlword.LEVEL, "holds_rpdo": True, "rpdo_before_tpdo": True}
 _SLUGGISH: Final = {
     "status_delay_ms": 50.0,
-    "sdo_delay_s": 0.1,
+    "sdo_delay_s": 2.0,
     "rpdo_timer": False,
     "heartbeat_consumer": HeartbeatConsumer.STOPS,
 }
