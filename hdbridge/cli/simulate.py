@@ -45,11 +45,11 @@ def simulate(
 
         hdbridge step article --interface socketcan --channel vcan0
     """
+    from hdbridge.device.node import DriveNode
+    from hdbridge.device.run import run
     from hdbridge.drive.link import open_bus
     from hdbridge.sim.lockstep import nameplate_of
     from hdbridge.sim.machine import Machine
-    from hdbridge.sim.node import SimulatedDrive
-    from hdbridge.sim.run import run
     from hdbridge.sim.truth import Truth
 
     files = Profile.find(profile)
@@ -64,7 +64,7 @@ def simulate(
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
         nameplate = nameplate_of(known, load_object=axis.load_encoder.source.address)
-        node = SimulatedDrive(
+        node = DriveNode(
             bus,
             Machine(known, seed),
             axis.eds_path,

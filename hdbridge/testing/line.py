@@ -16,10 +16,10 @@ import can
 
 from hdbridge.axis.config import BusConfig
 from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.device.run import run
 from hdbridge.drive.interfacelock import interface_lock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusInUseError, HdbridgeError, InputError
-from hdbridge.sim.run import run
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
 from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
 from hdbridge.testing.watched import WatchedDrive

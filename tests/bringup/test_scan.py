@@ -12,13 +12,13 @@ import pytest
 from hdbridge.axis import AxisConfig
 from hdbridge.bringup.match import axis_lines, compare
 from hdbridge.bringup.scan import Node, Scan, scan_bus
+from hdbridge.device.node import DriveNode
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
 from hdbridge.errors import BusInUseError
 from hdbridge.files.bundled import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from tests.support.chatter import Chatter
 
@@ -56,9 +56,7 @@ class Encoder:
 
 
 @contextmanager
-def bench(
-    *chatter: tuple[int, bytes], encoder: int | None = None
-) -> Iterator[tuple[Link, SimulatedDrive, list]]:
+def bench(*chatter: tuple[int, bytes], encoder: int | None = None) -> Iterator[tuple[Link, DriveNode, list]]:
     channel = f"scan-{uuid4()}"
     truth = Truth.load(bundled_profile("article"))
     with (

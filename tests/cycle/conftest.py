@@ -14,6 +14,7 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
@@ -21,7 +22,6 @@ from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, simulated_bench
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from tests.support.characters import FRIENDLY, Character
 
@@ -82,7 +82,7 @@ class Rig:
 
     bus: SpoiltBus
     clock: VirtualClock
-    node: SimulatedDrive
+    node: DriveNode
     drive: Drive
     cycle: Cycle
     supervision: Supervision

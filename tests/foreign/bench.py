@@ -19,11 +19,11 @@ from foreign.machine import ForeignMachine
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
-from hdbridge.sim.dictionary import Dictionary
+from hdbridge.device.dictionary import Dictionary
+from hdbridge.device.nameplate import Nameplate
+from hdbridge.device.node import DriveNode
+from hdbridge.device.run import run
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
-from hdbridge.sim.nameplate import Nameplate
-from hdbridge.sim.node import SimulatedDrive
-from hdbridge.sim.run import run
 
 REACH_DEG = 4000.0
 TORQUE = """load_torque:
@@ -38,7 +38,7 @@ class ForeignBench:
 
     bus: LockstepBus
     clock: VirtualClock
-    node: SimulatedDrive
+    node: DriveNode
     axis: AxisConfig
     machine: ForeignMachine
     """The plant, for true angles."""
@@ -74,7 +74,7 @@ def serve(
     machine.coast(1, True)  # compiles before time counts
     machine.follow(0.0, 0.0, 1)
     machine.coast(1, True)
-    node = SimulatedDrive(bus, machine, axis.eds_path, axis.drive.node_id, clock, nameplate(truth))
+    node = DriveNode(bus, machine, axis.eds_path, axis.drive.node_id, clock, nameplate(truth))
     run(bus, node, clock, should_stop)
 
 

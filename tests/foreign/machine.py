@@ -1,4 +1,4 @@
-"""A foreign axis as the firmware sees it (`hdbridge.sim.motion.Machine`): servo, mechanics, encoders.
+"""A foreign axis as the firmware sees it (`hdbridge.device.motion.Machine`): servo, mechanics, encoders.
 
 Deterministic: the same parameters and seed, driven alike, give the same numbers bit for bit.
 """

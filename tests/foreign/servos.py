@@ -126,7 +126,7 @@ _PARAMETERS = [
 ]
 _STATE = [
     "before", "speed", "active", "integral", "first", "second", "command", "n1", "n2", "filtered", "q",
-    "seen", "seen_speed", "seen_disturbance", "reference", "reference_speed", "torque_nm", "actual_nm",
+    "estimate", "estimated_speed", "estimated_disturbance", "reference", "reference_speed", "torque_nm", "actual_nm",
 ]
 # fmt: on
 PARAMETERS = np.dtype(
@@ -209,7 +209,7 @@ def loops_of(servo: Servo) -> Loops:
 def settle(loops: Loops, position: float) -> None:
     """Puts the loops to rest at a position in radians, without torque, as at power-on."""
     loops.state[:] = 0
-    for name in ("before", "first", "second", "command", "seen", "reference"):
+    for name in ("before", "first", "second", "command", "estimate", "reference"):
         loops.state[0][name] = position
     loops.delay[:] = position, 0.0, 0.0
     loops.average[:] = position
@@ -313,11 +313,11 @@ def _state_feedback(p, s, position, target, limit_nm):
     before = s.reference_speed
     s.reference_speed = min(p.speed_limit, max(-p.speed_limit, before + period * acceleration))
     s.reference += period * s.reference_speed
-    wanted = p.inertia_ff * (s.reference_speed - before) / period - s.seen_disturbance
-    wanted += p.k1 * (s.reference - s.seen) + p.k2 * (s.reference_speed - s.seen_speed)
+    wanted = p.inertia_ff * (s.reference_speed - before) / period - s.estimated_disturbance
+    wanted += p.k1 * (s.reference - s.estimate) + p.k2 * (s.reference_speed - s.estimated_speed)
     given = min(limit_nm, max(-limit_nm, wanted))
-    miss, seen_speed = position - s.seen, s.seen_speed
-    s.seen += period * (seen_speed + p.l1 * miss)
-    s.seen_speed += period * ((given + s.seen_disturbance) / p.inertia + p.l2 * miss)
-    s.seen_disturbance += s.active * period * p.l3 * p.inertia * miss
+    miss, estimated_speed = position - s.estimate, s.estimated_speed
+    s.estimate += period * (estimated_speed + p.l1 * miss)
+    s.estimated_speed += period * ((given + s.estimated_disturbance) / p.inertia + p.l2 * miss)
+    s.estimated_disturbance += s.active * period * p.l3 * p.inertia * miss
     return given

@@ -8,8 +8,8 @@ from itertools import product
 from typing import Final, Literal
 
 from hdbridge.axis import AxisConfig
-from hdbridge.sim.behaviour import Behaviour, Controlword, HeartbeatConsumer
-from hdbridge.sim.node import SimulatedDrive
+from hdbridge.device.behaviour import Behaviour, Controlword, HeartbeatConsumer
+from hdbridge.device.node import DriveNode
 from hdbridge.sim.truth import Truth
 
 
@@ -68,7 +68,7 @@ def _every_character() -> Iterator[Character]:
 class PowerCount:
     """Counts how often a drive enters 'operation enabled'."""
 
-    def __init__(self, node: SimulatedDrive) -> None:
+    def __init__(self, node: DriveNode) -> None:
         self.times = 0
         firmware = node.firmware
         operate = firmware._operate

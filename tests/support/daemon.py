@@ -26,12 +26,12 @@ from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
 from hdbridge.daemon.setting import CompensationSetting
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
 
@@ -121,7 +121,7 @@ class SteppedDaemon:
         memory: Memory,
         clock: VirtualClock,
         bus: SpoiltBus,
-        nodes: Sequence[SimulatedDrive],
+        nodes: Sequence[DriveNode],
         intruder: VirtualBus,
     ) -> None:
         self._begin, self.memory, self.clock = begin, memory, clock

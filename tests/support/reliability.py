@@ -18,10 +18,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from hdbridge.device.behaviour import Controlword
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
-from hdbridge.sim.behaviour import Controlword
-from hdbridge.sim.node import SimulatedDrive
 from tests.support.characters import FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
@@ -40,7 +40,7 @@ DAEMON_VCAN = "daemon, vcan"
 class Bench(Protocol):
     """An axis under way at constant speed, and what can be done to it."""
 
-    node: SimulatedDrive
+    node: DriveNode
     supervision: Supervision
     period_s: float
 

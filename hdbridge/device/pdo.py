@@ -12,7 +12,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
-from hdbridge.sim.dictionary import Abort, Dictionary, Entry, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, Entry, SdoAbortError
 
 INVALID: Final = 1 << 31
 EXTENDED: Final = 1 << 29

@@ -8,8 +8,8 @@ from typing import Final
 import can
 
 from hdbridge.clock import Clock
+from hdbridge.device.node import DriveNode
 from hdbridge.errors import BusError
-from hdbridge.sim.node import SimulatedDrive
 
 LONGEST_WAIT_S: Final = 0.1
 """How long ``should_stop`` may go unasked, unless a shorter time is wanted."""
@@ -20,7 +20,7 @@ PATIENCE_S: Final = 5.0
 
 def run(
     bus: can.BusABC,
-    node: SimulatedDrive,
+    node: DriveNode,
     clock: Clock,
     should_stop: Callable[[], bool],
     longest_wait_s: float = LONGEST_WAIT_S,

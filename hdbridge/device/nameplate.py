@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from hdbridge.sim.dictionary import Dictionary
+from hdbridge.device.dictionary import Dictionary
 
 LOAD_OBJECT: Final = (0x60E4, 1)
 

@@ -13,10 +13,10 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
+from hdbridge.device.dictionary import Dictionary
 from hdbridge.errors import InputError
-from hdbridge.sim.dictionary import Dictionary
 from hdbridge.sim.lockstep import lockstep_bench
-from tests.sim.conftest import RawMaster
+from tests.device.conftest import RawMaster
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 

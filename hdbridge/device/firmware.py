@@ -8,20 +8,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from hdbridge.sim.behaviour import Behaviour, Controlword
-from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
-from hdbridge.sim.emergency import Emergency, ErrorCode
-from hdbridge.sim.faults import Faults
-from hdbridge.sim.modes import (
+from hdbridge.device.behaviour import Behaviour, Controlword
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.emergency import Emergency, ErrorCode
+from hdbridge.device.faults import Faults
+from hdbridge.device.modes import (
     CyclicSynchronousPosition,
     Homing,
     InterpolatedPosition,
     Mode,
     ProfilePosition,
 )
-from hdbridge.sim.motion import Machine, Motion, wrap_int32
-from hdbridge.sim.powerstate import POWERED, Control, State, Status, next_state
-from hdbridge.sim.profile import Profile, stop
+from hdbridge.device.motion import Machine, Motion, wrap_int32
+from hdbridge.device.powerstate import POWERED, Control, State, Status, next_state
+from hdbridge.device.profile import Profile, stop
 
 SLOW_DOWN_RAMP: Final = (1, 5)
 QUICK_STOP_RAMP: Final = (2, 6)

@@ -16,9 +16,9 @@ import canopen
 import pytest
 
 from hdbridge.clock import MonotonicClock
+from hdbridge.device.node import DriveNode
+from hdbridge.device.run import run
 from hdbridge.errors import BusError
-from hdbridge.sim.node import SimulatedDrive
-from hdbridge.sim.run import run
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 PATIENCE_S = 20.0
@@ -38,11 +38,11 @@ def channel() -> str:
 
 
 @pytest.fixture
-def drive(channel: str, motor) -> Iterator[SimulatedDrive]:
+def drive(channel: str, motor) -> Iterator[DriveNode]:
     """A drive in a thread of its own."""
     stop = threading.Event()
     with can.Bus(interface="virtual", channel=channel, ignore_config=True) as bus:
-        node = SimulatedDrive(bus, motor, EDS, 5, MonotonicClock())
+        node = DriveNode(bus, motor, EDS, 5, MonotonicClock())
         thread = threading.Thread(target=run, args=(bus, node, MonotonicClock(), stop.is_set))
         thread.start()
         try:
@@ -64,7 +64,7 @@ def network(channel: str) -> Iterator[canopen.Network]:
 
 
 @pytest.fixture
-def remote(network: canopen.Network, drive: SimulatedDrive) -> canopen.RemoteNode:
+def remote(network: canopen.Network, drive: DriveNode) -> canopen.RemoteNode:
     remote = network.add_node(5, str(EDS))
     remote.sdo.RESPONSE_TIMEOUT = PATIENCE_S
     return remote
@@ -163,7 +163,7 @@ class SteppedClock:
 def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
     clock = SteppedClock()
     with BrokenBus() as bus:
-        node = SimulatedDrive(bus, motor, EDS, 1, clock)
+        node = DriveNode(bus, motor, EDS, 1, clock)
         with pytest.raises(BusError, match="gone: cannot be read"):
             run(bus, node, clock, lambda: False)
     assert motor.elapsed_s > 4.0
@@ -172,6 +172,6 @@ def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
 def test_frames_that_cannot_be_sent_are_dropped(motor):
     with BrokenBus() as bus:
         bus.recv = lambda timeout: None
-        node = SimulatedDrive(bus, motor, EDS, 1, SteppedClock())
+        node = DriveNode(bus, motor, EDS, 1, SteppedClock())
         node.poll(0.0)
         assert node.lost_frames == 1

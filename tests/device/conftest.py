@@ -9,8 +9,8 @@ from pathlib import Path
 import can
 import pytest
 
+from hdbridge.device.node import DriveNode
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
-from hdbridge.sim.node import SimulatedDrive
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 PERIOD_S = 0.004
@@ -62,9 +62,7 @@ class IdealMotor:
 class RawMaster:
     """Writes and reads frames as bytes; knows nothing of the package's master."""
 
-    def __init__(
-        self, bus: LockstepBus, clock: VirtualClock, node: SimulatedDrive, motor: IdealMotor
-    ) -> None:
+    def __init__(self, bus: LockstepBus, clock: VirtualClock, node: DriveNode, motor: IdealMotor) -> None:
         self.bus, self.clock, self.node, self.motor = bus, clock, node, motor
         self.seen: list[tuple[int, bytes]] = []
 

@@ -9,7 +9,7 @@ import struct
 from enum import IntEnum
 from typing import Final
 
-from hdbridge.sim.dictionary import MAX_STRING, Abort, Dictionary, Entry, SdoAbortError
+from hdbridge.device.dictionary import MAX_STRING, Abort, Dictionary, Entry, SdoAbortError
 
 _HEAD: Final = struct.Struct("<BHB")
 _ABORT: Final = struct.Struct("<BHBI")

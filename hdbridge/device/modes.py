@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from hdbridge.sim.dictionary import Abort, SdoAbortError
-from hdbridge.sim.motion import Motion, wrap_int32
-from hdbridge.sim.powerstate import Control, Status
-from hdbridge.sim.profile import Profile, move
+from hdbridge.device.dictionary import Abort, SdoAbortError
+from hdbridge.device.motion import Motion, wrap_int32
+from hdbridge.device.powerstate import Control, Status
+from hdbridge.device.profile import Profile, move
 
 INDEX_PULSE: Final = {33: -1, 34: 1}
 """Methods that move to the next index pulse, and in which direction."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from hdbridge.sim.dictionary import Dictionary
+from hdbridge.device.dictionary import Dictionary
 
 _HALF: Final = 1 << 31
 _MASK: Final = (1 << 32) - 1

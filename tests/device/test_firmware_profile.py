@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.sim.profile import move, stop
+from hdbridge.device.profile import move, stop
 
 positions = st.floats(-1e6, 1e6)
 speeds = st.floats(-1e5, 1e5)

@@ -18,16 +18,16 @@ import can
 
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
-from hdbridge.sim.behaviour import Behaviour, HeartbeatConsumer
-from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
-from hdbridge.sim.emergency import Emergency, ErrorCode
-from hdbridge.sim.faults import Faults, Outgoing
-from hdbridge.sim.firmware import Firmware
-from hdbridge.sim.motion import Machine
-from hdbridge.sim.nameplate import Nameplate
-from hdbridge.sim.nmt import Nmt, NmtCommand
-from hdbridge.sim.pdo import ReceivePdo, TransmitPdo
-from hdbridge.sim.sdo_server import SdoServer
+from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.emergency import Emergency, ErrorCode
+from hdbridge.device.faults import Faults, Outgoing
+from hdbridge.device.firmware import Firmware
+from hdbridge.device.motion import Machine
+from hdbridge.device.nameplate import Nameplate
+from hdbridge.device.nmt import Nmt, NmtCommand
+from hdbridge.device.pdo import ReceivePdo, TransmitPdo
+from hdbridge.device.sdo_server import SdoServer
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
@@ -46,7 +46,7 @@ _AFTER_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
 """Object 1029h:01: the NMT state after a communication error; 1 changes nothing."""
 
 
-class SimulatedDrive:
+class DriveNode:
     """A CiA-402 drive on ``bus``, moving ``machine``.
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives

@@ -8,7 +8,7 @@ from enum import IntEnum
 from functools import partial
 from typing import Final
 
-from hdbridge.sim.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
 
 HISTORY_DEPTH: Final = 8
 _FRAME: Final = struct.Struct("<HB5s")
