@@ -126,7 +126,8 @@ _PARAMETERS = [
 ]
 _STATE = [
     "before", "speed", "active", "integral", "first", "second", "command", "n1", "n2", "filtered", "q",
-    "estimate", "estimated_speed", "estimated_disturbance", "reference", "reference_speed", "torque_nm", "actual_nm",
+    "estimate", "estimated_speed", "estimated_disturbance", "reference", "reference_speed", "torque_nm",
+    "actual_nm",
 ]
 # fmt: on
 PARAMETERS = np.dtype(
