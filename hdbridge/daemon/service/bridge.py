@@ -235,6 +235,7 @@ class ServiceBridge:
                 period_s=core.memory.period_s,
                 cycle=core.observer.cycle,
                 alive=core.observer.alive,
+                pid=core.memory.status.loop_pid,
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
                 busy_us=float(head["busy_us"]) if head is not None else None,
