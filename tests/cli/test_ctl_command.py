@@ -5,11 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from support.api import served
 from support.fake_bridge import FakeBridge
+from support.patience import PATIENCE_S, until
 
 from hdbridge import SafetyStop
 from hdbridge.client import messages
@@ -210,18 +210,15 @@ def test_an_object_is_read(ctl):
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_axis_that_moves(machine, place, number):
-    machine.axes["joint-1"].moving_s = 60.0
+    machine.axes["joint-1"].moving_s = 2 * PATIENCE_S
     command = [sys.executable, "-m", "hdbridge", "ctl", "move", "joint-1", "30"]
     environment = {**os.environ, "HDBRIDGE_SOCKET": str(place.socket)}
     with subprocess.Popen(
         command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as moving:
-        until = time.monotonic() + 60
-        while not machine.moved:
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        until(lambda: machine.moved)
         moving.send_signal(number)
-        _, said = moving.communicate(timeout=60)
+        _, said = moving.communicate()
     assert moving.returncode == 130
     assert "axis 'joint-1' is stopped; it stays enabled" in said
     assert "Traceback" not in said

@@ -43,7 +43,7 @@ def url(certificate):
         time.sleep(0.005)
     yield address
     server.stop()
-    thread.join(30)
+    thread.join()
 
 
 def test_a_client_that_trusts_the_certificate_asks_moves_and_watches(url, certificate):
