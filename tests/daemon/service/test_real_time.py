@@ -1,7 +1,9 @@
 """The service as it runs: event loop, worker threads, a job's process; the control loop in a thread."""
 
 import asyncio
+import math
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +14,7 @@ from support.service import Service, stepped_service
 from hdbridge.client.messages import JobKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.interface import StreamPoint, WayPoint
-from hdbridge.daemon.service.timing import RealTiming
+from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
 from hdbridge.errors import RefusedError
 
 
@@ -39,10 +41,17 @@ async def verified(bridge: ServiceBridge) -> None:
         await asyncio.sleep(0.02)
 
 
-def test_many_things_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slower", [1, 5000], ids=["idle", "busy"])
+def test_many_things_at_once(tmp_path: Path, slower: int) -> None:
+    """Also on a computer that takes so many times as long for everything."""
+
     async def story(service: Service) -> None:
-        timing = RealTiming(8)
-        async with ServiceBridge(service.machine, service.daemon.memory, timing, runtime=tmp_path) as bridge:
+        memory = service.daemon.memory
+        clock = SimulatedClock(
+            lambda: memory.status.loop_count, memory.period_s, lambda: slower * time.monotonic(), math.inf
+        )
+        timing = RealTiming(8, clock)
+        async with ServiceBridge(service.machine, memory, timing, runtime=tmp_path) as bridge:
             await verified(bridge)
             token = bridge.lease.take("test")
             await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))
