@@ -49,7 +49,7 @@ def hold(
         token = None
         if page is not None and tcp is None:
             token = secrets.token_urlsafe(32)
-            listeners.append(stack.enter_context(tcp_socket("127.0.0.1", page)))
+            listeners.append(stack.enter_context(tcp_socket("127.0.0.1", page, "--port")))
         if page is not None:
             _tell_page(listeners[-1], token, tls=tcp is not None and tcp.certificate is not None)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))

@@ -60,8 +60,11 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
     return listener
 
 
-def tcp_socket(host: str, port: int) -> socket.socket:
-    """A listening TCP socket; DaemonError where the port is taken, InputError for a host that is none."""
+def tcp_socket(host: str, port: int, option: str = "api.tcp.port") -> socket.socket:
+    """A listening TCP socket; DaemonError where the port is taken, InputError for a host that is none.
+
+    ``option`` is where the port can be changed, for complaints.
+    """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -77,9 +80,9 @@ def tcp_socket(host: str, port: int) -> socket.socket:
         listener.close()
         if problem.errno == errno.EADDRINUSE:
             raise DaemonError(
-                f"{host}:{port}: another process listens there; stop it or give api.tcp.port another number"
+                f"{host}:{port}: another process listens there; stop it, or give {option} another number"
             ) from None
-        raise InputError(f"{host}:{port}: cannot be listened at: {problem.strerror}") from None
+        raise InputError(f"{option}: {host}:{port} cannot be listened at: {problem.strerror}") from None
     return listener
 
 

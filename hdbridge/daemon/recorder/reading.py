@@ -21,6 +21,7 @@ from hdbridge.daemon.recorder.about import About
 from hdbridge.daemon.recorder.flightfile import EVENTS, MACHINE_TOPIC, MODEL, PART, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
+from hdbridge.files.regular import open_regular
 
 SUFFIX: Final = ".mcap"
 TORN: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
@@ -78,10 +79,12 @@ def flight_files(paths: list[Path]) -> list[Path]:
             if not inside:
                 raise InputError(f"{path}: no {SUFFIX} file in this folder; expected flight recordings")
             found += sorted(inside, key=lambda each: each.name)
-        elif path.exists():
-            found.append(path)
-        else:
+        elif not path.exists():
             raise InputError(f"{path}: there is no such file or folder; expected a flight recording")
+        elif not (path.is_file() and path.name.endswith((SUFFIX, SUFFIX + PART))):
+            raise InputError(f"{path}: is no flight recording; expected a file that ends in {SUFFIX}")
+        else:
+            found.append(path)
     return found
 
 
@@ -186,7 +189,7 @@ def overview(path: Path) -> Overview:
 
 def _opened(path: Path) -> BinaryIO:
     try:
-        return path.open("rb")
+        return open_regular(path)
     except OSError as problem:
         raise InputError(f"{path}: cannot be read: {problem.strerror}") from None
 
