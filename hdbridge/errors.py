@@ -18,7 +18,10 @@ A message says what is wrong, where (file:line:column, node and object), what wa
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
 """
 
-from typing import ClassVar
+from typing import ClassVar, Final
+
+RESET: Final = "'hdbridge reset PROFILE', or 'hdbridge ctl reset AXIS' if a daemon holds the drive"
+"""The command that resets a fault; every message that asks for a reset names it."""
 
 
 class HdbridgeError(Exception):
@@ -65,6 +68,11 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
     """The supervision stopped the axis while it ran; the stop is latched until an explicit reset."""
 
     exit_status = 5
+
+    def __init__(self, text: str, hint: str = "") -> None:
+        """``text`` says what happened, ``hint`` what a person does about it."""
+        super().__init__(f"{text}; {hint}" if hint else text)
+        self.text, self.hint = text, hint
 
 
 class OutputError(HdbridgeError):

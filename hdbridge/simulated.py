@@ -30,8 +30,13 @@ def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) 
     from hdbridge.sim.lockstep import simulated_bench  # noqa: PLC0415
 
     known = Path(truth) if truth is not None else Profile.find(str(axis.path)).simulated
+    source = axis.load_encoder.source.address
     with (
-        simulated_bench(known, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
+        simulated_bench(known, axis.eds_path, axis.drive.node_id, seed, load_object=source) as (
+            bus,
+            clock,
+            _,
+        ),
         Drive(bus, axis, clock) as drive,
     ):
         yield drive

@@ -20,6 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import MachineFile
+from hdbridge.device.behaviour import Behaviour
 from hdbridge.drive.supervision import TABLE, Reaction
 from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
@@ -35,7 +36,6 @@ from hdbridge.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
-from hdbridge.sim.behaviour import Behaviour
 from hdbridge.twin.translation import TABLE as TRANSLATED
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

@@ -61,6 +61,10 @@ class DriveConfig(_Part):
         min_length=1, description="EDS file: relative to this file, else one of those that come with hdbridge"
     )
     identity: Identity = Field(description="which drive it must be")
+    mode: Literal["csp", "ip"] = Field(
+        "csp",
+        description="mode of the control cycle: cyclic synchronous position (8) or interpolated position (7)",
+    )
     cycle_ms: float = Field(
         ge=0.5, le=255, description="SYNC period; 60C2h must express it: whole or with one decimal"
     )
@@ -86,6 +90,27 @@ class DriveConfig(_Part):
         description="whether 6092h (feed) scales positions, as CiA 402 has it; false where it only informs",
     )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
+    shutdown_option: int = Field(
+        0, ge=-32768, le=32767, description="605Bh: what 'shutdown' does under power; 0 switches it off"
+    )
+    disable_option: int = Field(
+        1, ge=-32768, le=32767, description="605Ch: what 'disable operation' does; 1 brakes first"
+    )
+    fault_reaction_option: int = Field(
+        2, ge=-32768, le=32767, description="605Eh: what a fault does; 2 brakes on the quick-stop ramp"
+    )
+    abort_connection_option: int = Field(
+        3,
+        ge=-32768,
+        le=32767,
+        description="6007h: what the drive does when its master is lost: 1 fault, 2 power off, 3 quick stop",
+    )
+    communication_error_option: int = Field(
+        0,
+        ge=0,
+        le=255,
+        description="1029h:01: NMT state when the master is lost: 0 pre-operational, 1 as it was, 2 stopped",
+    )
     rated_torque_nm: float = Field(
         gt=0, le=10_000, description="rated torque of the motor, 6076h; unit of 6077h"
     )
@@ -347,6 +372,15 @@ class AxisConfig(OtherChannels):
         """The file that this axis was read from."""
         return self._document.path if self._document is not None else Path("axis.yaml")
 
+    def states(self, key: str) -> bool:
+        """The file states a key (``drive.halt_option``) rather than leaving it to its default."""
+        part: object = self
+        for name in key.split("."):
+            if not isinstance(part, Strict) or name not in part.model_fields_set:
+                return False
+            part = getattr(part, name)
+        return True
+
     def where(self, key: str) -> str:
         """Where a key stands, for a complaint: ``axis.yaml:12:3: drive.node_id``.
 
@@ -357,6 +391,11 @@ class AxisConfig(OtherChannels):
             return f"{self.path}: {key}"
         line, column = self._document.position(tuple(key.split(".")))
         return f"{self.path}:{line}:{column}: {key}"
+
+    @property
+    def is_from_file(self) -> bool:
+        """The axis was read from a file, so its EDS file is known."""
+        return self._eds_path is not None
 
     @property
     def eds_path(self) -> Path:

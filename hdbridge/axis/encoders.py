@@ -94,6 +94,11 @@ class Source(Strict):
         return self
 
     @property
+    def address(self) -> tuple[int, int]:
+        """Index and sub-index of the object."""
+        return self.index, self.subindex
+
+    @property
     def wraps_at_counts(self) -> int:
         """The reading is known modulo this many counts."""
         return self.range_counts or self.WRAPS[self.type]

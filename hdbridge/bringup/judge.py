@@ -124,7 +124,7 @@ def judge_following(axis: AxisConfig, errors_counts: Sequence[int]) -> Verdict:
     )
 
 
-def judge_torque(axis: AxisConfig, torques_permille: Sequence[int], limit_percent: float) -> Verdict:
+def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_percent: float) -> Verdict:
     """How much torque does a slow move need, of what it was allowed?"""
     worst = max(map(abs, torques_permille)) / 10.0
     text = f"at most {worst:.1f} % of the rated torque, allowed {limit_percent:g} %"

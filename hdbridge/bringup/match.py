@@ -36,7 +36,7 @@ def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
     elif not there.usable:
         lines.append(
             f"{axis.where('drive.node_id')}: node {there.node_id} is: {there.kind}; expected a "
-            "CiA-402 drive with cyclic synchronous position (CSP)"
+            "CiA-402 drive with cyclic synchronous (CSP) or interpolated position (IP)"
         )
     else:
         lines += _identity_lines(axis, there)
@@ -71,6 +71,8 @@ def axis_lines(node: Node) -> list[str]:
         "  eds: FILE.eds                 # the EDS file of this drive, next to the axis file",
         f"  identity: {{{identity}}}",
     ]
+    if node.cyclic == "ip":
+        lines.append("  mode: ip                      # 6502h: it has interpolated position, and not csp")
     torque = node.values.get(objects.RATED_TORQUE)
     if torque:
         lines.append(f"  rated_torque_nm: {torque / 1000.0:g}        # 6076h")

@@ -18,6 +18,7 @@ from hdbridge.bringup.scale import Turned, judge_turn
 from hdbridge.bringup.slow import Silence, SlowAxis, TravelPlan, plan_travel
 from hdbridge.drive import objects
 from hdbridge.drive.emergencies import HEARTBEAT_LOST
+from hdbridge.drive.layout import layouts
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError
@@ -101,6 +102,8 @@ def torque(context: BringUpContext) -> Verdict:
     """The torque of that move."""
     if not context.out:
         return not_possible(_NOT_MOVED)
+    if objects.TORQUE_ACTUAL in layouts(context.axis).absent:
+        return not_possible("the drive does not send its torque (6077h)")
     limit = min(context.torque_percent, context.axis.limits.torque_percent)
     return judge_torque(context.axis, [each.torque_permille for each in context.out], limit)
 
@@ -124,7 +127,9 @@ def quick_stop(context: BringUpContext) -> Verdict:
     verdict = judge_stop(axis, speed, distance, time_s, f"'{state.value}'", 0.0)
     option = axis.drive.quick_stop_option
     expected = State.QUICK_STOP_ACTIVE if option >= 5 else State.SWITCH_ON_DISABLED
-    if state is not expected:
+    report = context.drive.report
+    chosen = report is not None and any(row.index == objects.QUICK_STOP_OPTION.index for row in report.held)
+    if chosen and state is not expected:
         return failed(
             verdict.measured,
             f"{axis.where('drive.quick_stop_option')}: found {option}, after which '{expected.value}' is "
@@ -137,7 +142,7 @@ def quick_stop(context: BringUpContext) -> Verdict:
 def heartbeat(context: BringUpContext) -> Verdict:
     """The master's heartbeat stays away in slow motion: the drive has to stop by itself."""
     axis, sdo = context.axis, context.drive.sdo
-    has_timer = sdo.has(objects.RPDO_COMMUNICATION, 5)
+    has_timer = _timer(context) is not None
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
         if has_timer:
             return not_possible("the drive watches no heartbeat (no 1016h); its RPDO event timer has to do")
@@ -168,9 +173,10 @@ def heartbeat(context: BringUpContext) -> Verdict:
 def set_points(context: BringUpContext) -> Verdict:
     """SYNC and set-points stay away in slow motion while the heartbeat goes on: the drive has to stop."""
     axis, sdo = context.axis, context.drive.sdo
-    if not sdo.has(objects.RPDO_COMMUNICATION, 5):
+    timer = _timer(context)
+    if timer is None:
         return not_possible("the drive has no RPDO event timer (1400h:05); its heartbeat consumer has to do")
-    timer_s = sdo.read(objects.RPDO_COMMUNICATION, 5) / 1000.0
+    timer_s = sdo.read(timer, 5) / 1000.0
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -195,6 +201,12 @@ def switched_off(context: BringUpContext) -> Verdict:
     if state in _OFF:
         return passed(text)
     return failed(text, "switch the drive off by its enable input and look at its error display")
+
+
+def _timer(context: BringUpContext) -> int | None:
+    """Communication parameter of an RPDO of the cycle that has an event timer; None if none has."""
+    used = (objects.RPDO_COMMUNICATION + layout.number - 1 for layout in context.drive.image.rpdos)
+    return next((each for each in used if context.drive.sdo.has(each, 5)), None)
 
 
 def _plan(context: BringUpContext, slow: SlowAxis) -> TravelPlan:

@@ -16,7 +16,7 @@ from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.manners import Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import IDENTITY
-from hdbridge.drive.objects import Address, IntegerType, Mode, NmtState
+from hdbridge.drive.objects import CYCLIC, Address, IntegerType, NmtState
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.errors import SdoError
 
@@ -103,8 +103,14 @@ class Node:
 
     @property
     def usable(self) -> bool:
-        """A CiA-402 drive with cyclic synchronous position."""
-        return self.profile == objects.DEVICE_PROFILE_402 and bool((self.modes or 0) & Mode.CSP.supported_bit)
+        """A CiA-402 drive with a cyclic position mode, or one that does not say which modes it has."""
+        return self.profile == objects.DEVICE_PROFILE_402 and (self.modes is None or self.cyclic is not None)
+
+    @property
+    def cyclic(self) -> str | None:
+        """The value of ``drive.mode`` for this drive; None if it has neither mode, or does not say."""
+        has = [name for name, each in CYCLIC.items() if (self.modes or 0) & each.mode.supported_bit]
+        return has[0] if has else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import Emergency
-from hdbridge.drive.objects import COB_EMCY, Mode
+from hdbridge.drive.objects import COB_EMCY
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.supervision import Event, Supervision
 from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
@@ -146,9 +146,9 @@ class SlowAxis:
     def enabled(self) -> Iterator[Feedback]:
         """Power on at rest, off again at the end; gives the first feedback under power."""
         drive, power = self._drive, self.image.power
-        if drive.sdo.has(objects.MAX_TORQUE.index, objects.MAX_TORQUE.sub):
+        if drive.can_set(objects.MAX_TORQUE):
             drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
-        drive.enable(Mode.CSP)
+        drive.enable()
         self.cycle.restart()
         try:
             feedback = until_enabled(lambda: self._tick(None), power, self.cycle.period_s)

@@ -13,6 +13,9 @@ from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO
 from hdbridge.bringup.scan import scan_bus
 from hdbridge.bringup.slow import SlowAxis
 from hdbridge.drive import objects
+from hdbridge.drive.bootplan import left_to_drive, plan
+from hdbridge.drive.bootup import await_sdo
+from hdbridge.drive.dictionary import load_eds
 from hdbridge.drive.nameplate import (
     IDENTITY,
     device_type_complaints,
@@ -23,9 +26,8 @@ from hdbridge.drive.nameplate import (
     torque_notes,
 )
 from hdbridge.drive.objects import Address, IntegerType
-from hdbridge.drive.sdo import SdoAbortError, load_eds
-from hdbridge.drive.writes import left_out, plan
-from hdbridge.errors import SdoError
+from hdbridge.drive.sdo import SdoAbortError
+from hdbridge.errors import DriveError, SdoError
 
 REST_S: Final = 1.0
 _ABSENT: Final = (0x0602_0000, 0x0609_0011)
@@ -36,16 +38,16 @@ def files(context: BringUpContext) -> Verdict:
     """The axis file and the EDS can be read, and every value of the boot-up fits its object."""
     axis = context.load()
     od = load_eds(axis.eds_path, axis.drive.node_id)
-    rows, lacking = plan(axis, od), left_out(axis, od)
+    rows, left = plan(axis, od), left_to_drive(axis, od)
     context.admit(axis, od)
-    names = ", ".join(f"{each.index:04X}h:{each.sub:02X} ({each.why})" for each in lacking)
+    names = ", ".join(f"{each.index:04X}h:{each.sub:02X}" for each in left)
     return passed(
-        f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to write"
-        + (f"; the EDS lacks, so what the drive has holds: {names}" if lacking else ""),
+        f"{axis.path}, {axis.eds_path.name}: {len(rows)} objects to compare and write"
+        + (f"; left to the drive, see `hdbridge check`: {names}" if left else ""),
         axis_file=str(axis.path),
         eds=str(axis.eds_path),
         writes=len(rows),
-        lacking=len(lacking),
+        left=len(left),
     )
 
 
@@ -61,10 +63,13 @@ def answers(context: BringUpContext) -> Verdict:
     """The node answers; where it does not, whoever else does."""
     axis, drive = context.axis, context.drive
     try:
-        device_type = drive.sdo.fetch(objects.DEVICE_TYPE)
+        where = axis.where("drive.node_id")
+        device_type = await_sdo(drive.link, drive.monitor, drive.sdo, where)
     except SdoAbortError:
         raise
-    except SdoError:
+    except DriveError as error:
+        if drive.monitor.watch(axis.drive.node_id).heard_since((0, 0, 0)):
+            return failed(str(error))
         found = scan_bus(drive.link, listen_s=0.3, force=True)
         _, lines = compare(axis, found)
         others = ", ".join(f"node {each.node_id} ({each.kind})" for each in found.nodes) or "nobody"
@@ -89,7 +94,9 @@ def identity(context: BringUpContext) -> Verdict:
         for address, name in IDENTITY
         if sdo.has(address.index, address.sub) or getattr(axis.drive.identity, name) is not None
     }
-    complaints = identity_complaints(axis, found) + mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
+    complaints = identity_complaints(axis, found)
+    if sdo.has(objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub):
+        complaints += mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
     text = ", ".join(f"{name.replace('_', ' ')} {value:#x}" for name, value in found.items())
     return failed(text, *(each.text for each in complaints), **found) if complaints else passed(text, **found)
 
@@ -133,7 +140,14 @@ def eds(context: BringUpContext) -> Verdict:
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
     """The objects to look at: those that are used, as far as the EDS lists them."""
     axis, sdo = context.axis, context.drive.sdo
-    for address in (*objects.REQUIRED, objects.RATED_TORQUE, objects.ERROR_CODE, *scaling_addresses(axis)):
+    target = context.drive.image.cyclic.target
+    for address in (
+        *objects.REQUIRED,
+        target,
+        objects.RATED_TORQUE,
+        objects.ERROR_CODE,
+        *scaling_addresses(axis),
+    ):
         if sdo.has(address.index, address.sub):
             yield address.index, address.sub
     for row in plan(axis, sdo.od):
@@ -177,7 +191,9 @@ def boot(context: BringUpContext) -> Verdict:
     report = drive.report
     assert report is not None
     return passed(
-        f"{len(report.written)} objects written and read back; OPERATIONAL, '{report.state.value}'",
+        f"{len(report.held)} objects as planned, {len(report.written)} of them written; OPERATIONAL, "
+        f"'{report.state.value}'" + "".join(f"; {each}" for each in report.notes),
+        held=len(report.held),
         written=len(report.written),
     )
 

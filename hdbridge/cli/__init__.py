@@ -65,6 +65,7 @@ PANELS: Final = {
     "Positioning": {
         "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
         "last.",
+        "reset": "Reset a fault of the drive when its cause is gone; power stays off.",
         "home": "Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.",
         "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
         "measured.",

@@ -37,6 +37,8 @@ def booted(
         connected(axis, profile, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
         Drive(bus, axis, clock, force=force) as drive,
     ):
-        drive.boot()
+        report = drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
+        for note in report.notes:
+            notes.print(note, markup=False, soft_wrap=True)
         yield drive, interrupted

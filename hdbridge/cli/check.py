@@ -14,7 +14,6 @@ from hdbridge.files.profile import Profile
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig, BusConfig
     from hdbridge.daemon.machine import Machine
-    from hdbridge.drive.writes import PlannedWrite
 
 CheckedArgument = Annotated[
     str,
@@ -94,14 +93,13 @@ class _Report:
     def __init__(self, axis: AxisConfig, model: Path | None) -> None:
         from hdbridge.control.bench import compensation_for
         from hdbridge.control.caps import cap_remark
-        from hdbridge.drive import load_eds, plan
-        from hdbridge.drive.writes import left_out
+        from hdbridge.drive.bootplan import left_to_drive, plan, sent_along
+        from hdbridge.drive.layout import layouts
         from hdbridge.evaluation.stepping import quantisation_floor_arcsec
+        from hdbridge.files.edsfile import shared_eds
         from hdbridge.model import TransmissionModel
 
-        self._axis = axis
-        od = load_eds(axis.eds_path, axis.drive.node_id)
-        plan(axis, od)
+        plan(axis)
         floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
         self.facts = {
             "axis": axis.name,
@@ -120,21 +118,28 @@ class _Report:
             compensation_for(axis, loaded)
             self.remark = cap_remark(axis, loaded)
             self.facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
-        self.lacking: list[PlannedWrite] = left_out(axis, od)
+        pdos = layouts(axis)
+        self.rows: dict[str, list[str]] = {
+            "fixed mapping": [
+                str(each) for each in (*pdos.cyclic, *pdos.channels, *pdos.rpdos) if each.is_fixed
+            ],
+            "sent along": sent_along(axis),
+            "left to the drive": [
+                f"{each}{f' ({axis.where(each.field)})' if each.field else ''}"
+                for each in left_to_drive(axis)
+            ],
+            "not read": list(shared_eds(axis.eds_path, axis.drive.node_id).unread),
+        }
 
     def document(self) -> dict[str, Any]:
         """For machines."""
-        return {**self.facts, "left to the drive": [*map(str, self.lacking)]}
+        return {**self.facts, **self.rows}
 
     def print(self) -> None:
         """For a person."""
         _print(self.facts)
-        for row in self.lacking:
-            source = f" ({self._axis.where(row.field)})" if row.field else ""
-            console.print(
-                f"{'left to the drive':>20}  {row.index:04X}h:{row.sub:02X}, which {self._axis.drive.eds} "
-                f"lacks: {row.why}{source}",
-                soft_wrap=True,
-            )
+        for name, rows in self.rows.items():
+            for row in rows:
+                console.print(f"{name:>20}  {row}", markup=False, soft_wrap=True)
         if self.remark:
             notes.print(self.remark, markup=False, soft_wrap=True)

@@ -147,7 +147,12 @@ def connected(
             yield bus, MonotonicClock()
         return
     plant = simulated_by(profile, truth)
-    with simulated_bench(plant, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _):
+    source = axis.load_encoder.source.address
+    with simulated_bench(plant, axis.eds_path, axis.drive.node_id, seed, load_object=source) as (
+        bus,
+        clock,
+        _,
+    ):
         yield bus, clock
 
 

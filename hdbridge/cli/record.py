@@ -46,9 +46,9 @@ def register(app: typer.Typer) -> None:
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
     """List recordings: from when to when, how large, and what stopped an axis in them."""
     _need_extra()
-    from hdbridge.daemon.recorder.reading import flight_files, overview
+    from hdbridge.daemon.recorder.reading import each_flight, overview
 
-    found = [overview(each) for each in flight_files(flights)]
+    found = list(each_flight(flights, overview))
     write_json(json_file, {"schema": "hdbridge.flights/1", "flights": [_overview(each) for each in found]})
     table = Table("recording", "begins", "duration", "MB", "faults and marks")
     for each in found:
@@ -74,7 +74,6 @@ def info(
 
     from hdbridge.daemon.recorder.reading import read
 
-    _need_file(flight)
     found = read(flight)
     about = found.about
     steps = np.diff(found.machine["cycle"])
@@ -124,13 +123,16 @@ def mend(flights: FlightsArgument) -> None:
     """
     _need_extra()
     from hdbridge.daemon.recorder import mend as mending
-    from hdbridge.daemon.recorder.reading import flight_files, overview
+    from hdbridge.daemon.recorder.reading import each_flight, overview
 
-    for path in flight_files(flights):
+    def mended(path: Path) -> None:
         if path.name.endswith(".mcap") and overview(path).finished:
-            continue
+            return
         done = mending.mend(path)
         _say(f"{done}: finished" if done is not None else f"{path}: nothing in it was whole; removed")
+
+    for _ in each_flight(flights, mended):
+        pass
 
 
 def export(
@@ -171,17 +173,20 @@ def export(
     """
     _need_extra()
     from hdbridge.daemon.recorder.export import axis_of, exported, last_model
-    from hdbridge.daemon.recorder.reading import flight_files, overview, read
+    from hdbridge.daemon.recorder.reading import each_flight, overview, read
 
     if out is None:
         raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
     _check_out(out)
     limits = (_time_ns(begin, "--from"), _time_ns(end, "--to"))
-    found: list[Flight] = []
-    for path in flight_files(flights):
+
+    def wanted(path: Path) -> Flight | None:
         about = overview(path)
-        if not _outside(about, *limits):
-            found.append(read(path, (axis_of(about.about, axis, path)[1].name,)))
+        if _outside(about, *limits):
+            return None
+        return read(about.path, (axis_of(about.about, axis, path)[1].name,))
+
+    found = [each for each in each_flight(flights, wanted) if each is not None]
     if not found:
         raise InputError(f"{flights[0]}: nothing was recorded between --from and --to")
     found.sort(key=lambda each: each.first_ns)
@@ -261,11 +266,6 @@ def _found(name: str) -> bool:
         return find_spec(name) is not None
     except ModuleNotFoundError:
         return False
-
-
-def _need_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; expected a flight recording")
 
 
 def _time_ns(text: str | None, option: str) -> int | None:

@@ -96,7 +96,7 @@ def put(
     does is up to you: 6040h moves an axis. Until the drive stores it (1010h), it lasts until it is switched
     off; `hdbridge` itself writes what the axis file says at every boot-up.
     """
-    from hdbridge.drive.sdo import load_eds
+    from hdbridge.drive.dictionary import load_eds
     from hdbridge.drive.values import find_object
 
     files = Profile.find(profile)

@@ -45,11 +45,11 @@ def simulate(
 
         hdbridge step article --interface socketcan --channel vcan0
     """
+    from hdbridge.device.node import DriveNode
+    from hdbridge.device.run import run
     from hdbridge.drive.link import open_bus
     from hdbridge.sim.lockstep import nameplate_of
     from hdbridge.sim.machine import Machine
-    from hdbridge.sim.node import SimulatedDrive
-    from hdbridge.sim.run import run
     from hdbridge.sim.truth import Truth
 
     files = Profile.find(profile)
@@ -63,13 +63,14 @@ def simulate(
     known = Truth.load(simulated_by(files, truth))
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
-        node = SimulatedDrive(
+        nameplate = nameplate_of(known, load_object=axis.load_encoder.source.address)
+        node = DriveNode(
             bus,
             Machine(known, seed),
             axis.eds_path,
             axis.drive.node_id,
             clock,
-            nameplate_of(known),
+            nameplate,
             known.firmware,
         )
         notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")

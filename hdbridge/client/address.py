@@ -6,7 +6,7 @@ import os
 import re
 import socket
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,13 +90,16 @@ def _url(given: str, token: str | None) -> Address:
     return Address(url=match[1], token=token)
 
 
-def _sockets(environment: Mapping[str, str]) -> Iterator[Path]:
+def _sockets(environment: Mapping[str, str]) -> list[Path]:
     """The sockets that somebody listens at, in folders that no stranger can write to."""
+    found: list[Path] = []
     for folder in (session_folder(environment), SYSTEM_FOLDER):
         if _is_trusted(folder):
-            for path in sorted({*folder.glob("*.sock"), *folder.glob("*/*.sock")}):
-                if _listens(path):
-                    yield path
+            for place, inside, names in os.walk(folder, followlinks=True):  # ignores what vanishes
+                if Path(place) != folder:
+                    inside.clear()  # one level of folders
+                found += [Path(place, name) for name in names if name.endswith(".sock")]
+    return [path for path in sorted(found) if _listens(path)]
 
 
 def _is_trusted(folder: Path) -> bool:

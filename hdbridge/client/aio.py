@@ -40,8 +40,8 @@ class AsyncClient:
     """A daemon, wherever it is. Close it, or use it as an asynchronous context manager.
 
     ``address`` is a Unix socket, a URL or a machine's name; without it `hdbridge.client.address.find` looks
-    for the one that there is. ``token`` is what TCP asks for, ``certificate`` what HTTPS trusts in place of
-    the system's. ``name`` is shown to others while it holds the lease. Several tasks may use it.
+    for the one that there is. ``token`` is what TCP asks for, ``name`` is shown to others while it
+    holds the lease. Several tasks may use it.
     """
 
     def __init__(
@@ -49,13 +49,12 @@ class AsyncClient:
         address: str | Path | None = None,
         *,
         token: str | None = None,
-        certificate: Path | str | None = None,
         name: str = "",
         timeout_s: float = 10.0,
     ) -> None:
         self.address: Address = find(address, token)
         self.name = name
-        self._tls = transport.tls_context(self.address, certificate)
+        self._tls = transport.tls_context(self.address)
         self._timeout_s = timeout_s
         self._lock = asyncio.Lock()
         self._holding = 0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import ssl
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,23 +10,13 @@ import httpx
 from hdbridge.client.address import Address
 from hdbridge.client.calls import PREFIX, A, Call
 from hdbridge.client.messages import LeaseGrant
-from hdbridge.errors import DaemonError, InputError
+from hdbridge.errors import DaemonError
 
 
-def tls_context(address: Address, certificate: Path | str | None) -> ssl.SSLContext | None:
-    """That trusts this certificate, that of ``$HDBRIDGE_CERTIFICATE``, or the system's; None without TLS.
-
-    InputError where it is none.
-    """
-    certificate = certificate or os.environ.get("HDBRIDGE_CERTIFICATE") or None
-    if address.socket is not None or not address.url.startswith("https"):
-        return None
-    try:
-        return ssl.create_default_context(cafile=certificate)
-    except OSError as problem:
-        raise InputError(
-            f"{certificate}: cannot be read as a certificate (PEM): {problem.strerror}"
-        ) from None
+def tls_context(address: Address) -> ssl.SSLContext | None:
+    """For HTTPS to a reverse proxy: trusts what the system, or ``$SSL_CERT_FILE``, does; None without TLS."""
+    https = address.socket is None and address.url.startswith("https")
+    return ssl.create_default_context() if https else None
 
 
 def settings(address: Address) -> dict[str, Any]:

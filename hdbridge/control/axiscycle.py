@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Final
 
 from hdbridge.drive.feedback import Feedback
-from hdbridge.drive.image import HALT_BIT, ProcessImage
+from hdbridge.drive.image import Frames, ProcessImage
 from hdbridge.drive.link import Frame, new_tuple
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.pdo import PdoLengthError
@@ -51,7 +51,7 @@ class AxisCycle:
         "_awaited_channels", "_channel_ids", "_channels", "_commanded", "_good_cycle", "_last", "_left",
         "_plausibility", "_refused", "_ridden", "_still", "_stop_cycles", "_traffic", "awaited", "changed",
         "command", "feedback", "image", "monitor", "name", "needed", "patience_s", "pending", "rested",
-        "rpdo_id", "silent", "spoke_s", "supervision",
+        "silent", "spoke_s", "supervision",
     )  # fmt: skip
 
     def __init__(
@@ -83,7 +83,6 @@ class AxisCycle:
         """Of the last turn; not fresh where it has none of its own."""
         self.patience_s = drives_patience_s(axis)
         """For how long the drive waits for a silent master before it stops by itself."""
-        self.rpdo_id = image.rpdo_id
         self.spoke_s = 0.0
         """Begin of the last turn that gave it an RPDO, on the clock."""
 
@@ -159,7 +158,9 @@ class AxisCycle:
         stop = supervision.error()
         if supervision.reaction is not Reaction.QUICK_STOP or self.riding or self.confirmed:
             return stop
-        return SafetyStop(f"{stop}; the drive did not confirm it: its own watchdogs have to stop it")
+        return SafetyStop(
+            f"{stop.text}; the drive did not confirm it: its own watchdogs have to stop it", stop.hint
+        )
 
     # ---------------------------------------------------------------- for the bus
 
@@ -188,8 +189,8 @@ class AxisCycle:
         power = self.image.power
         return power.aim is _ENABLED or power.state in _POWERED
 
-    def stop_before_sync(self) -> bytes | None:
-        """RPDO with a quick stop, if a fault that came before SYNC stops the axis; else None.
+    def stop_before_sync(self) -> Frames | None:
+        """RPDOs with a quick stop, if a fault that came before SYNC stops the axis; else None.
 
         A drive keeps the last RPDO until SYNC. If it has stopped on its own in between, the set-point in
         there would set it in motion again. After a fault that latches the axis, no RPDO is sent at all.
@@ -222,8 +223,8 @@ class AxisCycle:
         if not (self.silent or self.rested):
             self.pending += faults
 
-    def turn(self, now: float, count: int, time_s: float, complete: bool) -> bytes | None:
-        """One period is received, ``complete`` with every TPDO: judge it; the RPDO, where one is to go."""
+    def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
+        """One period is received, ``complete`` with every TPDO: judge it; the RPDOs, where they are to go."""
         image, supervision = self.image, self.supervision
         self.spoke_s = now
         stop = supervision.stop
@@ -257,7 +258,7 @@ class AxisCycle:
             try:
                 command = self.command
                 target = command(feedback) if callable(command) else command
-                data = self._hold() if target is None else image.pack_rpdo(target)
+                data = image.pack_rpdo_held() if target is None else image.pack_rpdo(target)
             except self._refused as error:
                 what = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
                 self.pending.append((Fault.BAD_TARGET, what))
@@ -309,7 +310,7 @@ class AxisCycle:
 
     # ---------------------------------------------------------------- the parts of a turn
 
-    def _react(self, count: int, data: bytes | None, before: Feedback) -> bytes | None:
+    def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
         """The rest of a turn in which something is wrong, or was in the last one."""
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
@@ -366,19 +367,13 @@ class AxisCycle:
         detail = f"it went to '{state.value}'"
         self.pending.append((Fault.DRIVE_FAULT if fault else Fault.DROPPED_OUT, detail))
 
-    def _hold(self) -> bytes:
-        """The RPDO with the last target once more."""
-        image = self.image
-        word = image.power.controlword() | (HALT_BIT if image.halt else 0)
-        return image.rpdo.pack((word, image.target_counts))
-
-    def _idle(self) -> bytes:
-        """The RPDO with the actual position as target."""
+    def _idle(self) -> Frames:
+        """The RPDOs with the actual position as target."""
         try:
             return self.image.pack_rpdo_idle()
         except InputError:
-            # It does not fit 607Ah. The drive is not enabled or is told to stop: it ignores the target.
-            return self._hold()
+            # It does not fit the target object. The drive is not enabled or is told to stop: it ignores it.
+            return self.image.pack_rpdo_held()
 
     # ---------------------------------------------------------------- a quick stop, turn by turn
 

@@ -23,8 +23,9 @@ from hdbridge.control.realtime import resumed_realtime
 from hdbridge.control.sensed import Sensed
 from hdbridge.control.survived import Survived, Watch
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.layout import layouts
 from hdbridge.drive.link import new_tuple
-from hdbridge.drive.objects import Mode
+from hdbridge.drive.objects import TORQUE_ACTUAL
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
@@ -59,8 +60,9 @@ class Run(Recording, Generic[Outcome]):
 
 
 def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
-    """What `Bench` can tell the effects in each cycle."""
-    return frozenset(each for each in Channel if each.axis_key in {"", *axis.channels})
+    """The channels that `Bench` passes to the effects in each cycle."""
+    known = {each for each in Channel if each.axis_key in {"", *axis.channels}}
+    return frozenset(known - ({Channel.MOTOR_TORQUE} if TORQUE_ACTUAL in layouts(axis).absent else set()))
 
 
 def walk(
@@ -96,6 +98,8 @@ def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
     table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
     columns = dict(zip(names, table.T, strict=True))
     columns.pop("load_target_deg")
+    if np.isnan(columns["motor_torque_nm"]).any():
+        del columns["motor_torque_nm"]  # the drive does not send it
     for place, key in enumerate(axis.channels):
         reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
         if not np.isnan(reading).any():
@@ -132,10 +136,11 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
     model.check_bound_to(axis)
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
         lacking = sorted(channels, key=lambda each: each.value)
-        keys = " and ".join(f"'{each.axis_key}'" for each in lacking)
+        keys = " and ".join(f"'{each.axis_key}'" for each in lacking if each.axis_key)
+        add = f"add {keys} to {axis.path}, or " * bool(keys)
         raise InputError(
             f"the effect '{name}' needs {', '.join(each.value for each in lacking)}, which this axis does "
-            f"not have: add {keys} to {axis.path}, or leave the effect out of the model that compensates"
+            f"not have: {add}leave the effect out of the model that compensates"
         )
     caps = axis.compensation
     limits = CompensationLimits(caps.maximum_arcsec, caps.slew_arcsec_s, caps.ramp_s)
@@ -283,7 +288,7 @@ class Bench:
 
     def _enable(self) -> None:
         """Enable the drive by PDO, standing still, and begin from where it stands."""
-        self._drive.enable(Mode.CSP)
+        self._drive.enable()
         self.cycle.restart()
         feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
         feedback = self._await_channels(feedback)

@@ -229,10 +229,10 @@ class BusCycle:
                     got = 0
 
             for axis in self._speaking:
-                data = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
-                if data is not None:
+                frames = axis.turn(now, count, time_s, got & axis.needed == axis.needed)
+                for frame in frames or ():
                     try:
-                        self._send(axis.rpdo_id, data)
+                        self._send(*frame)
                     except TransmitBufferFull as error:
                         # Stale set-points are worse than none: it is not sent again, and the axes stop.
                         self._no_room(f"RPDO: {error}")
@@ -290,14 +290,14 @@ class BusCycle:
                 if axis.silent:
                     send(COB_NMT, bytes((NmtCommand.PRE_OPERATIONAL, axis.image.node_id)))
                 else:
-                    send(axis.rpdo_id, axis.image.pack_rpdo_stop())
+                    for frame in axis.image.pack_rpdo_stop():
+                        send(*frame)
             self._interrupted = False
         else:
             for axis in self._speaking:
                 if axis.pending:
-                    data = axis.stop_before_sync()
-                    if data is not None:
-                        send(axis.rpdo_id, data)
+                    for frame in axis.stop_before_sync() or ():
+                        send(*frame)
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
         """This process was silent for longer than a drive under power waits."""

@@ -55,7 +55,7 @@ def routes(axes: Sequence[AxisCycle]) -> Routes:
                 awaited |= bit
                 bits += FRAME_BITS[image.length_of(can_id)]
         if not axis.silent:
-            bits += FRAME_BITS[image.rpdo.length]
+            bits += sum(FRAME_BITS[layout.codec.length] for layout in image.rpdos)
         listeners.update(dict.fromkeys(axis.identifiers, axis))
     return Routes(
         tuple(axis for axis in axes if not axis.silent),
@@ -84,10 +84,26 @@ def check_members(axes: Sequence[AxisCycle], period_s: float) -> None:
                 "a bus has one master with one heartbeat"
             )
     _check_nodes(axes)
+    _check_identifiers(axes)
+
+
+def _check_identifiers(axes: Sequence[AxisCycle]) -> None:
+    """A drive whose identifiers cannot be changed need not make them of its node id."""
+    owners: dict[int, AxisCycle] = {}
+    for axis in axes:
+        image = axis.image
+        for layout in (*image.tpdos, *image.channel_tpdos, *image.rpdos):
+            other = owners.setdefault(layout.can_id, axis)
+            if other is not axis:
+                raise InputError(
+                    f"{image.axis.where('drive.eds')} of '{axis.name}' and "
+                    f"{other.image.axis.where('drive.eds')} of '{other.name}' both have a PDO with the "
+                    f"identifier {layout.can_id:03X}h; put one of the drives on another bus"
+                )
 
 
 def _check_nodes(axes: Sequence[AxisCycle]) -> None:
-    """All identifiers of an axis are made of node ids, so it is these that must differ."""
+    """Nearly all identifiers of an axis are made of node ids, so these must differ."""
     owners: dict[int, tuple[AxisCycle, str]] = {}
     for axis in axes:
         config = axis.image.axis

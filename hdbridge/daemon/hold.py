@@ -8,7 +8,7 @@ import socket
 import sys
 from contextlib import ExitStack
 
-from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
+from hdbridge.daemon.api.sockets import file_of, tcp_socket, unix_socket
 from hdbridge.daemon.keeper import SIMULATED, Keeper, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
@@ -45,24 +45,23 @@ def hold(
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
         stack.callback(path.unlink, missing_ok=True)
         if (tcp := machine.api.tcp) is not None:
-            listeners.append(stack.enter_context(tcp_socket(tcp.host, tcp.port)))
+            listeners.append(stack.enter_context(tcp_socket(tcp.port)))
         token = None
         if page is not None and tcp is None:
             token = secrets.token_urlsafe(32)
-            listeners.append(stack.enter_context(tcp_socket("127.0.0.1", page, "--port")))
+            listeners.append(stack.enter_context(tcp_socket(page, "--port")))
         if page is not None:
-            _tell_page(listeners[-1], token, tls=tcp is not None and tcp.certificate is not None)
+            _tell_page(listeners[-1], token)
         memory = stack.enter_context(Memory.create(len(machine.axes), machine.cycle_s))
         start = Start(
-            machine, memory.fd, os.getpid(), simulation=simulation, force=force, runtime=folder,
-            page_token=token, log=log,
+            machine, memory.fd, os.getpid(), simulation=simulation, force=force, socket=path,
+            socket_file=file_of(path), page_token=token, log=log,
         )  # fmt: skip
         times = Times() if simulation is None else SIMULATED
         return Keeper(start, memory, listeners, Notifier.of_environment(), times=times).run()
 
 
-def _tell_page(listener: socket.socket, token: str | None, *, tls: bool) -> None:
-    """For the person at the terminal; the token of a run is nothing for a log."""
-    host, port, *_ = listener.getsockname()
-    address = f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}/"
-    print(f"page: {address}{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)
+def _tell_page(listener: socket.socket, token: str | None) -> None:
+    """For the person at the terminal; the token of a run does not belong in a log."""
+    host, port = listener.getsockname()
+    print(f"page: http://{host}:{port}/{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

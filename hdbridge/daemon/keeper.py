@@ -4,7 +4,8 @@ It holds what has to outlive a child: the shared memory, the listening sockets, 
 
     a child is        the keeper
     ----------------  ----------------------------------------------------------------------------------
-    control, dead     starts it again; its axes come up disabled. Too often in a minute: ends everything
+    control, dead     starts it again; its axes come up disabled. Too often in a minute: ends everything.
+                      So it does if somebody ended it by SIGTERM: only the keeper ends the daemon
     control, hung     kills it after `Times.hung_s`: the bus is silent, the drives have stopped by themselves
     service, dead     starts it again, later each time; the loop goes on
     service, hung     kills it after `Times.service_hung_s`
@@ -167,9 +168,7 @@ class Keeper:
             return
         _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
-        if status == 0:
-            self._stop(now_s, 0, "the control process was asked to end")
-        elif status in _ERRORS and not self._memory.status.loop_count:
+        if status in _ERRORS and not self._memory.status.loop_count:
             self._stop(now_s, known, f"the control process cannot begin ({how})")
         elif not self._budget.spend(now_s):
             self._stop(now_s, known, "the control process dies again and again")

@@ -25,7 +25,7 @@ from hdbridge.daemon.machinefile import (
     MachineFile,
 )
 from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.drive import load_eds, plan
+from hdbridge.drive import plan
 from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.bundled import bundled_folder
@@ -199,7 +199,7 @@ def _axis(file: MachineFile, number: int, places: Places) -> Axis:
     except InputError as problem:
         raise places.error(("axes", number, "profile"), str(problem)) from None
     config = AxisConfig.load(profile.axis)
-    plan(config, load_eds(config.eds_path, config.drive.node_id))
+    plan(config)
     adaptation = file.adaptation
     if entry.adapt is not None:
         adaptation = adaptation.model_copy(update={"mode": entry.adapt})

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from hdbridge.axis import AxisConfig, BusConfig
-from hdbridge.daemon.api.sockets import check_exposure
 from hdbridge.daemon.machinefile import MachineFile, token_complaint
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.errors import InputError
@@ -97,19 +95,9 @@ def check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: Places) -> No
 
 
 def check_tcp(file: MachineFile, places: Places) -> None:
-    """What lets clients in from the network is there, and the token is nobody else's to read."""
+    """The token is there, and nobody else can read it."""
     tcp = file.api.tcp
     if tcp is None:
         return
-    try:
-        check_exposure(tcp.host, tls=tcp.certificate is not None, unencrypted=tcp.unencrypted)
-    except InputError as problem:
-        raise places.error(("api", "tcp", "host"), str(problem).removeprefix("api.tcp.host: ")) from None
     if complaint := token_complaint(places.folder / tcp.token_file):
         raise places.error(("api", "tcp", "token_file"), complaint)
-    for key in ("certificate", "key"):
-        text: str | None = getattr(tcp, key)
-        if text is not None and not os.access(places.folder / text, os.R_OK):
-            raise places.error(
-                ("api", "tcp", key), f"{places.folder / text} cannot be read; expected a PEM file"
-            )

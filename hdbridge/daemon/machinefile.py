@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.evaluation.stepping import Scheme
-from hdbridge.files.yamlfile import wrong
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
@@ -59,31 +58,16 @@ class AxisEntry(_Part):
 
 
 class TcpSettings(_Part):
-    """The API on the network."""
+    """The API over TCP, for this machine: for the page, local tools and a reverse proxy."""
 
-    host: str = Field("127.0.0.1", min_length=1, description="address to listen at")
-    port: int = Field(8402, ge=1, le=65_535, description="port to listen at")
+    port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1 to listen at")
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
-        (), description="names by which clients reach this machine; addresses and localhost need none"
+        (), description="names by which a reverse proxy on this machine is reached"
     )
     token_file: str = Field(
         min_length=1,
         description="file with the token that clients show, of mode 600, relative to this file",
     )
-    certificate: str | None = Field(
-        None, min_length=1, description="certificate chain for TLS, PEM, relative to this file"
-    )
-    key: str | None = Field(None, min_length=1, description="its private key, PEM, relative to this file")
-    unencrypted: bool = Field(
-        False, description="whether the token may cross a network in the clear, where there is no certificate"
-    )
-
-    @model_validator(mode="after")
-    def _pair(self) -> Self:
-        if (self.certificate is None) != (self.key is None):
-            there, lacking = ("key", "certificate") if self.certificate is None else ("certificate", "key")
-            raise wrong(f"a {there} without a {lacking}; expected both, or neither", there)
-        return self
 
 
 class ApiSettings(_Part):
@@ -97,7 +81,9 @@ class ApiSettings(_Part):
     group: str | None = Field(
         None, min_length=1, description="group whose members may use the socket; else that of the daemon"
     )
-    tcp: TcpSettings | None = Field(None, description="a port on the network, too; without the key none")
+    tcp: TcpSettings | None = Field(
+        None, description="a TCP port for this machine as well; without the key none"
+    )
 
 
 class LimitSettings(_Part):

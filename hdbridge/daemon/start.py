@@ -50,8 +50,10 @@ class Start:
     simulation: Simulation | None = None
     force: bool = False
     """Speak even where another master is heard. The lock of the interface is the keeper's either way."""
-    runtime: Path = Path()
-    """The runtime folder."""
+    socket: Path = Path()
+    """Path of the Unix socket of the API."""
+    socket_file: tuple[int, int] = (0, 0)
+    """Device and inode that the keeper has bound there."""
     api_fds: tuple[int, ...] = ()
     """Listening sockets, the Unix one first; the service's."""
     page_token: str | None = None

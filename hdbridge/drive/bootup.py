@@ -1,7 +1,8 @@
 """From an unknown node to a drive that is known, configured and OPERATIONAL (but not enabled).
 
-Nothing is believed: the identity is compared, the scaling is compared, and every object that is written is
-read back. The first thing that is not as expected ends the boot-up with an error that names the object.
+Nothing is believed: the identity is compared, the scaling is compared, and every object is read before it is
+written, and read back after. The first thing that is not as expected ends the boot-up with an error that
+names the object, unless it may be left to the drive.
 """
 
 from __future__ import annotations
@@ -9,9 +10,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
+from hdbridge.drive.bootplan import plan
+from hdbridge.drive.dictionary import find, is_readable, is_writable
+from hdbridge.drive.image import drive_heartbeat_ms
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import heartbeat_of
 from hdbridge.drive.monitor import NetworkMonitor
@@ -28,7 +33,7 @@ from hdbridge.drive.nameplate import (
 from hdbridge.drive.objects import Address, Mode, NmtCommand, NmtState
 from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.writes import PlannedWrite, plan
+from hdbridge.drive.writes import PlannedWrite
 from hdbridge.errors import DriveError, IdentityError, SdoError
 
 if TYPE_CHECKING:
@@ -37,8 +42,14 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
 """How long a node may take from a reset to its boot-up message before it is asked directly."""
+SDO_AFTER_BOOT_UP_S: Final = 3.5
+"""How long a node may take from its boot-up message to its first SDO answer."""
 STATE_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.02
+_WRITE_ONLY: Final = 0x0601_0001
+_READ_ONLY: Final = 0x0601_0002
+_MAPPINGS: Final = (0x1600, 0x1A00)
+_MAPPINGS_PER_KIND: Final = 0x200
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +61,14 @@ class BootReport:
     names: dict[str, str]
     """Device name and versions (1008h, 1009h, 100Ah), where the drive tells them."""
     modes: tuple[Mode, ...]
-    """Modes of operation that the drive has, of those that are used here."""
+    """Modes of operation that the drive has, of those that are used here; all if it does not say (6502h)."""
     state: State
-    written: tuple[PlannedWrite, ...]
+    held: tuple[PlannedWrite, ...] = ()
+    """What the drive now holds as planned."""
+    written: tuple[PlannedWrite, ...] = ()
+    """Those of ``held`` that had to be written."""
+    left: frozenset[tuple[int, int]] = frozenset()
+    """Index and sub-index of the objects that it did not take, and that were left to it."""
     notes: tuple[str, ...] = field(default=())
     """What is worth knowing but no reason to refuse."""
 
@@ -77,33 +93,33 @@ class BootUp:
         self._clients = clients
         self._sdo = clients[axis.drive.node_id]
         self._others_heard = set(others_heard)
+        self._held: list[PlannedWrite] = []
+        self._written: list[PlannedWrite] = []
+        self._left: set[tuple[int, int]] = set()
+        self._notes: list[str] = []
 
     def run(self, *, reset: bool) -> BootReport:
         """All of it, in order. Raises `DriveError` (or a kind of it) at the first thing that is wrong.
 
         `InputError` before anything is sent where the EDS lacks what there is no doing without.
         """
-        written = tuple(plan(self._axis, self._sdo.od))
+        planned = plan(self._axis, self._sdo.od)
         for node_id in self._clients:
             self._reach(node_id, reset=reset)
         self._check_device_type()
         identity = self._check_identity()
         modes = self._check_modes()
         self._power_off()
-        notes = self._check_scaling()
-        for row in written:
-            self._write(row)
+        self._check_scaling()
+        for pdo, rows in groupby(planned, lambda row: (row.node_id, row.pdo)):
+            if pdo[1]:
+                self._configure(list(rows))
+            else:
+                for row in rows:
+                    self._settle(row)
         for node_id in self._clients:
             self._start(node_id)
-        return BootReport(
-            node_id=self._axis.drive.node_id,
-            identity=identity,
-            names=self._names(),
-            modes=modes,
-            state=decode(self._sdo.fetch(objects.STATUSWORD)),
-            written=written,
-            notes=tuple(notes),
-        )
+        return self._report(identity, modes)
 
     def look(self) -> BootReport:
         """Compare a drive that runs already with its axis file; writes nothing and changes no state.
@@ -113,15 +129,20 @@ class BootUp:
         self._check_device_type()
         identity = self._check_identity()
         modes = self._check_modes()
-        notes = self._check_scaling()
+        self._check_scaling()
+        return self._report(identity, modes)
+
+    def _report(self, identity: dict[str, int], modes: tuple[Mode, ...]) -> BootReport:
         return BootReport(
             node_id=self._axis.drive.node_id,
             identity=identity,
             names=self._names(),
             modes=modes,
             state=decode(self._sdo.fetch(objects.STATUSWORD)),
-            written=(),
-            notes=tuple(notes),
+            held=tuple(self._held),
+            written=tuple(self._written),
+            left=frozenset(self._left),
+            notes=tuple(self._notes),
         )
 
     # -- network management -------------------------------------------------------------------------------
@@ -142,6 +163,7 @@ class BootUp:
     def _reach(self, node_id: int, *, reset: bool) -> None:
         """Get a node into PRE-OPERATIONAL, and be sure that it is there."""
         status = self._monitor.watch(node_id)
+        since = status.counts
         if reset:
             before = status.boot_ups
             self._nmt(NmtCommand.RESET_COMMUNICATION, node_id)
@@ -149,23 +171,15 @@ class BootUp:
             while status.boot_ups == before and self._receive_until(deadline_s):
                 pass
         self._nmt(NmtCommand.PRE_OPERATIONAL, node_id)
-        try:
-            self._clients[node_id].fetch(objects.DEVICE_TYPE)
-        except SdoAbortError:
-            raise  # it answered: it is there
-        except SdoError as error:
-            heard = ", ".join(map(str, sorted(self._others_heard)))
-            own = node_id == self._axis.drive.node_id
-            where = self._axis.where("drive.node_id" if own else "load_encoder.source.node")
-            raise DriveError(
-                f"node {node_id} on {self._link.name} does not answer"
-                + (f" (heard: node {heard})" if heard else " (no other node was heard either)")
-                + f"; check power, cable, termination, bit rate and {where}"
-            ) from error
+        own = node_id == self._axis.drive.node_id
+        where = self._axis.where("drive.node_id" if own else "load_encoder.source.node")
+        await_sdo(self._link, self._monitor, self._clients[node_id], where, since, self._others_heard)
 
     def _start(self, node_id: int) -> None:
         status = self._monitor.watch(node_id)
         self._nmt(NmtCommand.START, node_id)
+        if node_id == self._axis.drive.node_id and not drive_heartbeat_ms(self._axis, self._sdo.od):
+            return  # nothing says that it has started but the TPDOs that are to come
         deadline_s = self._link.now() + STATE_TIMEOUT_S + 2e-3 * self._axis.drive.heartbeat_ms
         status.nmt_state = None
         while status.nmt_state != NmtState.OPERATIONAL and self._receive_until(deadline_s):
@@ -200,15 +214,17 @@ class BootUp:
         return found
 
     def _check_modes(self) -> tuple[Mode, ...]:
+        if not self._sdo.has(objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub):
+            return tuple(Mode)
         bits = self._sdo.fetch(objects.SUPPORTED_MODES)
         self._refuse(mode_complaints(self._axis, bits))
-        return tuple(mode for mode in Mode if bits & mode.supported_bit)
+        return tuple(mode for mode in Mode if not bits or bits & mode.supported_bit)
 
-    def _check_scaling(self) -> list[str]:
+    def _check_scaling(self) -> None:
         """User units per motor turn, by every object that says something about them."""
         self._refuse(scaling_complaints(self._axis, self._readings(scaling_addresses(self._axis))))
         rated = self._readings((objects.RATED_TORQUE,))
-        return torque_notes(self._axis, rated.get(objects.RATED_TORQUE))
+        self._notes += torque_notes(self._axis, rated.get(objects.RATED_TORQUE))
 
     def _names(self) -> dict[str, str]:
         names = {}
@@ -245,24 +261,132 @@ class BootUp:
         while self._receive_until(deadline_s):
             pass
 
+    def _configure(self, rows: list[PlannedWrite]) -> None:
+        """Bring one PDO to what its rows say, if it is not there: a drive may have it so, and fixed."""
+        lasting = [row for row in rows if not row.passing]
+        wrong = [row for row in lasting if not self._is_held(row)]
+        if not wrong:
+            self._held += lasting
+            return
+        remap = any(map(_maps, wrong))
+        off = rows[0]
+        cob_id = find(self._sdo.od, off.index, off.sub) if off.node_id == self._sdo.node_id else None
+        for row in rows:
+            fixed = row is off and cob_id is not None and not is_writable(cob_id)
+            if fixed or (row.passing and _maps(row) and not remap):
+                continue
+            self._settle(row)
+
+    def _is_held(self, row: PlannedWrite) -> bool:
+        """The drive holds the value already; False if it cannot be read."""
+        try:
+            found = self._read(row)
+        except SdoError as error:
+            raise self._refused(row, error) from error
+        return found is not None and row.holds(found)
+
+    def _read(self, row: PlannedWrite) -> int | None:
+        """What the drive holds; None for an object that can only be written."""
+        sdo = self._clients[row.node_id]
+        variable = find(sdo.od, row.index, row.sub)
+        if variable is not None and not is_readable(variable):
+            return None
+        try:
+            return sdo.read(row.index, row.sub, row.type)
+        except SdoAbortError as error:
+            if error.code == _WRITE_ONLY:
+                return None
+            raise
+
+    def _settle(self, row: PlannedWrite) -> None:
+        """See to it that an object holds its value: read it, write it if it differs, read it back."""
+        if not self._is_held(row):
+            try:
+                self._write(row)
+            except DriveError as error:
+                if not self._may_keep(row, error):
+                    raise
+                self._left.add((row.index, row.sub))
+                self._notes.append(f"left to the drive ({row.without}): {error}")
+                return
+            if not row.passing:
+                self._written.append(row)
+        if not row.passing:
+            self._held.append(row)
+
+    def _may_keep(self, row: PlannedWrite, error: DriveError) -> bool:
+        """The drive may keep a value that nobody chose but hdbridge, and one that is read-only."""
+        if not row.without or row.exact:
+            return False
+        cause = error.__cause__
+        if isinstance(cause, SdoError) and not isinstance(cause, SdoAbortError):
+            return False  # it does not answer
+        read_only = isinstance(cause, SdoAbortError) and cause.code == _READ_ONLY
+        return read_only or not self._axis.states(row.field)
+
     def _write(self, row: PlannedWrite) -> None:
         """Write one object and compare what the drive then holds."""
         sdo = self._clients[row.node_id]
-        at = f"; {self._axis.where(row.field)} decides it" if row.field else ""
         value = row.value
         try:
             if row.kept:
-                value |= sdo.read(row.index, row.sub, row.type) & row.kept & ~row.value
+                value |= (self._read(row) or 0) & row.kept & ~row.value
             sdo.write(row.index, row.sub, value, row.type)
-            found = sdo.read(row.index, row.sub, row.type)
+            found = self._read(row)
         except SdoError as error:
-            raise SdoError(f"{error} (to write {row.value}: {row.why}){at}") from error
-        if found & row.compared != value & row.compared:
+            raise self._refused(row, error) from error
+        if found is not None and not row.holds(found):
             raise DriveError(
                 f"{sdo.describe(row.index, row.sub)}: was written {value} ({row.why}), but reads back "
-                f"{found}; "
-                f"the drive does not take this value{at}"
+                f"{found}; the drive does not take this value{self._decides(row)}"
             )
+
+    def _refused(self, row: PlannedWrite, error: SdoError) -> SdoError:
+        return SdoError(f"{error} (to write {row.value}: {row.why}){self._decides(row)}")
+
+    def _decides(self, row: PlannedWrite) -> str:
+        return f"; {self._axis.where(row.field)} decides it" if row.field else ""
 
     def _name(self, address: Address) -> str:
         return self._sdo.describe(address.index, address.sub)
+
+
+def _maps(row: PlannedWrite) -> bool:
+    """Whether the object is a mapping parameter of a PDO."""
+    return any(base <= row.index < base + _MAPPINGS_PER_KIND for base in _MAPPINGS)
+
+
+def await_sdo(
+    link: Link,
+    monitor: NetworkMonitor,
+    client: SdoClient,
+    where: str,
+    since: tuple[int, int, int] = (0, 0, 0),
+    others_heard: Iterable[int] = (),
+) -> int:
+    """The device type (1000h) of a node, which may answer SDO only seconds after its boot-up message.
+
+    Raises `DriveError` if it does not answer, with what was heard of it since its status had the
+    counts ``since``, else with ``where`` the axis file names it. An abort is an answer (`SdoAbortError`).
+    """
+    status = monitor.watch(client.node_id)
+    while True:
+        try:
+            return client.fetch(objects.DEVICE_TYPE)
+        except SdoAbortError:
+            raise  # it answered: it is there
+        except SdoError as error:
+            booted_s = status.boot_up_s
+            booted = status.boot_ups > since[0]
+            if booted and booted_s is not None and link.now() < booted_s + SDO_AFTER_BOOT_UP_S:
+                continue
+            others = ", ".join(map(str, sorted(set(others_heard) - {client.node_id})))
+            if said := status.heard_since(since):
+                heard = f"heard of it: {said}"
+                todo = "its SDO server is not up: switch it off and on, and look at its error display"
+            else:
+                heard = f"heard: node {others}" if others else "no other node was heard either"
+                todo = f"check power, cable, termination, bit rate and {where}"
+            raise DriveError(
+                f"node {client.node_id} on {link.name} does not answer ({heard}); {todo}"
+            ) from error

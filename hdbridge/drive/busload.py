@@ -15,7 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from hdbridge.drive.image import HEARTBEATS_PER_TIMEOUT, channel_layouts, rpdo_layout, tpdo_layouts
+from hdbridge.drive.image import HEARTBEATS_PER_TIMEOUT
+from hdbridge.drive.layout import layouts
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,9 +52,10 @@ def cycle_bits(axes: Sequence[AxisConfig]) -> float:
     bits = float(frame_bits(0) + 2 * frame_bits(_SDO_BYTES))
     heartbeat = frame_bits(_HEARTBEAT_BYTES)
     for axis in axes:
-        layouts = (*tpdo_layouts(axis), *channel_layouts(axis), rpdo_layout(axis))
-        bits += sum(frame_bits(layout.codec.length) / layout.every for layout in layouts)
-        nodes = len({layout.node_id for layout in layouts})
+        pdos = layouts(axis)
+        every = (*pdos.cyclic, *pdos.channels, *pdos.rpdos)
+        bits += sum(frame_bits(layout.codec.length) / layout.every for layout in every)
+        nodes = len({layout.node_id for layout in every})
         bits += nodes * heartbeat * axis.drive.cycle_ms / axis.drive.heartbeat_ms
     if axes:
         masters = max(axis.drive.cycle_ms / axis.drive.heartbeat_ms for axis in axes) * HEARTBEATS_PER_TIMEOUT

@@ -15,14 +15,7 @@ from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.supervision import Fault
 
 if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
-
-    from hdbridge.axis import AxisConfig
     from hdbridge.axis.channels import MeasuredChannel
-
-_CIA_301_TYPES = {
-    "int8": 0x02, "int16": 0x03, "int32": 0x04, "uint8": 0x05, "uint16": 0x06, "uint32": 0x07,
-}  # fmt: skip
 
 
 class ChannelFollower:
@@ -90,29 +83,3 @@ class ChannelFollower:
 
     def _of(self, counts: int) -> float:
         return self._at_zero + self._per_count * counts
-
-
-def channel_complaints(axis: AxisConfig, od: ObjectDictionary) -> list[str]:
-    """Where the EDS does not have a channel's object as the axis file says, in words that name its line."""
-    complaints = []
-    for key, channel in axis.channels.items():
-        source = channel.source
-        name = f"{source.index:04X}h:{source.subindex:02X}"
-        entry = od.get(source.index)
-        members = getattr(entry, "subindices", None)
-        variable = members.get(source.subindex) if members is not None else entry
-        at = f"{key}.source.index"
-        if variable is None or (members is None and source.subindex):
-            wrong = f"{axis.drive.eds} has no object {name}; expected the drive's object for it"
-        elif not variable.pdo_mappable:
-            wrong = f"{axis.drive.eds} says that {name} cannot be mapped to a PDO; expected one that can"
-        elif variable.data_type != _CIA_301_TYPES[source.type]:
-            at = f"{key}.source.type"
-            found = {code: kind for kind, code in _CIA_301_TYPES.items()}.get(
-                variable.data_type, "another type"
-            )
-            wrong = f"{axis.drive.eds} says that {name} is {found}; expected that here"
-        else:
-            continue
-        complaints.append(f"{axis.where(at)}: {wrong}, or leave '{key}' out")
-    return complaints

@@ -19,7 +19,7 @@ from hdbridge.drive.objects import Mode, NmtState
 from hdbridge.drive.sdo import SdoClient
 from hdbridge.drive.states import State, controlword_for, decode, states_on_the_way
 from hdbridge.drive.unwrap import wrap_int32
-from hdbridge.errors import DriveError, TransitionError
+from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0
 """How long a drive may take for one transition, or for a change of mode."""
@@ -101,18 +101,21 @@ class Commander:
                 )
             self.pause(POLL_S)
 
-    def fault(self, when: str) -> DriveError:
-        """The error to raise for a drive that is in fault: its error code and last emergency."""
+    def fault_words(self) -> str:
+        """Error code and last emergency of a drive that is in fault."""
         code = self.sdo.fetch(objects.ERROR_CODE) if self.sdo.has(objects.ERROR_CODE.index) else None
         last = self.monitor.watch(self.sdo.node_id).last_error
         details = [
             f"error code {code:04X}h, {error_name(code)}" if code is not None else "",
             str(last) if last else "",
         ]
-        told = ", ".join(filter(None, details)) or "no error code is known"
+        return ", ".join(filter(None, details)) or "no error code is known"
+
+    def fault(self, when: str) -> DriveError:
+        """The error to raise for a drive that is in fault."""
         return DriveError(
-            f"{self.name}: fault {when} ({told}); remove the cause (the drive's manual explains the code), "
-            "then reset the fault"
+            f"{self.name}: fault {when} ({self.fault_words()}); remove the cause (the drive's manual "
+            f"explains the code), then reset the fault: {RESET}"
         )
 
     def walk(self, target: State) -> None:

@@ -5,8 +5,8 @@
         drive.enable(Mode.PP)
         drive.move_to(90.0)
 
-For the control cycle, `enable(Mode.CSP)` prepares everything and hands over to ``image.power``: the cycle
-then walks the states by PDO, while SYNC and set-points are already running.
+For the control cycle, `enable()` prepares everything and hands over to ``image.power``: the cycle then walks
+the states by PDO, while SYNC and set-points are already running.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
+from hdbridge.drive.dictionary import find, is_writable
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.objects import IntegerType, Mode, NmtCommand
-from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoClient, shared_eds
+from hdbridge.drive.objects import Address, IntegerType, Mode, NmtCommand
+from hdbridge.drive.sdo import DEFAULT_TIMEOUT_S, SdoAbortError, SdoClient
 from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
-from hdbridge.errors import DriveError, HdbridgeError, TransitionError
+from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
+from hdbridge.files.edsfile import shared_eds
 
 if TYPE_CHECKING:
     import can
@@ -71,9 +73,9 @@ class Drive:
         self.axis = axis
         self.link = Link(bus, clock if clock is not None else MonotonicClock())
         self.monitor = NetworkMonitor(axis.drive.node_id)
-        self.image = ProcessImage(axis)
         if od is None:
-            od = shared_eds(axis.eds_path, axis.drive.node_id)
+            od = shared_eds(axis.eds_path, axis.drive.node_id).dictionary
+        self.image = ProcessImage(axis, od)
         self.sdo = SdoClient(self.link, self.monitor, axis.drive.node_id, od, sdo_timeout_s)
         self._clients = {axis.drive.node_id: self.sdo}
         encoder = axis.load_encoder.source.node
@@ -116,6 +118,8 @@ class Drive:
         self.report = None
         self._mode = None
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients, self._heard).run(reset=reset)
+        for note in self.report.notes:
+            _log.warning("boot-up", {"node": self.axis.drive.node_id, "note": note})
         _log.info("booted", {"node": self.axis.drive.node_id, "bus": self.link.name, **self.report.identity})
         return self.report
 
@@ -134,29 +138,37 @@ class Drive:
         answered = self.report.identity if self.report else {}
         return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
-    def enable(self, mode: Mode = Mode.CSP) -> None:
+    def enable(self, mode: Mode | None = None) -> None:
         """Make ready for power in ``mode``: target = actual position, mode set and seen in 6061h, then power.
 
-        In PP and HM the states are walked here, by SDO. In CSP they are not: a drive in CSP wants SYNC and
-        set-points while it is enabled, so ``image.power`` is aimed and the cycle walks. Raises `DriveError`
-        for a fault (`fault_reset` first), for a position outside the limits, `TransitionError`.
+        By default the mode is that of the control cycle (``drive.mode``). In PP and HM the states are walked
+        here, by SDO. In a cyclic mode they are not: the drive wants SYNC and set-points while it is enabled,
+        so ``image.power`` is aimed and the cycle walks. Raises `DriveError` for a fault (`fault_reset`
+        first), for a position outside the limits, `TransitionError`, `InputError` for another cyclic mode.
         """
+        cyclic = self.image.cyclic.mode
+        mode = cyclic if mode is None else mode
+        if mode is not cyclic and mode in (Mode.CSP, Mode.IP):
+            raise InputError(f"{self.axis.where('drive.mode')} is {self.axis.drive.mode}, not {mode.name}")
         positions = self._make_ready(mode)
-        motor_counts = self._commander.preload_target()
+        has_target = self.sdo.has(objects.TARGET_POSITION.index, objects.TARGET_POSITION.sub)
+        # In interpolated position mode the target is 60C1h, and comes by PDO before anything may move.
+        preload = has_target and mode is not Mode.IP
+        motor_counts = self._commander.preload_target() if preload else positions.motor_counts
         self.image.halt = False
         self.image.seed(motor_counts, positions.load_counts, self._commander.statusword())
         _log.info("enable", {"node": self.axis.drive.node_id, "mode": mode.name})
-        if mode is Mode.CSP:
+        if mode is cyclic:
             self.image.power.go(State.OPERATION_ENABLED)
         else:
             self._commander.walk(State.OPERATION_ENABLED)
 
     def prepare(self) -> Positions:
-        """Make ready for power in CSP while a control cycle runs already; where the axis stands.
+        """Make ready for power in the cyclic mode while a control cycle runs already; where the axis stands.
 
         As `enable`, but the cycle's RPDOs keep the target at the actual position, and it walks the states.
         """
-        return self._make_ready(Mode.CSP)
+        return self._make_ready(self.image.cyclic.mode)
 
     def _make_ready(self, mode: Mode) -> Positions:
         """All that precedes power but the target: checks, the watch for the master, the mode."""
@@ -196,12 +208,14 @@ class Drive:
         self._mode = None
         _log.info("disabled", {"node": self.axis.drive.node_id, "state": state.value})
 
-    def fault_reset(self) -> None:
-        """Reset a fault: a rising edge on bit 7. `TransitionError` when there is none, `DriveError` when "
-        "it stays.
+    def fault_reset(self) -> str:
+        """Resets a fault by a rising edge on bit 7; returns its error code and last emergency in words.
+
+        Raises `TransitionError` if the drive is not in fault, `DriveError` if the fault stays.
         """
         commander = self._commander
         row_for(commander.state(), Command.FAULT_RESET)
+        words = commander.fault_words()
         commander.control(0x0000)
         commander.control(Command.FAULT_RESET.word)
         try:
@@ -216,6 +230,7 @@ class Drive:
         finally:
             commander.control(0x0000)
         commander.state()
+        return words
 
     def quick_stop(self) -> State:
         """Stop at once. What follows is 605Ah's choice; the state in which the drive then is."""
@@ -289,6 +304,12 @@ class Drive:
         load = client.read(source.index, source.subindex, IntegerType.named(source.type))
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
+    def can_set(self, address: Address) -> bool:
+        """The drive has an object that can be written, by its EDS and by what it took in the boot-up."""
+        variable = find(self.sdo.od, address.index, address.sub)
+        left = self.report.left if self.report is not None else ()
+        return variable is not None and is_writable(variable) and (address.index, address.sub) not in left
+
     def close(self) -> list[str]:
         """Stop and disable the drive, take it out of OPERATIONAL; what did not work, in words.
 
@@ -334,7 +355,7 @@ class Drive:
         Without power nothing can move, and the master may be busy with files. A drive begins to watch with
         the first heartbeat that it hears after this object was written.
         """
-        if self.sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
+        if self.can_set(objects.HEARTBEAT_CONSUMER):
             self.sdo.store(objects.HEARTBEAT_CONSUMER, master_heartbeat(self.axis) if expected else 0)
 
     def _power_off(self) -> None:
@@ -352,9 +373,10 @@ class Drive:
             commander.wait_for(
                 "'switch on disabled'", lambda word: decode(word) in _OFF, STEP_TIMEOUT_S, allow_fault=True
             )
-        if quick.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
+        if self.can_set(objects.HEARTBEAT_CONSUMER):
             # The master leaves on purpose; its silence from now on is no fault.
-            quick.store(objects.HEARTBEAT_CONSUMER, 0)
+            with suppress(SdoAbortError):  # a drive that refuses this has never watched
+                quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
         """The same without an answer: as frames that a drive which only listens can still obey."""

@@ -16,7 +16,8 @@ class Feedback(NamedTuple):
     motor_counts: int
     load_counts: int
     demand_counts: int
-    torque_permille: int
+    torque_permille: float
+    """NaN if the drive does not send it (6077h)."""
     fresh: bool
     """False when a TPDO was missing or not believed: the values are the last good ones."""
     readings: tuple[float | None, ...]

@@ -1,90 +1,48 @@
 """The process image: what goes over the bus in every cycle, and what its numbers mean for the axis. Pure.
 
-Which PDO carries what is written here once; the boot-up maps the drive accordingly and the cycle packs and
-unpacks with it.
-
-    TPDO1 180h+id  statusword, position, torque        8 bytes
-    TPDO2 280h+id  load encoder, position demand       8 bytes (4 when the load encoder is a node of its own)
-    TPDO1 180h+id2 load encoder of another node        as long as its object
-    TPDO3 380h+id  load torque, temperature            as long as its objects; where the axis has them
-    TPDO4 480h+id  temperature                         where it comes less often than the load torque
-    RPDO1 200h+id  controlword, target position        6 bytes
+Which PDO carries what, `hdbridge.drive.layout` says; the boot-up maps the drive accordingly and the cycle
+packs and unpacks with it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
-from hdbridge.drive.objects import IntegerType
-from hdbridge.drive.pdo import PdoCodec, PdoEntry
-from hdbridge.drive.states import Command, PowerWalk
+from hdbridge.drive.dictionary import dictionary_of, find, held
+from hdbridge.drive.layout import Layout, cyclic_mode, layouts
+from hdbridge.drive.objects import Address
+from hdbridge.drive.pdo import PdoEntry
+from hdbridge.drive.states import Command, PowerWalk, State
 from hdbridge.drive.supervision import Fault
-from hdbridge.drive.unwrap import Unwrap, wrap_int32
+from hdbridge.drive.unwrap import INT32_RANGE, Unwrap, wrap_int32
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
     from hdbridge.axis import AxisConfig
 
+Frames = tuple[tuple[int, bytes], ...]
+"""Identifier and data of the frames to send."""
+# For the control cycle: to look a member up in its class takes five times as long as a name of the module.
+_ENABLED: Final = State.OPERATION_ENABLED
+_ENABLE_OPERATION: Final = Command.ENABLE_OPERATION.word
 HALT_BIT: Final = 0x0100
 HEARTBEATS_PER_TIMEOUT: Final = 2
 """The master sends this many heartbeats in the time in which the drive expects one, and grants as many."""
 
 
-class Layout(NamedTuple):
-    """One PDO of the image: whose it is, its number (1..), its identifier and what is mapped."""
-
-    node_id: int
-    number: int
-    can_id: int
-    codec: PdoCodec
-    every: int = 1
-    """It goes with every so many SYNCs."""
-
-
-def tpdo_layouts(axis: AxisConfig) -> tuple[Layout, ...]:
-    """The PDOs that each cycle needs."""
-    drive_id = axis.drive.node_id
-    source = axis.load_encoder.source
-    load = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
-    demand = PdoEntry.of(objects.POSITION_DEMAND)
-    actual = PdoCodec(map(PdoEntry.of, (objects.STATUSWORD, objects.POSITION_ACTUAL, objects.TORQUE_ACTUAL)))
-    first = Layout(drive_id, 1, objects.COB_TPDO1 + drive_id, actual)
-    second_id = objects.COB_TPDO2 + drive_id
-    if source.node is None or source.node == drive_id:
-        return first, Layout(drive_id, 2, second_id, PdoCodec((load, demand)))
-    return (
-        first,
-        Layout(drive_id, 2, second_id, PdoCodec((demand,))),
-        Layout(source.node, 1, objects.COB_TPDO1 + source.node, PdoCodec((load,))),
-    )
-
-
-def channel_layouts(axis: AxisConfig) -> tuple[Layout, ...]:
-    """The PDOs of the optional channels: one for all that come equally often."""
-    together: dict[int, list[PdoEntry]] = {}
-    for channel in axis.channels.values():
-        source = channel.source
-        entry = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
-        together.setdefault(channel.every_cycles, []).append(entry)
-    drive_id = axis.drive.node_id
-    return tuple(
-        Layout(drive_id, number, base + drive_id, PdoCodec(entries), every)
-        for (every, entries), (number, base) in zip(
-            together.items(), ((3, objects.COB_TPDO3), (4, objects.COB_TPDO4)), strict=False
-        )
-    )
-
-
-def rpdo_layout(axis: AxisConfig) -> Layout:
-    """The PDO that the master sends."""
-    codec = PdoCodec(map(PdoEntry.of, (objects.CONTROLWORD, objects.TARGET_POSITION)))
-    return Layout(axis.drive.node_id, 1, objects.COB_RPDO1 + axis.drive.node_id, codec)
+def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> int:
+    """Period of the drive's heartbeat; 0 if its EDS has none (1017h)."""
+    od = dictionary_of(axis) if od is None else od
+    address = objects.HEARTBEAT_PRODUCER
+    there = od is None or find(od, address.index, address.sub) is not None
+    return axis.drive.heartbeat_ms if there else 0
 
 
 def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
@@ -105,72 +63,95 @@ def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
 class ProcessImage:
     """The newest values from the drive, the next ones to it, and the scaling between counts and degrees.
 
-    `accept` takes the frames of a cycle, `pack_rpdo` gives the frame to send; the power states are walked by
-    ``power`` (aim with ``power.go``). Positions are unwrapped multi-turn Python integers.
+    `accept` takes the frames of a cycle, `pack_rpdo` gives the frames to send; the power states are walked by
+    ``power`` (aim with ``power.go``). Positions are unwrapped multi-turn Python integers. ``od`` is by
+    default the dictionary of the axis's own EDS.
     """
 
-    def __init__(self, axis: AxisConfig) -> None:
+    def __init__(self, axis: AxisConfig, od: ObjectDictionary | None = None) -> None:
+        od = dictionary_of(axis) if od is None else od
         self.axis = axis
         self.node_id: int = axis.drive.node_id
-        self.tpdos = tpdo_layouts(axis)
-        self.channel_tpdos = channel_layouts(axis)
-        rpdo = rpdo_layout(axis)
-        self.rpdo_id, self.rpdo = rpdo.can_id, rpdo.codec
+        self.cyclic = cyclic_mode(axis)
+        self._enabling = self.cyclic.enabling
+        self.tpdos, self.channel_tpdos, self.rpdos, absent = layouts(axis, od)
         self.sync_id: int = objects.COB_SYNC
         self.heartbeat_id: int = objects.COB_HEARTBEAT + axis.drive.master_node_id
         """Identifier of the master's own heartbeat; its data is one byte 05h."""
         self.heartbeat_period_s: float = axis.drive.heartbeat_ms / 1000.0 / HEARTBEATS_PER_TIMEOUT
         """How often the master has to send its heartbeat."""
-        self.heartbeat_timeout_s: float = axis.drive.heartbeat_ms / 1000.0 * HEARTBEATS_PER_TIMEOUT
-        """How old the drive's heartbeat may become."""
+        beat_ms = drive_heartbeat_ms(axis, od)
+        self.heartbeat_timeout_s: float = beat_ms / 1000.0 * HEARTBEATS_PER_TIMEOUT if beat_ms else math.inf
+        """How old the drive's heartbeat may become; infinite if it sends none."""
         self.limits_counts = position_limits_counts(axis)
         self.power = PowerWalk()
         self.halt = False
         """Sets the halt bit of the controlword."""
 
         self._motor, self._load = axis.motor_encoder.scale, axis.load_encoder.scale
-        source = axis.load_encoder.source
-        self._load_key = (source.index, source.subindex)
-        self._handlers: dict[int, Callable[[bytes], None]] = {
-            layout.can_id: self._handler(place, layout.codec) for place, layout in enumerate(self.tpdos)
-        }
-        self.tpdo_ids: tuple[int, ...] = tuple(self._handlers)
-        """Identifiers of the frames that each cycle needs."""
         self.channels = tuple(
             ChannelFollower(key, channel, axis.drive.cycle_ms) for key, channel in axis.channels.items()
         )
         """What the axis has in addition to its encoders; empty for most."""
-        followers = {
+        self._followers = {
             (channel.source.index, channel.source.subindex): follower
             for channel, follower in zip(axis.channels.values(), self.channels, strict=True)
         }
-        self._carried = {
-            layout.can_id: [followers[entry.index, entry.sub] for entry in layout.codec.entries]
-            for layout in self.channel_tpdos
-        }
-        for layout in self.channel_tpdos:
-            self._handlers[layout.can_id] = partial(self._accept_channels, layout)
         self.readings: tuple[float | None, ...] = (None,) * len(self.channels)
         """Of each of ``channels`` the last reading that was believed; None where none is known (any more)."""
-        self._unwrap_motor = Unwrap()
-        self._unwrap_demand = Unwrap()
-        self._unwrap_load = Unwrap(source.wraps_at_counts)
+        position = self._entry_of(objects.POSITION_ACTUAL)
+        demand = self._entry_of(objects.POSITION_DEMAND)
+        self._unwrap_motor = Unwrap(1 << position.type.bits if position else INT32_RANGE)
+        self._unwrap_demand = Unwrap(1 << demand.type.bits if demand else INT32_RANGE)
+        self._unwrap_load = Unwrap(axis.load_encoder.source.wraps_at_counts)
+        self._has_demand = objects.POSITION_DEMAND not in absent
+        self._handlers = self._handlers_of((*self.tpdos, *self.channel_tpdos))
+        self.tpdo_ids: tuple[int, ...] = tuple(layout.can_id for layout in self.tpdos)
+        """Identifiers of the frames that each cycle needs."""
+        self._packers = tuple(self._packer(layout, od) for layout in self.rpdos)
         self.statusword: int | None = None
         """Newest statusword; None before the first."""
         self.motor_counts = 0
         self.load_counts = 0
         self.demand_counts = 0
-        self.torque_permille = 0
+        """Position demand; the target before the last one, which the drive has reached, if it sends none."""
+        self.torque_permille: float = math.nan if objects.TORQUE_ACTUAL in absent else 0
+        """NaN if the drive does not send it."""
         self.target_counts = 0
         """Last target that was packed."""
+        self._under_way = 0
 
-    def _handler(self, place: int, codec: PdoCodec) -> Callable[[bytes], None]:
-        """What to do with the data of a TPDO that each cycle needs."""
-        if place == 0:
-            return partial(self._accept_state, codec.unpack)
-        load = codec.positions.get(self._load_key)
-        demand = codec.positions.get((objects.POSITION_DEMAND.index, objects.POSITION_DEMAND.sub))
-        return partial(self._accept_positions, codec.unpack, load, demand)
+    # -- received -----------------------------------------------------------------------------------------
+
+    def _entry_of(self, address: Address) -> PdoEntry | None:
+        entries = (entry for layout in self.tpdos for entry in layout.codec.entries)
+        return next(
+            (each for each in entries if (each.index, each.sub) == (address.index, address.sub)), None
+        )
+
+    def _handlers_of(self, tpdos: Iterable[Layout]) -> dict[int, Callable[[bytes], None]]:
+        """What takes the data of each TPDO. An object that several carry is taken from the first."""
+        source = self.axis.load_encoder.source
+        takers: dict[tuple[int, int, int], Callable[[int], None]] = {
+            (self.node_id, address.index, address.sub): take
+            for address, take in (
+                (objects.STATUSWORD, self._take_statusword),
+                (objects.POSITION_ACTUAL, self._take_position),
+                (objects.TORQUE_ACTUAL, self._take_torque),
+                (objects.POSITION_DEMAND, self._take_demand),
+            )
+        }
+        takers |= {(self.node_id, *key): each.accept for key, each in self._followers.items()}
+        takers[source.node or self.node_id, source.index, source.subindex] = self._take_load
+        handlers = {}
+        for layout in tpdos:
+            taken = []
+            for place, entry in enumerate(layout.codec.entries):
+                take = takers.pop((layout.node_id, entry.index, entry.sub), None)
+                if take is not None:
+                    taken.append((place, take))
+            handlers[layout.can_id] = _handler(layout.codec.unpack, taken)
+        return handlers
 
     def accept(self, can_id: int, data: bytes) -> bool:
         """Take a TPDO; whether it was one of the image's. `PdoLengthError` when its length is wrong.
@@ -192,35 +173,43 @@ class ProcessImage:
         layouts = (*self.tpdos, *self.channel_tpdos)
         return next(each.codec.length for each in layouts if each.can_id == can_id)
 
-    def _accept_state(self, unpack: Callable[[bytes], tuple[int, ...]], data: bytes) -> None:
-        self.statusword, motor, self.torque_permille = unpack(data)
-        self.power.observe(self.statusword)
-        self.motor_counts = self._unwrap_motor.update(motor)
+    def statusword_in(self, can_id: int, data: bytes) -> int | None:
+        """Statusword that a TPDO carries, or None. Takes nothing over into the image."""
+        for layout in self.tpdos:
+            place = layout.codec.positions.get((objects.STATUSWORD.index, objects.STATUSWORD.sub))
+            if layout.can_id == can_id and place is not None and len(data) == layout.codec.length:
+                return layout.codec.unpack(data)[place]
+        return None
 
-    def _accept_positions(
-        self,
-        unpack: Callable[[bytes], tuple[int, ...]],
-        load: int | None,
-        demand: int | None,
-        data: bytes,
-    ) -> None:
-        values = unpack(data)
-        if load is not None:
-            self.load_counts = self._unwrap_load.update(values[load])
-        if demand is not None:
-            self.demand_counts = self._unwrap_demand.update(values[demand])
+    def _take_statusword(self, word: int) -> None:
+        self.statusword = word
+        self.power.observe(word)
 
-    def _accept_channels(self, layout: Layout, data: bytes) -> None:
-        for follower, counts in zip(self._carried[layout.can_id], layout.codec.unpack(data), strict=True):
-            follower.accept(counts)
+    def _take_position(self, counts: int) -> None:
+        motor_counts = self.motor_counts = self._unwrap_motor.update(counts)
+        if not self._has_demand and self.power.state is not _ENABLED:
+            self.demand_counts = motor_counts
+
+    def _take_torque(self, permille: int) -> None:
+        self.torque_permille = permille
+
+    def _take_load(self, counts: int) -> None:
+        self.load_counts = self._unwrap_load.update(counts)
+
+    def _take_demand(self, counts: int) -> None:
+        self.demand_counts = self._unwrap_demand.update(counts)
 
     def awaited_channels(self) -> list[int]:
         """Identifiers of the optional channels' TPDOs that come with every SYNC, as long as they do."""
         return [
             layout.can_id
             for layout in self.channel_tpdos
-            if layout.every == 1 and not all(each.lost for each in self._carried[layout.can_id])
+            if layout.every == 1 and not all(each.lost for each in self._followers_in(layout))
         ]
+
+    def _followers_in(self, layout: Layout) -> list[ChannelFollower]:
+        keys = [(entry.index, entry.sub) for entry in layout.codec.entries]
+        return [self._followers[key] for key in keys if key in self._followers]
 
     def step_channels(self) -> list[tuple[Fault, str]]:
         """One cycle is over for the channels: their values as of now, and what is wrong with them."""
@@ -238,6 +227,36 @@ class ProcessImage:
             follower.reset()
         self.readings = (None,) * len(self.channels)
 
+    # -- sent ---------------------------------------------------------------------------------------------
+
+    def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
+        """What makes the frame of an RPDO from controlword and target; either may be in another one.
+
+        A mapping that cannot be written may have other objects: the mode of operation is that of the cycle,
+        any other holds what the EDS says, else 0.
+        """
+        entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
+        values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]
+        words, targets, modes = (
+            [
+                place
+                for place, entry in enumerate(entries)
+                if (entry.index, entry.sub) == (each.index, each.sub)
+            ]
+            for each in (objects.CONTROLWORD, self.cyclic.target, objects.MODE)
+        )
+        for place in modes:
+            values[place] = self.cyclic.mode
+
+        def frame(word: int, target_counts: int) -> tuple[int, bytes]:
+            for place in words:
+                values[place] = word
+            for place in targets:
+                values[place] = target_counts
+            return can_id, pack(values)
+
+        return frame
+
     def check_target(self, counts: int) -> None:
         """`InputError` unless ``counts`` is an integer within the position limits."""
         least, greatest = self.limits_counts
@@ -248,8 +267,8 @@ class ProcessImage:
                 f"{self.axis.limits.position_max_deg} deg at the load); the target was not sent"
             )
 
-    def pack_rpdo(self, target_counts: int) -> bytes:
-        """Data of the RPDO: the controlword of ``power`` and the target, checked against the limits.
+    def pack_rpdo(self, target_counts: int) -> Frames:
+        """The RPDOs with the controlword of ``power`` and the target, checked against the limits.
 
         `InputError`, and nothing to send, when the target is outside them. Before power is enabled use
         `pack_rpdo_idle`: the axis may stand anywhere then.
@@ -257,37 +276,42 @@ class ProcessImage:
         self.check_target(target_counts)
         return self._pack(target_counts)
 
-    def pack_rpdo_idle(self) -> bytes:
-        """Data of the RPDO with the actual position as target: for every cycle before power is enabled."""
+    def pack_rpdo_idle(self) -> Frames:
+        """The RPDOs with the actual position as target: for every cycle before power is enabled."""
         return self._pack(wrap_int32(self.motor_counts))
 
-    def pack_rpdo_stop(self) -> bytes:
-        """Data of the RPDO with *quick stop* and the actual position, whatever ``power`` aims at.
+    def pack_rpdo_held(self) -> Frames:
+        """The RPDOs with the last target once more."""
+        return self._pack(self.target_counts)
 
-        It enables no drive in any state, and replaces an RPDO that a drive has buffered.
+    def pack_rpdo_stop(self) -> Frames:
+        """The RPDOs with *quick stop* and the actual position, whatever ``power`` aims at.
+
+        They enable no drive in any state, and replace RPDOs that a drive has buffered.
         """
-        return self.rpdo.pack((Command.QUICK_STOP.word, wrap_int32(self.motor_counts)))
+        word, target_counts = Command.QUICK_STOP.word, wrap_int32(self.motor_counts)
+        return tuple([frame(word, target_counts) for frame in self._packers])
 
-    def statusword_in(self, can_id: int, data: bytes) -> int | None:
-        """Statusword that a TPDO carries, or None. Takes nothing over into the image."""
-        if can_id != self.tpdo_ids[0] or len(data) != self.tpdos[0].codec.length:
-            return None
-        return self.tpdos[0].codec.unpack(data)[0]
-
-    def _pack(self, target_counts: int) -> bytes:
-        word = self.power.controlword()
+    def _pack(self, target_counts: int) -> Frames:
+        power = self.power
+        word = power.controlword()
+        if self._enabling and word == _ENABLE_OPERATION and power.state is _ENABLED:
+            word |= self._enabling
         if self.halt:
             word |= HALT_BIT
-        data = self.rpdo.pack((word, target_counts))
+        frames = tuple([frame(word, target_counts) for frame in self._packers])
         self.target_counts = target_counts
-        return data
+        if not self._has_demand:
+            self.demand_counts = self._under_way
+            self._under_way = self.motor_counts + wrap_int32(target_counts - self.motor_counts)
+        return frames
 
     def seed(self, motor_counts: int, load_counts: int, statusword: int) -> None:
         """Start the multi-turn counts from readings over SDO, so that the cycle goes on from there."""
         self._unwrap_motor.reset(motor_counts)
         self._unwrap_load.reset(load_counts)
         self._unwrap_demand.reset(motor_counts)
-        self.motor_counts = self.demand_counts = self.target_counts = motor_counts
+        self.motor_counts = self.demand_counts = self.target_counts = self._under_way = motor_counts
         self.load_counts = load_counts
         self.statusword = statusword
         self.power.observe(statusword)
@@ -307,3 +331,20 @@ class ProcessImage:
         counts = round(self._motor.counts(motor_deg))
         self.check_target(counts)
         return counts
+
+
+def _held(od: ObjectDictionary, entry: PdoEntry) -> int:
+    variable = find(od, entry.index, entry.sub)
+    value = held(variable) if variable is not None else None
+    return value if value is not None and entry.type.minimum <= value <= entry.type.maximum else 0
+
+
+def _handler(
+    unpack: Callable[[bytes], tuple[int, ...]], takers: Sequence[tuple[int, Callable[[int], None]]]
+) -> Callable[[bytes], None]:
+    def handle(data: bytes) -> None:
+        values = unpack(data)
+        for place, take in takers:
+            take(values[place])
+
+    return handle

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.files.expectation import one_line
@@ -39,27 +40,47 @@ def interface_lock(interface: str, channel: object, folder: Path | None = None) 
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            number = _holder(path)
             raise BusInUseError(
-                f"{interface}:{channel}: another hdbridge on this machine masters it ({_holder(handle)} "
-                f"holds {path}); end that one first (--force, in the library shared=True, opens the bus all "
-                "the same)"
+                f"{interface}:{channel}: another hdbridge on this machine masters it "
+                f"({process_words(number) if number else 'it'} holds {path}); end that one first "
+                "(--force, in the library shared=True, opens the bus all the same)"
             ) from None
         yield
     finally:
         os.close(handle)
 
 
-def _holder(handle: int) -> str:
-    """Who has locked an open file, as far as this system tells: number and command line of the process."""
+def holders(folder: Path | None = None) -> dict[int, str]:
+    """The processes of hdbridge that master an interface of this machine: by number, what each holds."""
+    found: dict[int, str] = {}
+    for path in sorted((folder or _folder()).iterdir()):
+        match = re.fullmatch(r"hdbridge-(.+)\.lock", path.name)
+        with suppress(OSError):
+            if match is not None and (number := _holder(path)):
+                interface, _, channel = unquote(match[1]).partition("-")
+                found[number] = f"{interface}:{channel} is held by {process_words(number)}"
+    return found
+
+
+def process_words(number: int) -> str:
+    """Number and command line of a process."""
+    words: list[bytes] = []
+    with suppress(OSError):
+        words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
+    command = " ".join(each.decode(errors="replace") for each in words if each)
+    return f"process {number}, '{one_line(command[:80])}'"
+
+
+def _holder(path: Path) -> int:
+    """Number of the process that has locked a file; 0 if none has, or this system does not show it."""
+    inode = path.stat().st_ino
     with suppress(OSError, ValueError):
-        inode = os.fstat(handle).st_ino
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
             _, kind, _, _, number, place, *_ = line.split()
-            if kind == "FLOCK" and int(place.split(":")[2]) == inode and int(number) > 0:
-                words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
-                command = " ".join(each.decode(errors="replace") for each in words if each)
-                return f"process {number}, '{one_line(command[:80])}',"
-    return "it"
+            if kind == "FLOCK" and int(place.split(":")[2]) == inode:
+                return max(int(number), 0)
+    return 0
 
 
 def _folder() -> Path:

@@ -21,6 +21,8 @@ from hdbridge.errors import DriveError, HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.drive.objects import Address
+    from hdbridge.drive.sdo import SdoClient
 
 ENABLED: Final = HOLD[State.OPERATION_ENABLED]
 NEW_SET_POINT: Final = 0x0010
@@ -148,8 +150,8 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
     with _stopping_on_failure(commander):
         timeout_s = move.time_allowed_s(axis, sdo.fetch(objects.POSITION_ACTUAL))
         sdo.store(objects.PROFILE_VELOCITY, motor_rate(axis, move.velocity_deg_s))
-        sdo.store(objects.PROFILE_ACCELERATION, motor_rate(axis, move.acceleration_deg_s2))
-        sdo.store(objects.PROFILE_DECELERATION, motor_rate(axis, move.acceleration_deg_s2))
+        for address in (objects.PROFILE_ACCELERATION, objects.PROFILE_DECELERATION):
+            _store_if_there(sdo, address, motor_rate(axis, move.acceleration_deg_s2))
         sdo.store(objects.TARGET_POSITION, move.target_counts)
         commander.control(ENABLED)
         doing = f"moving to {move.load_deg:g} deg"
@@ -179,8 +181,9 @@ def run_homing(commander: Commander, homing: Homing) -> None:
         sdo.store(objects.HOMING_METHOD, homing.method)
         sdo.store(objects.HOMING_SPEED_SWITCH, motor_rate(axis, homing.switch_velocity_deg_s))
         sdo.store(objects.HOMING_SPEED_ZERO, motor_rate(axis, homing.zero_velocity_deg_s))
-        sdo.store(objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
-        sdo.store(objects.HOME_OFFSET, offset)
+        _store_if_there(sdo, objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
+        if offset or sdo.has(objects.HOME_OFFSET.index):
+            sdo.store(objects.HOME_OFFSET, offset)
         commander.control(ENABLED)
         before = commander.statusword()
         commander.control(ENABLED | START_HOMING)
@@ -192,6 +195,12 @@ def run_homing(commander: Commander, homing: Homing) -> None:
                 "switches and that the method suits them"
             )
         commander.control(ENABLED)
+
+
+def _store_if_there(sdo: SdoClient, address: Address, value: int) -> None:
+    """Set an object that is optional in CiA 402; a drive without it has a value of its own."""
+    if sdo.has(address.index, address.sub):
+        sdo.store(address, value)
 
 
 def halt(commander: Commander) -> bool:

@@ -42,6 +42,9 @@ class NodeStatus:
     heartbeat_s: float | None = None
     """When the last heartbeat or boot-up message came, on the link's clock."""
     boot_ups: int = 0
+    heartbeats: int = 0
+    boot_up_s: float | None = None
+    """When the last boot-up message came."""
     emergency_count: int = 0
     """All emergencies, those that no longer fit the ring included."""
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
@@ -49,6 +52,23 @@ class NodeStatus:
     def heartbeat_age_s(self, now_s: float) -> float:
         """Seconds since the last heartbeat; infinite before the first."""
         return float("inf") if self.heartbeat_s is None else now_s - self.heartbeat_s
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Boot-up messages, heartbeats and emergencies so far."""
+        return self.boot_ups, self.heartbeats, self.emergency_count
+
+    def heard_since(self, counts: tuple[int, int, int]) -> str:
+        """What was heard of the node since it had these counts, for a message; empty if nothing was."""
+        boot_ups, heartbeats, emergencies = counts
+        said = []
+        if self.boot_ups > boot_ups:
+            said.append("its boot-up message")
+        if self.heartbeats > heartbeats:
+            said.append(f"a heartbeat ({self.nmt_state or 0:02X}h)")
+        if self.emergency_count > emergencies:
+            said.append(str(self.emergencies[-1]))
+        return " and ".join(said)
 
     @property
     def last_error(self) -> Emergency | None:
@@ -91,6 +111,9 @@ class NetworkMonitor:
             status.heartbeat_s = time_s
             if nmt_state == NmtState.BOOT_UP:
                 status.boot_ups += 1
+                status.boot_up_s = time_s
+            else:
+                status.heartbeats += 1
             return True
         status = self._emergency.get(can_id)
         if status is None:

@@ -11,6 +11,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hdbridge.drive import objects
+from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
 
 if TYPE_CHECKING:
@@ -87,16 +88,28 @@ def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Comp
 
 
 def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
-    """Whether 6502h has the mode that the control cycle needs."""
-    if modes & objects.Mode.CSP.supported_bit:
+    """Whether 6502h has the mode of the control cycle; 0 says nothing."""
+    if not modes or modes & cyclic_mode(axis).mode.supported_bit:
         return []
+    key = "drive.mode"
     return [
         Complaint(
-            "drive",
-            f"{_at(axis, objects.SUPPORTED_MODES)} is {modes:08X}h, without cyclic synchronous position "
-            "(bit 7); this drive cannot be used: choose one with that mode, or enable it in the drive",
+            key,
+            f"{_at(axis, objects.SUPPORTED_MODES)} is {modes:08X}h, without the mode {axis.drive.mode} of "
+            f"{axis.where(key)}; {mode_advice(modes)}",
         )
     ]
+
+
+def mode_advice(modes: int) -> str:
+    """What to do if 6502h lacks the mode of the control cycle."""
+    for name, each in objects.CYCLIC.items():
+        if modes & each.mode.supported_bit:
+            return f"'mode: {name}' would be one that it has"
+    return (
+        "this drive cannot be used: choose one with cyclic synchronous position (csp) or interpolated "
+        "position (ip), or enable that in the drive"
+    )
 
 
 def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from hdbridge.errors import InputError
 
@@ -85,6 +85,7 @@ class Mode(IntEnum):
 
     PP = 1
     HM = 6
+    IP = 7
     CSP = 8
 
     @property
@@ -184,6 +185,8 @@ HOMING_METHOD: Final = Address(0x6098, 0, _I8, "homing method")
 HOMING_SPEED_SWITCH: Final = Address(0x6099, 1, _U32, "homing speed towards the switch")
 HOMING_SPEED_ZERO: Final = Address(0x6099, 2, _U32, "homing speed towards zero")
 HOMING_ACCELERATION: Final = Address(0x609A, 0, _U32, "homing acceleration")
+INTERPOLATION_SUBMODE: Final = Address(0x60C0, 0, _I16, "interpolation sub mode select")
+INTERPOLATION_DATA: Final = Address(0x60C1, 1, _I32, "interpolation data record")
 CYCLE_MANTISSA: Final = Address(0x60C2, 1, _U8, "interpolation time period value")
 CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
 SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
@@ -200,20 +203,24 @@ def additional_resolution(sub: int) -> tuple[Address, Address]:
     )
 
 
-REQUIRED: Final = (
-    CONTROLWORD,
-    STATUSWORD,
-    MODE,
-    MODE_DISPLAY,
-    POSITION_ACTUAL,
-    TARGET_POSITION,
-    POSITION_DEMAND,
-    TORQUE_ACTUAL,
-    CYCLE_MANTISSA,
-    CYCLE_EXPONENT,
-    SUPPORTED_MODES,
-)
-"""What the control cycle cannot do without."""
+REQUIRED: Final = (CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY, POSITION_ACTUAL)
+"""The objects that the control cycle cannot do without, next to the target of its `CyclicMode`."""
+
+
+class CyclicMode(NamedTuple):
+    """A mode of operation that takes a position target in every cycle."""
+
+    mode: Mode
+    target: Address
+    enabling: int
+    """Controlword bits, set in 'operation enabled' only, without which the drive holds its position."""
+
+
+CYCLIC: Final = {
+    "csp": CyclicMode(Mode.CSP, TARGET_POSITION, 0),
+    "ip": CyclicMode(Mode.IP, INTERPOLATION_DATA, 0x0010),
+}
+"""By the value of ``drive.mode`` in the axis file."""
 STANDARD: Final[dict[tuple[int, int], Address]] = {
     (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
 }

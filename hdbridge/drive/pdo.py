@@ -27,6 +27,7 @@ _FORMATS = {
     IntegerType.UINT64: "Q",
 }
 MAX_BYTES = 8
+_FIRST_OBJECT = 0x1000
 
 
 class PdoLengthError(DriveError):
@@ -45,6 +46,11 @@ class PdoEntry:
     def of(cls, address: Address) -> PdoEntry:
         """The entry that maps a known object."""
         return cls(address.index, address.sub, address.type)
+
+    @property
+    def is_gap(self) -> bool:
+        """A data type in place of an object, which a drive's own mapping may have to leave a gap."""
+        return self.index < _FIRST_OBJECT
 
     @property
     def mapping(self) -> int:
@@ -81,7 +87,8 @@ class PdoCodec:
             raise InputError(
                 f"a PDO carries 1 to {MAX_BYTES} bytes, but {names or 'nothing'} needs {self.length}"
             )
-        if len(self.positions) != len(self.entries):
+        objects = [entry for entry in self.entries if not entry.is_gap]
+        if len({(entry.index, entry.sub) for entry in objects}) != len(objects):
             raise InputError(f"a PDO maps an object once, but got {names}")
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:

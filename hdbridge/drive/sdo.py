@@ -13,19 +13,17 @@ from __future__ import annotations
 
 import logging
 import struct
-from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
-import canopen
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import SdoClient as CanopenSdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from hdbridge.drive.dictionary import find, integer_type
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import COB_SDO_ANSWER, COB_SDO_REQUEST, STANDARD, Address, IntegerType
-from hdbridge.errors import InputError, SdoError
+from hdbridge.errors import RESET, InputError, SdoError
 
 _log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
@@ -39,21 +37,6 @@ _ABORT_TIMED_OUT: Final = 0x0504_0000
 _ABORT_OUT_OF_MEMORY: Final = 0x0504_0005
 _HEADER: Final = struct.Struct("<BHB")
 
-INTEGER_TYPES: Final = {
-    datatypes.INTEGER8: IntegerType.INT8,
-    datatypes.INTEGER16: IntegerType.INT16,
-    datatypes.INTEGER24: IntegerType.INT24,
-    datatypes.INTEGER32: IntegerType.INT32,
-    datatypes.INTEGER64: IntegerType.INT64,
-    datatypes.UNSIGNED8: IntegerType.UINT8,
-    datatypes.UNSIGNED16: IntegerType.UINT16,
-    datatypes.UNSIGNED24: IntegerType.UINT24,
-    datatypes.UNSIGNED32: IntegerType.UINT32,
-    datatypes.UNSIGNED64: IntegerType.UINT64,
-}
-"""By the number that the EDS has for them (CiA 301, table 44)."""
-_TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}
-
 _ADVICE: Final = {
     0x0601_0000: "the drive does not support this access",
     0x0601_0002: "the object is read-only on this drive",
@@ -65,31 +48,8 @@ _ADVICE: Final = {
     0x0609_0031: "the drive refuses the value as too high: lower it in the axis file",
     0x0609_0032: "the drive refuses the value as too low: raise it in the axis file",
     0x0800_0021: "another controller holds the drive (local or fieldbus): release it there",
-    0x0800_0022: "the drive refuses in its present state: disable it or reset its fault first",
+    0x0800_0022: f"the drive refuses in its present state: disable it, or reset its fault: {RESET}",
 }
-
-
-def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
-    """The object dictionary of an EDS file; `InputError` when it cannot be read."""
-    try:
-        if b"[DeviceInfo]" not in Path(path).read_bytes():  # canopen takes an empty file for a dictionary
-            raise ValueError("it has no section [DeviceInfo]")
-        return canopen.import_od(str(path), node_id)
-    except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"{path}: cannot be read as an EDS: {reason}; give drive.eds the drive's own EDS file"
-        ) from error
-
-
-def shared_eds(path: Path, node_id: int) -> ObjectDictionary:
-    """As `load_eds`, parsed once, which takes longer than to boot a simulated drive: not to be changed."""
-    return _read_as_of(path.stat().st_mtime_ns if path.exists() else 0, path, node_id)
-
-
-@lru_cache(maxsize=8)
-def _read_as_of(_: int, path: Path, node_id: int) -> ObjectDictionary:
-    return load_eds(path, node_id)
 
 
 class SdoAbortError(SdoError):
@@ -205,25 +165,18 @@ class SdoClient:
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Whether the EDS lists the object."""
-        return self._variable(index, sub) is not None
-
-    def _variable(self, index: int, sub: int) -> ODVariable | None:
-        # Not od.get_variable: it makes up any member of an array from the first one.
-        entry = self.od.get(index)
-        if isinstance(entry, ODVariable):
-            return entry if sub == 0 else None
-        return entry.subindices.get(sub) if entry is not None else None
+        return find(self.od, index, sub) is not None
 
     def type_of(self, index: int, sub: int) -> IntegerType:
         """Integer type of an object by the EDS, else by the profile; `SdoError` when neither has it."""
-        variable = self._variable(index, sub)
+        variable = find(self.od, index, sub)
         if variable is not None:
-            data_type = variable.data_type
-            if data_type not in _TYPES:
+            kind = integer_type(variable)
+            if kind is None:
                 raise SdoError(
-                    f"{self.describe(index, sub)}: is not an integer by the EDS (type {data_type}h)"
+                    f"{self.describe(index, sub)}: is not an integer by the EDS (type {variable.data_type}h)"
                 )
-            return _TYPES[data_type]
+            return kind
         known = STANDARD.get((index, sub))
         if known is None:
             raise SdoError(
@@ -234,7 +187,7 @@ class SdoClient:
     def describe(self, index: int, sub: int) -> str:
         """``node 1, object 607Ah:00 'Target position'``, the name by the EDS or the profile."""
         name = ""
-        variable = self._variable(index, sub)
+        variable = find(self.od, index, sub)
         if variable is not None:
             name = variable.qualname
         elif (index, sub) in STANDARD:

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from enum import Enum
 from typing import Final, NamedTuple
 
-from hdbridge.errors import TransitionError
+from hdbridge.errors import RESET, TransitionError
 
 
 class State(Enum):
@@ -184,8 +184,8 @@ def controlword_for(state: State, target: State) -> int:
     row = _FIRST_ROWS[state, target]
     if row is None:
         hint = {
-            State.FAULT: "reset the fault first",
-            State.FAULT_REACTION_ACTIVE: "wait for the drive's fault reaction, then reset the fault",
+            State.FAULT: f"reset the fault first: {RESET}",
+            State.FAULT_REACTION_ACTIVE: f"wait for its fault reaction, then reset the fault: {RESET}",
             State.UNKNOWN: "no valid statusword has arrived; check that the drive sends it",
         }.get(state, "no command leads there")
         raise TransitionError(f"cannot go from '{state.value}' to '{target.value}': {hint}")

@@ -14,7 +14,7 @@ from enum import Enum, IntEnum
 from itertools import islice
 from typing import Final, NamedTuple
 
-from hdbridge.errors import SafetyStop
+from hdbridge.errors import RESET, SafetyStop
 
 
 class Reaction(IntEnum):
@@ -81,7 +81,13 @@ TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.FLOOD, _FREEZE, 2, _STOP, "look for a node that babbles"),
     Row(Fault.EMERGENCY, _GO, 1, _GO, "look the code up in the drive's manual"),
     Row(Fault.MASTER_LOST, _STOP, 1, _STOP, "check the bus load, and 'hdbridge latency' for this machine"),
-    Row(Fault.DRIVE_FAULT, _STOP, 1, _STOP, "read its error code (603Fh), remove the cause, reset the fault"),
+    Row(
+        Fault.DRIVE_FAULT,
+        _STOP,
+        1,
+        _STOP,
+        f"read its error code (603Fh), remove the cause, then reset the fault: {RESET}",
+    ),
     Row(Fault.DROPPED_OUT, _STOP, 1, _STOP, "check the enable input, the supply and the limit switches"),
     Row(Fault.BOOT_UP, _LATCH, 1, _LATCH, "check its supply, then boot and verify the drive again"),
     Row(Fault.NMT_CHANGE, _LATCH, 1, _LATCH, "read the drive's error history (1003h), then boot it again"),
@@ -103,7 +109,8 @@ EMERGENCIES_TOLD: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
 """What a drive does by itself, and for reasons that it knows best."""
 _EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
-_AS_IT_SAYS: Final = "remove that cause, then reset the fault, or boot the drive again"
+EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
+"""What to do about a stop that an emergency message of the drive explains."""
 
 
 class Event(NamedTuple):
@@ -208,9 +215,9 @@ class Supervision:
         then = "" if gravest.fault is stop.fault else f"; then {gravest.fault.value}"
         said = self._emergencies(stop.cycle - 1)
         told = f"; the drive sent {', '.join(said)}" if said else ""
-        hint = _AS_IT_SAYS if said and stop.fault in _BY_THE_DRIVE else row.hint
+        hint = EXPLAINED_HINT if said and stop.fault in _BY_THE_DRIVE else row.hint
         return SafetyStop(
-            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched; {hint}"
+            f"cycle {stop.cycle}: {stop.fault.value}{again}{detail}{then}{told}: {done}, latched", hint
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:

@@ -40,11 +40,11 @@ class Traffic:
     def __init__(self, image: ProcessImage, monitor: NetworkMonitor, now_s: float) -> None:
         self._monitor = monitor
         self._node_id = image.node_id
-        self._nodes = {can_id & _NODE_MASK for can_id in image.tpdo_ids}
+        self._nodes = {layout.node_id for layout in image.tpdos}
         for node_id in self._nodes:
             monitor.watch(node_id)
         self._own = {
-            image.rpdo_id: "the RPDO",
+            **dict.fromkeys((layout.can_id for layout in image.rpdos), "the RPDO"),
             COB_SDO_REQUEST + image.node_id: "an SDO request",
         }
         self.identifiers: frozenset[int] = frozenset(

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from canopen.objectdictionary import datatypes
 
+from hdbridge.drive.dictionary import INTEGER_TYPES, is_readable, is_writable
 from hdbridge.drive.objects import STANDARD, IntegerType
-from hdbridge.drive.sdo import INTEGER_TYPES
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 
@@ -144,15 +144,15 @@ def find_object(text: str, od: ObjectDictionary) -> Object:
 
 
 def _of(variable: ODVariable) -> Object:
-    access, data_type = str(variable.access_type), variable.data_type or 0
+    data_type = variable.data_type or 0
     return Object(
         variable.index,
         variable.subindex,
         _name(variable),
         data_type,
         INTEGER_TYPES.get(data_type),
-        readable=access != "wo",
-        writable=access not in {"ro", "const"},
+        readable=is_readable(variable),
+        writable=is_writable(variable),
         lowest=variable.min,
         highest=variable.max,
     )

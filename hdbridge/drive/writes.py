@@ -1,7 +1,8 @@
 """What the boot-up writes into the drive, as a list that a person can read before it happens. Pure.
 
 Every row says which object gets which value, why, and which field of the axis file it comes from. The
-boot-up writes the rows in order and reads each one back.
+boot-up reads each object first, writes those that hold another value, in this order, and reads them back.
+`hdbridge.drive.bootplan` leaves objects that are optional in CiA 402 to a drive that lacks them.
 """
 
 from __future__ import annotations
@@ -9,22 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.drive import objects
-from hdbridge.drive.channels import channel_complaints
-from hdbridge.drive.image import (
-    Layout,
-    channel_layouts,
-    position_limits_counts,
-    rpdo_layout,
-    tpdo_layouts,
-)
+from hdbridge.drive.dictionary import find, held, integer_type, is_writable
+from hdbridge.drive.image import position_limits_counts
+from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
+    from canopen.objectdictionary import ObjectDictionary, ODVariable
 
     from hdbridge.axis import AxisConfig
 
@@ -32,24 +29,16 @@ SYNCHRONOUS: Final = 1
 """Transmission type: sent, or put into force, at every SYNC."""
 RPDO_TIMEOUT_CYCLES: Final = 4
 """The drive gives up on the master after this many cycles without a set-point (and not before 10 ms)."""
-_PDOS_PER_KIND: Final = 512
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
 _EVERYTHING: Final = -1
-_REQUIRED: Final = frozenset((each.index, each.sub) for each in objects.REQUIRED)
-_NAMED: Final = 4
-"""Objects that are named of those that are lacking."""
-
-# Option codes that no field of the axis file chooses: braked rather than coasting wherever CiA 402 offers it.
-SHUTDOWN_DISABLES: Final = 0
-DISABLE_SLOWS_DOWN: Final = 1
-FAULT_QUICK_STOPS: Final = 2
-LOST_MASTER_QUICK_STOPS: Final = 3
-ERROR_LEAVES_OPERATIONAL: Final = 0
+_EXPONENTS: Final = (-3, -4, -2, -5, -6, -1, 0)
+_USUAL_EXPONENT: Final = -3
+_LARGEST_MANTISSA: Final = 255
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedWrite:
-    """One object to be written and read back."""
+    """The value that one object is to hold."""
 
     node_id: int
     index: int
@@ -64,71 +53,44 @@ class PlannedWrite:
     """Bits that must read back as written."""
     kept: int = 0
     """Bits that stay as the drive has them."""
+    without: str = ""
+    """What follows if the drive keeps a value of its own; empty if hdbridge cannot do without this one."""
+    exact: bool = False
+    """A drive that has the object has to hold this value."""
+    pdo: int = 0
+    """Communication parameter of the PDO that the row configures; such rows stand together."""
+    passing: bool = False
+    """The object holds the value only while its PDO is changed."""
 
     def __str__(self) -> str:
         """``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
         source = f" [{self.field}]" if self.field else ""
         return f"{self.index:04X}h:{self.sub:02X} = {self.value} ({self.value:X}h): {self.why}{source}"
 
+    def holds(self, found: int) -> bool:
+        """Whether an object that holds ``found`` needs no write."""
+        return found & self.compared == self.value & self.compared
 
-def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWrite]:
-    """All writes of a boot-up in order, for the drive and a load encoder that is a node of its own.
 
-    With the drive's object dictionary ``od``, objects that a drive need not have are left out where it has
-    none (`left_out`), and its other PDOs are disabled. Raises `InputError` where a value of the axis file
-    cannot be expressed in its object, or the dictionary lacks what the control cycle or the axis file needs.
+def rows(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> list[PlannedWrite]:
+    """All writes in order, whether or not the drive has the objects.
+
+    Those of the PDOs and of the cycle are what the drive can have by ``od``. Raises `InputError` if a value
+    of the axis file cannot be expressed in its object.
     """
-    rows = _rows(axis, od)
-    if od is not None:
-        _check_dictionary(axis, od, rows)
-    return [row for row, optional in rows if not (optional and _lacks(axis, od, row))]
-
-
-def left_out(axis: AxisConfig, od: ObjectDictionary) -> list[PlannedWrite]:
-    """The writes that `plan` leaves out because the dictionary lacks their objects."""
-    return [row for row, optional in _rows(axis, od) if optional and _lacks(axis, od, row)]
-
-
-def _rows(axis: AxisConfig, od: ObjectDictionary | None) -> list[_Row]:
-    return [*_heartbeats(axis), *_pdos(axis, od), *_cycle(axis), *_options(axis), *_limits(axis)]
-
-
-def _lacks(axis: AxisConfig, od: ObjectDictionary | None, row: PlannedWrite) -> bool:
-    return od is not None and row.node_id == axis.drive.node_id and not _has(od, row.index, row.sub)
-
-
-def _check_dictionary(axis: AxisConfig, od: ObjectDictionary, rows: list[_Row]) -> None:
-    """`InputError` where the dictionary lacks an object that there is no doing without."""
-    lacking = [str(each) for each in objects.REQUIRED if not _has(od, each.index, each.sub)]
-    lacking += [
-        f"{row.index:04X}h:{row.sub:02X}"
-        for row, optional in rows
-        if not optional and (row.index, row.sub) not in _REQUIRED and _lacks(axis, od, row)
-    ]
-    if lacking:
-        lacking = list(dict.fromkeys(lacking))
-        more = f" and {len(lacking) - _NAMED} more" if len(lacking) > _NAMED else ""
-        raise InputError(
-            f"{axis.where('drive.eds')}: {axis.drive.eds} lacks {', '.join(lacking[:_NAMED])}{more}, which "
-            "hdbridge cannot do without; expected the EDS file of this drive, with all of its objects"
-        )
-    if complaints := channel_complaints(axis, od):
-        raise InputError(complaints[0])
-
-
-def _has(od: ObjectDictionary, index: int, sub: int) -> bool:
-    entry = od.get(index)
-    members = getattr(entry, "subindices", None)
-    return entry is not None and (sub in members if members is not None else sub == 0)
-
-
-_Row = tuple[PlannedWrite, bool]
-"""A write, and whether a drive may lack the object."""
+    return [*_heartbeats(axis), *_pdos(axis, od, pdos), *_cycle(axis, od), *_options(axis), *_limits(axis)]
 
 
 def _row(
-    axis: AxisConfig, address: Address, value: int, why: str, field: str = "", *, optional: bool = False
-) -> _Row:
+    axis: AxisConfig,
+    address: Address,
+    value: int,
+    why: str,
+    field: str = "",
+    *,
+    without: str = "",
+    exact: bool = False,
+) -> PlannedWrite:
     kind = address.type
     if not kind.minimum <= value <= kind.maximum:
         raise InputError(
@@ -136,7 +98,9 @@ def _row(
             f"{kind.maximum}]; "
             "choose a value that the object can hold"
         )
-    return PlannedWrite(axis.drive.node_id, address.index, address.sub, value, why, field), optional
+    return PlannedWrite(
+        axis.drive.node_id, address.index, address.sub, value, why, field, without=without, exact=exact
+    )
 
 
 def master_heartbeat(axis: AxisConfig) -> int:
@@ -154,57 +118,60 @@ def drives_patience_s(axis: AxisConfig) -> float:
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
 
-def _heartbeats(axis: AxisConfig) -> Iterator[_Row]:
-    ms = axis.drive.heartbeat_ms
-    field = "drive.heartbeat_ms"
-    yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, "the drive sends its heartbeat every so many ms", field)
-    yield _row(
-        axis,
-        objects.HEARTBEAT_CONSUMER,
-        master_heartbeat(axis),
-        f"the drive stops by itself when node {axis.drive.master_node_id}, the master, is silent for {ms} ms",
-        field,
-        optional=True,
-    )
-    yield _row(
-        axis,
-        objects.ERROR_BEHAVIOUR,
-        ERROR_LEAVES_OPERATIONAL,
-        "a lost master also takes the drive out of OPERATIONAL, so that nobody goes on unnoticed",
-        optional=True,
-    )
+_WATCHDOGS: Final = frozenset({(0x1016, 1), (0x1400, 5)})
+"""The heartbeat consumer, and the event timer of the set-points."""
+
+
+def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
+    ms, master, field = axis.drive.heartbeat_ms, axis.drive.master_node_id, "drive.heartbeat_ms"
+    why = "the drive sends its heartbeat every so many ms"
+    without = "only missing TPDOs show that the drive is gone"
+    yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, why, field, without=without, exact=True)
+    why = f"the drive stops by itself when node {master}, the master, is silent for {ms} ms"
+    without = "only its event timer (1400h:05) stops the axis when the master dies"
+    yield _row(axis, objects.HEARTBEAT_CONSUMER, master_heartbeat(axis), why, field, without=without)
+    key, why = "communication_error_option", "its NMT state when the master is lost"
+    yield _row(axis, objects.ERROR_BEHAVIOUR, getattr(axis.drive, key), why, f"drive.{key}", without=why)
     source = axis.load_encoder.source
     if source.node is not None:
         address = objects.HEARTBEAT_PRODUCER
         why = "the load encoder sends its heartbeat every so many ms"
-        yield PlannedWrite(source.node, address.index, address.sub, ms, why, field, address.type), True
+        yield PlannedWrite(source.node, address.index, address.sub, ms, why, field, address.type)
 
 
-def _pdos(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[_Row]:
+def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Iterator[PlannedWrite]:
     used = set()
-    for layout in (*tpdo_layouts(axis), *channel_layouts(axis)):
+    for layout in (*pdos.cyclic, *pdos.channels):
         used.add((layout.node_id, objects.TPDO_COMMUNICATION + layout.number - 1))
         yield from _pdo(layout, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING, _carried(axis, layout))
-    layout = rpdo_layout(axis)
-    used.add((layout.node_id, objects.RPDO_COMMUNICATION))
     timeout_ms = set_point_timeout_ms(axis)
-    timer = PlannedWrite(
-        layout.node_id,
-        objects.RPDO_COMMUNICATION,
-        5,
-        timeout_ms,
-        f"the drive stops by itself when no set-point comes for {timeout_ms} ms",
-        "drive.cycle_ms",
-        IntegerType.UINT16,
-    )
-    *others, last = _pdo(layout, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING, ["", ""])
-    yield from others
-    yield timer, True
-    yield last
-    for base, kind in ((objects.TPDO_COMMUNICATION, "TPDO"), (objects.RPDO_COMMUNICATION, "RPDO")):
-        for index in range(base, base + _PDOS_PER_KIND):
-            if od is not None and _has(od, index, 1) and (axis.drive.node_id, index) not in used:
-                yield _invalidate(axis.drive.node_id, index, f"{kind}{index - base + 1} is not used"), False
+    for layout in pdos.rpdos:
+        communication = objects.RPDO_COMMUNICATION + layout.number - 1
+        used.add((layout.node_id, communication))
+        timer = PlannedWrite(
+            layout.node_id,
+            communication,
+            5,
+            timeout_ms,
+            f"the drive stops by itself when no set-point comes for {timeout_ms} ms",
+            "drive.cycle_ms",
+            IntegerType.UINT16,
+            without="only its heartbeat consumer (1016h) stops the axis when the master dies",
+            pdo=communication,
+        )
+        nothing = [""] * len(layout.codec.entries)
+        *others, last = _pdo(layout, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING, nothing)
+        yield from others
+        yield timer
+        yield last
+    for base, kind, without in (
+        (objects.TPDO_COMMUNICATION, "TPDO", "it goes on sending"),
+        (objects.RPDO_COMMUNICATION, "RPDO", "it stays, and nobody sends it"),
+    ):
+        for index in range(base, base + PDOS_PER_KIND):
+            if od is not None and find(od, index, 1) and (axis.drive.node_id, index) not in used:
+                why = f"{kind}{index - base + 1} is not used"
+                yield _invalid(axis.drive.node_id, index, why, without=without)
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
@@ -216,7 +183,9 @@ def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
     return [keys.get((entry.index, entry.sub), "") for entry in layout.codec.entries]
 
 
-def _invalidate(node_id: int, index: int, why: str, field: str = "") -> PlannedWrite:
+def _invalid(
+    node_id: int, index: int, why: str, field: str = "", *, without: str = "", pdo: int = 0
+) -> PlannedWrite:
     return PlannedWrite(
         node_id,
         index,
@@ -227,130 +196,171 @@ def _invalidate(node_id: int, index: int, why: str, field: str = "") -> PlannedW
         type=IntegerType.UINT32,
         compared=PDO_INVALID,
         kept=PDO_INVALID - 1,
+        without=without,
+        pdo=pdo,
+        passing=bool(pdo),
     )
 
 
-def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[_Row]:
+def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[PlannedWrite]:
     """The order that CiA 301 prescribes: invalid, empty, entries, count, valid.
 
     ``fields`` are the keys of the axis file that chose the entries, empty where none did.
     """
-    node_id, number, can_id, codec, every = layout
+    node_id, number, can_id, codec, every, _ = layout
     field = next(filter(None, fields), "")
-    of_channel = communication == objects.TPDO_COMMUNICATION and number > 2
-    often = f"{field.split('.')[0]}.every_cycles" if of_channel else ""
+    of_channel = communication == objects.TPDO_COMMUNICATION and every != SYNCHRONOUS
+    often = f"{field.split('.')[0]}.every_cycles" if of_channel and field else ""
+    kind = "TPDO" if communication >= objects.TPDO_COMMUNICATION else "RPDO"
+    name = f"{kind}{number}"
     communication += number - 1
     mapping += number - 1
-    name = f"{'TPDO' if communication >= objects.TPDO_COMMUNICATION else 'RPDO'}{number}"
+
+    def row(
+        index: int, sub: int, value: int, why: str, key: str, type_: IntegerType, **more: int
+    ) -> PlannedWrite:
+        compared, kept = more.get("compared", _EVERYTHING), more.get("kept", 0)
+        passing = bool(more.get("passing"))
+        return PlannedWrite(
+            node_id, index, sub, value, why, key, type_, compared, kept, pdo=communication, passing=passing
+        )
+
     byte, word = IntegerType.UINT8, IntegerType.UINT32
     count = len(codec.entries)
-    yield _invalidate(node_id, communication, f"{name} is off while it is changed", field), False
-    yield PlannedWrite(node_id, mapping, 0, 0, f"{name} maps nothing while it is changed", type=byte), False
+    yield _invalid(node_id, communication, f"{name} is off while it is changed", field, pdo=communication)
+    yield row(mapping, 0, 0, f"{name} maps nothing while it is changed", "", byte, passing=1)
     for place, (entry, chosen) in enumerate(zip(codec.entries, fields, strict=True), start=1):
-        yield (
-            PlannedWrite(node_id, mapping, place, entry.mapping, f"{name} carries {entry}", chosen, word),
-            False,
-        )
-    yield PlannedWrite(node_id, mapping, 0, count, f"{name} maps {count} objects", field, byte), False
+        yield row(mapping, place, entry.mapping, f"{name} carries {entry}", chosen, word)
+    yield row(mapping, 0, count, f"{name} maps {count} objects", field, byte)
     when = "every SYNC" if every == SYNCHRONOUS else f"every SYNC in {every}"
-    yield PlannedWrite(node_id, communication, 2, every, f"{name} goes with {when}", often, byte), False
-    yield (
-        PlannedWrite(
-            node_id,
-            communication,
-            1,
-            can_id,
-            f"{name} is {can_id:03X}h on the bus",
-            "drive.node_id" if not field else "",
-            word,
-            compared=_COB_COMPARED,
-            # Bit 30 says that the PDO cannot be asked for by RTR; some drives insist on it.
-            kept=0x4000_0000,
-        ),
-        False,
+    yield row(communication, 2, every, f"{name} goes with {when}", often, byte)
+    yield row(
+        communication,
+        1,
+        can_id,
+        f"{name} is {can_id:03X}h on the bus",
+        "drive.node_id" if not field else "",
+        word,
+        compared=_COB_COMPARED,
+        # Bit 30 says that the PDO cannot be asked for by RTR; some drives insist on it.
+        kept=0x4000_0000,
     )
 
 
-def _cycle(axis: AxisConfig) -> Iterator[_Row]:
-    mantissa, exponent = axis.drive.interpolation_period
+def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWrite]:
+    mantissa, exponent = _period(axis, od)
     why = f"the cycle is {axis.drive.cycle_ms:g} ms = {mantissa}e{exponent} s"
-    yield _row(axis, objects.CYCLE_MANTISSA, mantissa, why, "drive.cycle_ms")
-    yield _row(axis, objects.CYCLE_EXPONENT, exponent, why, "drive.cycle_ms")
+    without = f"the drive has to take its period, {axis.drive.cycle_ms:g} ms, from SYNC or its own settings"
+    for address, value in ((objects.CYCLE_MANTISSA, mantissa), (objects.CYCLE_EXPONENT, exponent)):
+        yield _row(axis, address, value, why, "drive.cycle_ms", without=without, exact=True)
+    if axis.drive.mode == "ip":
+        yield _row(
+            axis, objects.INTERPOLATION_SUBMODE, 0, "linear interpolation", without="how it interpolates"
+        )
 
 
-def _options(axis: AxisConfig) -> Iterator[_Row]:
-    drive = axis.drive
-    yield _row(
-        axis,
-        objects.QUICK_STOP_OPTION,
-        drive.quick_stop_option,
-        "what a quick stop does",
-        "drive.quick_stop_option",
+def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
+    """Mantissa and exponent of the cycle as the drive takes them: some have a fixed exponent or period."""
+    seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
+    pairs = [(seconds.scaleb(-exponent), exponent) for exponent in _EXPONENTS]
+    whole = [(int(m), e) for m, e in pairs if m == int(m) and 1 <= m <= _LARGEST_MANTISSA]
+    if od is None:
+        return whole[0]
+    mantissa = find(od, objects.CYCLE_MANTISSA.index, objects.CYCLE_MANTISSA.sub)
+    exponent = find(od, objects.CYCLE_EXPONENT.index, objects.CYCLE_EXPONENT.sub)
+    if mantissa is None:
+        return whole[0]
+    for m, e in whole:
+        taken = e == _USUAL_EXPONENT if exponent is None else _takes(exponent, e)
+        if taken and _takes(mantissa, m):
+            return m, e
+    fixed = [each for each in (mantissa, exponent) if each is not None and not is_writable(each)]
+    said = " and ".join(f"60C2h:{each.subindex:02X} is read-only ({held(each)})" for each in fixed)
+    raise InputError(
+        f"{axis.where('drive.cycle_ms')}: {axis.drive.eds} does not permit {axis.drive.cycle_ms:g} ms in "
+        f"object 60C2h: {said or 'it is out of its limits'}; expected a cycle that the drive can have"
     )
-    yield _row(axis, objects.HALT_OPTION, drive.halt_option, "how a halt brakes", "drive.halt_option")
-    for address, value, why in (
-        (objects.SHUTDOWN_OPTION, SHUTDOWN_DISABLES, "'shutdown' switches the power stage off"),
-        (objects.DISABLE_OPTION, DISABLE_SLOWS_DOWN, "'disable operation' brakes before it disables"),
-        (objects.FAULT_REACTION_OPTION, FAULT_QUICK_STOPS, "a fault brakes with the quick-stop ramp"),
-        (objects.ABORT_CONNECTION_OPTION, LOST_MASTER_QUICK_STOPS, "a lost master means a quick stop"),
+
+
+def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
+    """Least and greatest value of an object by its type and its limits in the EDS."""
+    low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
+    high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
+    return low, high
+
+
+def _takes(variable: ODVariable, value: int) -> bool:
+    if not is_writable(variable):
+        return held(variable) in (None, value)
+    kind = integer_type(variable)
+    if kind is None:
+        return False
+    low, high = permitted(variable, kind)
+    return low <= value <= high
+
+
+def _options(axis: AxisConfig) -> Iterator[PlannedWrite]:
+    drive = axis.drive
+    for address, key, what in (
+        (objects.QUICK_STOP_OPTION, "quick_stop_option", "what a quick stop does"),
+        (objects.HALT_OPTION, "halt_option", "how a halt brakes"),
+        (objects.SHUTDOWN_OPTION, "shutdown_option", "what 'shutdown' does under power"),
+        (objects.DISABLE_OPTION, "disable_option", "how 'disable operation' brakes"),
+        (objects.FAULT_REACTION_OPTION, "fault_reaction_option", "how a fault brakes"),
+        (
+            objects.ABORT_CONNECTION_OPTION,
+            "abort_connection_option",
+            "what it does when its master is lost; `hdbridge doctor` checks it",
+        ),
     ):
-        yield _row(axis, address, value, why, optional=True)
+        value: int = getattr(drive, key)
+        yield _row(axis, address, value, what, f"drive.{key}", without=what)
 
 
-def _limits(axis: AxisConfig) -> Iterator[_Row]:
+def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
     limits, drive = axis.limits, axis.drive
     least, greatest = position_limits_counts(axis)
     margin = f"at the load, x ratio, wider by the compensation's {axis.compensation.maximum_arcsec:g} arcsec"
     # A reversed encoder makes the axis's lower end the drive's upper one; the counts are in order already.
     ends = ["limits.position_min_deg", "limits.position_max_deg"][:: axis.motor_encoder.direction]
-    yield _row(axis, objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0])
-    yield _row(axis, objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1])
-    rpm = math.ceil(limits.velocity_deg_s * axis.gear.ratio / 6.0)
-    yield _row(
-        axis,
-        objects.MAX_MOTOR_SPEED,
-        rpm,
-        "speed limit in rpm of the motor",
-        "limits.velocity_deg_s",
-        optional=True,
-    )
-    yield _row(
-        axis,
-        objects.QUICK_STOP_DECELERATION,
-        motor_rate(axis, limits.acceleration_deg_s2),
-        "ramp of a quick stop, motor counts/s2",
-        "limits.acceleration_deg_s2",
-        optional=True,
-    )
-    yield _row(
-        axis,
-        objects.MAX_TORQUE,
-        round(limits.torque_percent * 10.0),
-        "torque limit in per mille of the rated torque",
-        "limits.torque_percent",
-        optional=True,
-    )
     window = round(abs(axis.motor_encoder.counts(drive.following_error_deg)))
     if window == 0:
         raise InputError(
             f"{axis.where('drive.following_error_deg')} {drive.following_error_deg:g} is less than half a "
-            "motor count, "
-            "and 0 in object 6065h means no supervision; raise it"
+            "motor count, and 0 in object 6065h means no supervision; raise it"
         )
+    alone = "only hdbridge keeps to it"
+    rpm = math.ceil(limits.velocity_deg_s * axis.gear.ratio / 6.0)
+    ramp = motor_rate(axis, limits.acceleration_deg_s2)
+    late = "time after which a following error counts"
     yield _row(
-        axis,
-        objects.FOLLOWING_WINDOW,
-        window,
-        "following error window, motor counts",
-        "drive.following_error_deg",
-    )
+        axis, objects.LIMIT_MIN, least, f"lower end in motor counts ({margin})", ends[0],
+        without=f"lower end of travel; {alone}",
+    )  # fmt: skip
     yield _row(
-        axis,
-        objects.FOLLOWING_TIME,
-        drive.following_error_time_ms,
-        "time after which a following error counts, ms",
-        "drive.following_error_time_ms",
-    )
+        axis, objects.LIMIT_MAX, greatest, f"upper end in motor counts ({margin})", ends[1],
+        without=f"upper end of travel; {alone}",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.MAX_MOTOR_SPEED, rpm, "speed limit in rpm of the motor", "limits.velocity_deg_s",
+        without=f"speed limit; {alone}",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.QUICK_STOP_DECELERATION, ramp, "ramp of a quick stop, motor counts/s2",
+        "limits.acceleration_deg_s2", without="ramp of a quick stop",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.MAX_TORQUE, round(limits.torque_percent * 10.0),
+        "torque limit in per mille of the rated torque", "limits.torque_percent", without="torque limit",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.FOLLOWING_WINDOW, window, "following error window, motor counts",
+        "drive.following_error_deg", without="following error window; hdbridge watches by its own",
+    )  # fmt: skip
+    yield _row(
+        axis, objects.FOLLOWING_TIME, drive.following_error_time_ms, f"{late}, ms",
+        "drive.following_error_time_ms", without=late,
+    )  # fmt: skip
 
 
 def motor_rate(axis: AxisConfig, load_deg: float) -> int:

@@ -81,13 +81,13 @@ def content_of(document: Document) -> Content:
     return Content(file.ratio, tuple(effects), uncertainty, document.data.get("provenance") or {})
 
 
-def text_of(
+def document_of(
     ratio: float,
     effects: Sequence[Effect],
     uncertainty: Mapping[str, Mapping[str, Any]],
     provenance: Mapping[str, Any],
-) -> str:
-    """A model file's text; what it says reads back exactly."""
+) -> dict[str, Any]:
+    """The content of a model file as plain data."""
     entries = [
         {"effect": each.name, "parameters": each.parameters()}
         | ({"uncertainty": dict(uncertainty[each.name])} if uncertainty.get(each.name) else {})
@@ -95,8 +95,30 @@ def text_of(
     ]
     data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": ratio, "effects": entries}
     if provenance:
-        data["provenance"] = _hexadecimal(provenance)
+        data["provenance"] = dict(provenance)
+    return data
+
+
+def text_of(document: Mapping[str, Any]) -> str:
+    """The text of a model file; it reads back exactly."""
+    data = dict(document)
+    if "provenance" in data:
+        data["provenance"] = _hexadecimal(data["provenance"])
     return _HEADER + dump_yaml(data)
+
+
+def content_of_document(data: Mapping[str, Any]) -> Content:
+    """Reads `document_of`, which this program has made: fast enough for the control loop.
+
+    KeyError or ValueError for anything else.
+    """
+    entries = data["effects"]
+    return Content(
+        float(data["ratio"]),
+        tuple(CATALOGUE[each["effect"]].model_validate(each["parameters"]) for each in entries),
+        {each["effect"]: each["uncertainty"] for each in entries if "uncertainty" in each},
+        data.get("provenance", {}),
+    )
 
 
 def _effect(document: Document, number: int, entry: EffectEntry, before: list[str]) -> Effect:

@@ -120,7 +120,10 @@ class Store(Generic[K]):
     load: Callable[[Path], K]
 
     def log(self, profile: Path) -> list[Version[K]]:
-        """Every version: the pending one, an active one that is not in the history, newest first."""
+        """Every version: the pending one, an active one that is not in the history, newest first.
+
+        Another process, such as the daemon, may commit the pending one meanwhile.
+        """
         activations = self._activations(profile)
         active = _bytes(profile / self.active)
         versions = []
@@ -132,8 +135,14 @@ class Store(Generic[K]):
             versions.append(self._version(number, path, is_active, own))
         if active is not None and not known:
             versions.insert(0, self._version(None, profile / self.active, True))
-        if (profile / self.pending).exists():
-            versions.insert(0, self._version(None, profile / self.pending, False))
+        pending = profile / self.pending
+        if pending.exists():
+            try:
+                versions.insert(0, self._version(None, pending, False))
+            except InputError:
+                if pending.exists():
+                    raise
+                return self.log(profile)  # it is in the history now, or was discarded
         return versions
 
     def find(self, profile: Path, name: str) -> Version[K]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -15,7 +15,7 @@ from hdbridge.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
 from hdbridge.model.binding import binding, check_binding
-from hdbridge.model.file import content_of, text_of
+from hdbridge.model.file import content_of, content_of_document, document_of, text_of
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,18 @@ class TransmissionModel:
         content = content_of(document)
         return cls(*content, path=document.path)
 
+    @classmethod
+    def from_document(cls, data: Mapping[str, Any], path: Path | None = None) -> Self:
+        """Reads `document`; KeyError or ValueError for anything else."""
+        return cls(*content_of_document(data), path=path)
+
+    def document(self) -> dict[str, Any]:
+        """The content of the model file as plain data, ready for JSON."""
+        return document_of(self.ratio, self.effects, self.uncertainty, self.provenance)
+
     def dump(self) -> str:
         """The model file's text; what it says reads back exactly."""
-        return text_of(self.ratio, self.effects, self.uncertainty, self.provenance)
+        return text_of(self.document())
 
     def save(self, path: Path | str) -> None:
         """Write the model file atomically."""

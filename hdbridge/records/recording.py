@@ -11,6 +11,7 @@ import hashlib
 import importlib.metadata
 import platform
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -108,11 +109,13 @@ class Recording:
         records = []
         for number, each in enumerate(about.files):
             file = path / each.name
-            if file.is_file() and sha256_of(file) != each.sha256:
-                raise document.error(
-                    ("files", number, "sha256"),
-                    f"{file} has changed since it was recorded; restore it, or read it alone as a CSV file",
-                )
+            with suppress(OSError):  # `Record.read_csv` reports it
+                if file.is_file() and sha256_of(file) != each.sha256:
+                    raise document.error(
+                        ("files", number, "sha256"),
+                        f"{file} has changed since it was recorded; restore it, or read it alone as a "
+                        "CSV file",
+                    )
             records.append(Record.read_csv(file, minimum_samples=0))
         return cls(
             records[0] if len(records) == 1 else concatenate(records),

@@ -23,12 +23,12 @@ import can
 from can.interfaces.virtual import VirtualBus, channels_lock
 
 from hdbridge.canframe import DataFrame
+from hdbridge.device.behaviour import Behaviour
+from hdbridge.device.motion import Machine as AnyMachine
+from hdbridge.device.nameplate import LOAD_OBJECT, Nameplate
+from hdbridge.device.node import DriveNode
 from hdbridge.errors import InputError
-from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.motion import Machine as AnyMachine
-from hdbridge.sim.nameplate import Nameplate
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 
 LONGEST_WAIT_S: Final = 3600.0
@@ -231,7 +231,7 @@ def lockstep_bench(
     nameplate: Nameplate | None = None,
     others: Sequence[Node] = (),
     behaviour: Behaviour | None = None,
-) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
+) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
     """A simulated drive that moves ``machine``, and the master's bus and clock to it.
 
     The drive has been switched on, and its boot-up message sent, before the master joins the bus.
@@ -242,7 +242,7 @@ def lockstep_bench(
     channel = channel or f"hdbridge-{uuid4()}"
     clock = VirtualClock()
     with _unsearched(), _PolledBus(channel) as node_bus:
-        node = SimulatedDrive(node_bus, machine, eds_path, node_id, clock, nameplate, behaviour)
+        node = DriveNode(node_bus, machine, eds_path, node_id, clock, nameplate, behaviour)
         node.poll(clock.now())
         clock.nodes += [node, *others]
         with LockstepBus(channel, clock) as bus:
@@ -257,13 +257,16 @@ def simulated_bench(
     node_id: int = 1,
     seed: int = 0,
     channel: str | None = None,
-) -> Iterator[tuple[LockstepBus, VirtualClock, SimulatedDrive]]:
-    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames."""
+    load_object: tuple[int, int] = LOAD_OBJECT,
+) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
+    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames.
+
+    ``load_object`` is the index and sub-index from which its load encoder is read.
+    """
     known = truth if isinstance(truth, Truth) else Truth.load(Path(truth))
     machine = Machine(known, seed, may_compile=True)
-    with lockstep_bench(
-        machine, eds_path, node_id, channel, nameplate_of(known), behaviour=known.firmware
-    ) as bench:
+    nameplate, behaviour = nameplate_of(known, load_object=load_object), known.firmware
+    with lockstep_bench(machine, eds_path, node_id, channel, nameplate, behaviour=behaviour) as bench:
         yield bench
 
 
@@ -276,12 +279,13 @@ class SimulatedAxis:
     eds_path: Path
     node_id: int
     seed: int = 0
+    load_object: tuple[int, int] = LOAD_OBJECT
 
 
 @contextmanager
 def simulated_benches(
     axes: Sequence[SimulatedAxis], channel: str | None = None, clock: VirtualClock | None = None
-) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[SimulatedDrive, ...]]]:
+) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[DriveNode, ...]]]:
     """Several simulated axes on one bus and one clock, and the master's bus to them; as `lockstep_bench`.
 
     The same axes give the same frames, whatever the others do: each has its own noise. ``clock`` is by
@@ -299,23 +303,23 @@ def simulated_benches(
         for serial, axis in enumerate(axes, start=1):
             known = axis.truth if isinstance(axis.truth, Truth) else Truth.load(Path(axis.truth))
             node_bus = stack.enter_context(_PolledBus(channel))
-            node = SimulatedDrive(
+            node = DriveNode(
                 node_bus,
                 Machine(known, axis.seed, may_compile=may_compile),
                 axis.eds_path,
                 axis.node_id,
                 clock,
-                nameplate_of(known, serial),
+                nameplate_of(known, serial, axis.load_object),
                 known.firmware,
             )
             node.poll(clock.now())
             clock.nodes.append(node)
         bus = stack.enter_context(LockstepBus(channel, clock))
         bus.private = private
-        yield bus, clock, tuple(node for node in clock.nodes if isinstance(node, SimulatedDrive))
+        yield bus, clock, tuple(node for node in clock.nodes if isinstance(node, DriveNode))
 
 
-def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
+def nameplate_of(truth: Truth, serial: int = 1, load_object: tuple[int, int] = LOAD_OBJECT) -> Nameplate:
     """What a drive that controls this axis says of itself."""
     # The drive knows the ratio that the gear was sold with, not by how little the real one is off.
     ratio = Fraction(truth.gear.ratio).limit_denominator(100)
@@ -326,4 +330,5 @@ def nameplate_of(truth: Truth, serial: int = 1) -> Nameplate:
         gear_motor_turns=ratio.numerator,
         gear_load_turns=ratio.denominator,
         rated_torque_mnm=round(1000.0 * truth.motor.rated_torque_nm),
+        load_object=load_object,
     )

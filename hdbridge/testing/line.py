@@ -16,10 +16,10 @@ import can
 
 from hdbridge.axis.config import BusConfig
 from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.device.run import run
 from hdbridge.drive.interfacelock import interface_lock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusInUseError, HdbridgeError, InputError
-from hdbridge.sim.run import run
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
 from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
 from hdbridge.testing.watched import WatchedDrive
@@ -66,7 +66,10 @@ class Line:
                 f"{axis.path}: another simulated drive on this bus is node {node_id}; expected a free one"
             )
         with self.opened() as bus:
-            node = WatchedDrive(bus, settings.truth, settings.seed, axis.eds_path, node_id, self.clock)
+            source = axis.load_encoder.source.address
+            node = WatchedDrive(
+                bus, settings.truth, settings.seed, axis.eds_path, node_id, self.clock, source
+            )
             self.nodes.append(node)
             try:
                 node.poll(self.clock.now())

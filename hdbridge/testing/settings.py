@@ -11,10 +11,10 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from hdbridge.axis import AxisConfig
+from hdbridge.device.behaviour import Behaviour
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.profile import Profile
-from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.truth import Truth
 
 VIRTUAL, LOCKSTEP = "virtual", "lockstep"

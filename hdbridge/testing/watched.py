@@ -12,10 +12,11 @@ import can
 
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
+from hdbridge.device.nameplate import LOAD_OBJECT
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.emergencies import error_name
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from hdbridge.testing.history import Event, Frame, History, TrueState
 
@@ -81,19 +82,26 @@ class _Plan:
         return load_deg >= self.beyond_deg if self.from_below else load_deg <= self.beyond_deg
 
 
-class WatchedDrive(SimulatedDrive):
+class WatchedDrive(DriveNode):
     """`hdbridge.sim`'s drive of a truth, with a `History`, and faults that begin and end in its own time.
 
     Any thread may call it.
     """
 
     def __init__(
-        self, bus: can.BusABC, truth: Truth, seed: int, eds_path: Path, node_id: int, clock: Clock
+        self,
+        bus: can.BusABC,
+        truth: Truth,
+        seed: int,
+        eds_path: Path,
+        node_id: int,
+        clock: Clock,
+        load_object: tuple[int, int] = LOAD_OBJECT,
     ) -> None:
         self.lock = threading.RLock()
         self.history = History()
         self.machine = Machine(truth, seed)
-        self.nameplate = nameplate_of(truth)
+        self.nameplate = nameplate_of(truth, load_object=load_object)
         self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
         self.last_tpdos: dict[int, bytes] = {}
         """The data last sent, by identifier."""
@@ -164,19 +172,19 @@ class WatchedDrive(SimulatedDrive):
     # ---------------------------------------------------------------- the drive, watched
 
     def next_event_s(self) -> float:
-        """See `hdbridge.sim.node.SimulatedDrive`; the moments of faults are events as well."""
+        """See `hdbridge.device.node.DriveNode`; the moments of faults are events as well."""
         event_s = super().next_event_s()
         return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """See `hdbridge.sim.node.SimulatedDrive`."""
+        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             self.history.frames.append(Frame(self.time_s, False, message))
             super().handle(message, now_s)
             self._look()
 
     def run_until(self, now_s: float) -> None:
-        """See `hdbridge.sim.node.SimulatedDrive`."""
+        """See `hdbridge.device.node.DriveNode`."""
         with self.lock:
             while due := next((each for each in self._plans if self._is_due(each, now_s)), None):
                 self._plans.remove(due)

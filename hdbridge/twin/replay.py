@@ -60,11 +60,13 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
         commands = commands_of(part, axis, truth)
         bench_axis = at_cycle(axis, commands.cycle_s)
         with (
-            simulated_bench(as_warm(truth, commands), axis.eds_path, axis.drive.node_id, seed) as (
-                bus,
-                clock,
-                _,
-            ),
+            simulated_bench(
+                as_warm(truth, commands),
+                axis.eds_path,
+                axis.drive.node_id,
+                seed,
+                load_object=axis.load_encoder.source.address,
+            ) as (bus, clock, _),
             Drive(bus, bench_axis, clock) as drive,
         ):
             drive.boot()

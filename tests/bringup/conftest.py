@@ -16,10 +16,10 @@ from hdbridge.bringup.checks import Row, Verdict, run_checks
 from hdbridge.bringup.context import BringUpContext
 from hdbridge.bringup.doctor import CHECKS
 from hdbridge.clock import Clock
+from hdbridge.device.node import DriveNode
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 
 ARTICLE = bundled_profile("article")
@@ -44,9 +44,9 @@ class Case:
     honest: bool = False
     """Whether the drive's own objects say what the plant really is, rather than what the axis file says."""
     node_id: int = 1
-    spoil: Callable[[SimulatedDrive], None] = lambda node: None
+    spoil: Callable[[DriveNode], None] = lambda node: None
     rows: dict[str, Row[BringUpContext]] = field(default_factory=dict)
-    node: SimulatedDrive | None = None
+    node: DriveNode | None = None
     motor_counts_seen: set[int] = field(default_factory=set)
 
     def prepare(self) -> AxisConfig:

@@ -10,8 +10,8 @@ import pytest
 
 from hdbridge.bringup.checks import Outcome, Verdict
 from hdbridge.bringup.doctor import CHECKS
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.states import State, decode
-from hdbridge.sim.node import SimulatedDrive
 
 PASS, FAIL, NOT_POSSIBLE = Outcome.PASS, Outcome.FAIL, Outcome.NOT_POSSIBLE
 
@@ -134,8 +134,8 @@ WRONG: list[tuple[str, dict[str, Any], str, str]] = [
 ]
 
 
-def _without(*keys: tuple[int, int]) -> Callable[[SimulatedDrive], None]:
-    def spoil(node: SimulatedDrive) -> None:
+def _without(*keys: tuple[int, int]) -> Callable[[DriveNode], None]:
+    def spoil(node: DriveNode) -> None:
         for key in keys:
             node.dictionary.remove(*key)
 
@@ -153,7 +153,7 @@ def test_what_is_wrong_is_named(
 
 
 def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:
-    def unplug(node: SimulatedDrive) -> None:
+    def unplug(node: DriveNode) -> None:
         node.dictionary[0x60E4, 1].bind(lambda: 17)
 
     verdicts = case(spoil=unplug).run(until="turn")
@@ -163,7 +163,7 @@ def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:
 
 
 def test_an_object_that_repeats_the_motor_encoder(case: Callable[..., Any]) -> None:
-    def repeat(node: SimulatedDrive) -> None:
+    def repeat(node: DriveNode) -> None:
         node.dictionary[0x60E4, 1].bind(lambda: node.firmware.motion.motor_counts)
 
     verdicts = case(spoil=repeat).run(until="turn")
@@ -193,7 +193,7 @@ def test_what_load_torque_and_temperature_tell(case: Callable[..., Any]) -> None
 
 
 def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None:
-    def unplug(node: SimulatedDrive) -> None:
+    def unplug(node: DriveNode) -> None:
         node.dictionary[0x2101, 0].bind(lambda: -(2**31))
 
     verdicts = case(axis=CHANNELS, spoil=unplug).run(until="hold")
@@ -228,7 +228,7 @@ def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
 
 
 def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None:
-    def deaf(node: SimulatedDrive) -> None:
+    def deaf(node: DriveNode) -> None:
         node.faults.ignore_lost_heartbeat = True
 
     examined = case(spoil=deaf)
@@ -243,14 +243,14 @@ def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None
 def test_a_drive_without_a_torque_limit(case: Callable[..., Any]) -> None:
     verdicts = case(eds={"[6072]": "[no object]"}).run(until="nudge")
     assert failures(verdicts) == []
-    assert "the EDS lacks, so what the drive has holds: 6072h:00 (torque limit" in verdicts["files"].measured
+    assert "left to the drive, see `hdbridge check`: 6072h:00" in verdicts["files"].measured
 
 
 HOLDING = {"quick_stop_option: 2": "quick_stop_option: 6"}
 
 
 def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) -> None:
-    def spoil(node: SimulatedDrive) -> None:
+    def spoil(node: DriveNode) -> None:
         node.faults.only_report_lost_heartbeat = True
 
     verdict = case(axis=HOLDING, spoil=spoil).run(until="heartbeat")["heartbeat"]
@@ -263,7 +263,7 @@ def test_a_drive_that_only_reports_a_lost_heartbeat(case: Callable[..., Any]) ->
 
 
 def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[..., Any]) -> None:
-    def spoil(node: SimulatedDrive) -> None:
+    def spoil(node: DriveNode) -> None:
         node.faults.stay_operational = True
 
     level = {"servo:": "firmware: {controlword: level}\nservo:"}
@@ -273,7 +273,7 @@ def test_a_drive_that_the_master_itself_takes_out_of_its_stop(case: Callable[...
 
 
 def test_a_drive_that_ignores_missing_set_points(case: Callable[..., Any]) -> None:
-    def deaf(node: SimulatedDrive) -> None:
+    def deaf(node: DriveNode) -> None:
         node.faults.ignore_missing_set_points = True
 
     verdicts = case(spoil=deaf).run()
@@ -283,7 +283,7 @@ def test_a_drive_that_ignores_missing_set_points(case: Callable[..., Any]) -> No
 
 
 def test_a_drive_that_hardly_brakes(case: Callable[..., Any]) -> None:
-    def coast(node: SimulatedDrive) -> None:
+    def coast(node: DriveNode) -> None:
         node.faults.deceleration_counts_s2 = 2_000.0
 
     verdicts = case(spoil=coast).run(until="quick_stop")

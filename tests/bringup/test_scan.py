@@ -12,13 +12,13 @@ import pytest
 from hdbridge.axis import AxisConfig
 from hdbridge.bringup.match import axis_lines, compare
 from hdbridge.bringup.scan import Node, Scan, scan_bus
+from hdbridge.device.node import DriveNode
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link
 from hdbridge.errors import BusInUseError
 from hdbridge.files.bundled import bundled_folder, bundled_profile
 from hdbridge.sim.lockstep import LockstepBus, lockstep_bench
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from tests.support.chatter import Chatter
 
@@ -56,9 +56,7 @@ class Encoder:
 
 
 @contextmanager
-def bench(
-    *chatter: tuple[int, bytes], encoder: int | None = None
-) -> Iterator[tuple[Link, SimulatedDrive, list]]:
+def bench(*chatter: tuple[int, bytes], encoder: int | None = None) -> Iterator[tuple[Link, DriveNode, list]]:
     channel = f"scan-{uuid4()}"
     truth = Truth.load(bundled_profile("article"))
     with (
@@ -86,7 +84,7 @@ def test_a_drive_and_an_encoder_are_found_and_described() -> None:
     assert (drive.kind, encoder.kind) == ("drive (CiA 402)", "encoder (CiA 406)")
     assert drive.identity == {"vendor_id": 0x4844, "product_code": 0x402, "revision": 0x10000, "serial": 1}
     assert drive.names["device"]
-    assert drive.mode_names == ["PP", "HM", "CSP"]
+    assert drive.mode_names == ["PP", "HM", "IP", "CSP"]
     assert drive.usable
     assert not encoder.usable
     assert encoder.identity == {"vendor_id": 0x55}

@@ -66,3 +66,14 @@ def test_what_the_drive_does_not_say_is_left_to_be_filled_in(node):
     assert text.count("fill in") >= 4
     with pytest.raises(InputError, match=r"axis.yaml:\d+:\d+: drive.rated_torque_nm"):
         AxisConfig.from_text(text)
+
+
+def test_a_drive_with_interpolated_position_alone_gets_that_mode(node):
+    from dataclasses import replace
+
+    bus = BusConfig(interface="socketcan", channel="can0")
+    for modes, mode in ((0x43, "ip"), (0xE1, "csp"), (0xA1, "csp"), (None, "csp")):
+        found = replace(node, modes=modes)
+        assert found.usable
+        assert AxisConfig.from_text(axis_text("found", bus, found, "hdbridge-402.eds")).drive.mode == mode
+    assert not replace(node, modes=0x03).usable

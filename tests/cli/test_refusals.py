@@ -188,8 +188,8 @@ def test_what_cannot_be_right_is_refused_and_nothing_happens(command, place, mon
         ("step axis --interface cann0 --channel can0", "--interface: python-can has no interface 'cann0'"),
         ("scan --interface cann0 --channel can0", "python-can has no interface 'cann0'"),
         ("run axis --interface cann0 --channel can0", "--interface: python-can has no interface 'cann0'"),
-        ("record mend empty", "is no flight recording"),
-        ("record mend /dev/null", "is no flight recording"),
+        ("record mend empty", "not a flight recording"),
+        ("record mend /dev/null", "not a flight recording"),
     ],
 )
 def test_what_the_axis_cannot_do_is_refused_before_anything_is_connected(place, words, complaint):

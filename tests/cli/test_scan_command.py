@@ -6,7 +6,7 @@ import json
 def test_scan_lists_the_drive_and_recognises_it(hdbridge, tmp_path):
     done = hdbridge("scan", "article", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
-    for text in ("drive (CiA 402)", "PP, HM, CSP", "node_id: 1", "is the drive of"):
+    for text in ("drive (CiA 402)", "PP, HM, IP, CSP", "node_id: 1", "is the drive of"):
         assert text in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["schema"] == "hdbridge.scan/1"

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from support.meanwhile import before_each
 
 from hdbridge.client import address
 from hdbridge.client.address import Address, find
@@ -52,6 +53,19 @@ def test_a_socket_that_nobody_listens_at_is_no_daemon(machine, tmp_path):
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(dead))
     assert find(environment=machine.environment).socket == path
+
+
+def test_a_daemon_that_ends_meanwhile_is_not_there(machine, tmp_path):
+    machine("cell", "system/cell")
+    folder = tmp_path / "system" / "cell"
+
+    def hook(event: str, path: Path) -> None:
+        if event == "os.scandir" and path == folder and folder.exists():
+            (folder / "cell.sock").unlink()
+            folder.rmdir()
+
+    with before_each(hook), pytest.raises(DaemonError, match="no daemon runs"):
+        find(environment=machine.environment)
 
 
 def test_a_folder_that_anybody_can_write_to_is_not_trusted(machine):

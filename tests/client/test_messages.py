@@ -104,6 +104,15 @@ def test_an_error_comes_back_as_what_it_was(kind):
     assert back.exit_status == kind.exit_status
 
 
+def test_an_error_of_a_narrower_kind_comes_back_as_the_kind_that_clients_know():
+    class AbortError(errors.SdoError):
+        pass
+
+    back = messages.Problem.of(AbortError("node 3: refused")).error()
+    assert type(back) is errors.SdoError
+    assert back.exit_status == 4
+
+
 def test_the_narrowest_row_of_an_error_counts():
     """A kind that stands behind one that it is derived from would never be told."""
     kinds = list(STATUS)

@@ -14,15 +14,14 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
-from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, simulated_bench
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from tests.support.characters import FRIENDLY, Character
 
@@ -83,7 +82,7 @@ class Rig:
 
     bus: SpoiltBus
     clock: VirtualClock
-    node: SimulatedDrive
+    node: DriveNode
     drive: Drive
     cycle: Cycle
     supervision: Supervision
@@ -92,7 +91,7 @@ class Rig:
     bad: float | None = None
 
     def enable(self) -> None:
-        self.drive.enable(Mode.CSP)
+        self.drive.enable()
         self.cycle.restart()
         for _ in range(50):
             feedback = self.cycle.tick()

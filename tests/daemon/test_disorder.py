@@ -9,7 +9,6 @@ once.
 from __future__ import annotations
 
 import math
-import pickle
 import struct
 from contextlib import ExitStack, suppress
 
@@ -20,17 +19,17 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 
-from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError
 from hdbridge.drive.objects import Mode
 from hdbridge.errors import HdbridgeError
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 
 K = CommandKind
 TRAVEL_DEG = 3.0
 """Short, so that the ends are met often."""
-KINDS = [each for each in K if each is not K.ENDING]
+KINDS = list(K)
 axes = st.integers(0, 1)
 angles = st.one_of(
     st.floats(-1.2 * TRAVEL_DEG, 1.2 * TRAVEL_DEG), st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
@@ -67,9 +66,9 @@ class Disorder(RuleBasedStateMachine):
         self.stream = 0
         self.booted = [False, False]
         self.models = [
-            pickle.dumps(compensation_for(axis.config, model.bound_to(axis.config)))
-            for axis in self.daemon.axes
-            for model in (self._model(), self._model().only(("synchronous",)), self._model().only(()))
+            self.daemon.setting(axis, scheme).to_json()
+            for axis in range(2)
+            for scheme in (Scheme.EXTENDED, Scheme.SYNCHRONOUS, Scheme.NONE)
         ]
 
     @initialize()
@@ -228,20 +227,15 @@ class Disorder(RuleBasedStateMachine):
             self.post(K.STREAM_BEGIN, 1, a=0.1, i=mask, j=self.stream)
         self.go(number)
 
-    @rule(axis=axes, on=st.integers(0, 1), kind=st.sampled_from([K.COMPENSATE, K.LOAD_LOOP]), number=turns)
-    def switch(self, axis: int, on: int, kind: CommandKind, number: int) -> None:
-        self.post(kind, axis, i=on)
-        self.go(number)
-
     @rule(axis=axes, which=st.integers(0, 5), number=turns)
     def change_model(self, axis: int, which: int, number: int) -> None:
-        self.post(K.CHANGE, axis, i=self.daemon.memory.blobs.put(self.models[which]))
+        self.post(K.CHANGE, axis, i=self.daemon.memory.settings[axis].put(self.models[which]))
         self.go(number)
 
     # ---------------------------------------------------------------- a service out of its mind
 
     @rule(
-        kind=st.one_of(st.sampled_from(KINDS), st.integers(-5, 300).filter(lambda n: n != K.ENDING)),
+        kind=st.one_of(st.sampled_from(KINDS), st.integers(-5, 300)),
         axis=st.integers(-3, 5), a=angles, b=speeds, c=speeds, i=counts, j=counts,
         k=st.one_of(counts, st.sampled_from([0x0250, 0x1237, 0x0008, 0x0007])), number=turns,
     )  # fmt: skip
@@ -254,7 +248,7 @@ class Disorder(RuleBasedStateMachine):
 
     @rule(data=st.binary(max_size=50), number=turns)
     def nonsense_model(self, data: bytes, number: int) -> None:
-        self.post(K.CHANGE, 0, i=self.daemon.memory.blobs.put(pickle.dumps(data)))
+        self.post(K.CHANGE, 0, i=self.daemon.memory.settings[0].put(data))
         self.go(number)
 
     @rule(

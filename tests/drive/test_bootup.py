@@ -11,7 +11,7 @@ from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State
-from hdbridge.drive.writes import left_out
+from hdbridge.drive.bootplan import left_to_drive
 from hdbridge.errors import BusError, DriveError, IdentityError, InputError, SdoError
 
 
@@ -23,12 +23,12 @@ def drive(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> Drive:
 def test_a_drive_comes_up_configured_operational_and_disabled(drive: Drive, tiny: Any) -> None:
     report = drive.boot()
     assert report.state is State.SWITCH_ON_DISABLED
-    assert set(report.modes) == {Mode.PP, Mode.HM, Mode.CSP}
+    assert set(report.modes) == {Mode.PP, Mode.HM, Mode.IP, Mode.CSP}
     assert report.identity["vendor_id"] == 0x4844
     assert report.names["device"]
     assert report.notes == ()
     assert tiny.nmt_state == 5
-    for (index, sub), row in {(row.index, row.sub): row for row in report.written}.items():
+    for (index, sub), row in {(row.index, row.sub): row for row in report.held}.items():
         assert int(tiny.values[index, sub]) & row.compared == row.value & row.compared
     assert tiny.values[0x1A01, 1] == 0x60E40120
     assert tiny.values[0x1400, 1] == 0x201
@@ -60,6 +60,61 @@ def test_an_absent_drive_is_named_within_a_bounded_time(
         drive.boot()
     assert "\n" not in str(caught.value)
     assert clock.now() < 3.0
+
+
+def booting(tiny: Any, boot_up_s: float | None, sdo_s: float) -> None:
+    """After a reset its boot-up message and its SDO server come that late, counted from the reset."""
+    nmt, sdo, clock = tiny.nmt, tiny.sdo, tiny.clock
+    reset_s = [0.0]
+    told = [True]
+
+    def command(value: int) -> None:
+        if value == 0x82:
+            reset_s[0], told[0] = clock.now(), boot_up_s is None
+        elif clock.now() >= reset_s[0] + sdo_s:
+            nmt(value)
+
+    def request(data: bytes) -> None:
+        if clock.now() >= reset_s[0] + sdo_s:
+            sdo(data)
+
+    def call() -> None:
+        if not told[0] and clock.now() >= reset_s[0] + (boot_up_s or 0.0):
+            told[0] = True
+            tiny.send(0x700, b"\x00")
+
+    tiny.nmt, tiny.sdo = command, request
+    tiny.bus_peers.append(call)
+
+
+@pytest.mark.parametrize(
+    ("boot_up_s", "sdo_s"), [(0.1, 1.0), (0.1, 3.5), (1.9, 5.2), (2.8, 5.0), (3.4, 6.8), (None, 3.0)]
+)
+def test_a_drive_that_answers_seconds_after_its_boot_up_message(
+    tiny: Any, bus: Any, axis: AxisConfig, clock: Any, boot_up_s: float | None, sdo_s: float
+) -> None:
+    tiny.bus_peers = bus.peers
+    booting(tiny, boot_up_s, sdo_s)
+    assert Drive(bus, axis, clock, tiny.od).boot().state is State.SWITCH_ON_DISABLED
+
+
+def test_a_drive_that_boots_and_never_answers_was_heard(
+    drive: Drive, tiny: Any, bus: Any, clock: Any
+) -> None:
+    tiny.bus_peers = bus.peers
+    booting(tiny, 0.5, 1e9)
+    with pytest.raises(DriveError, match=r"does not answer \(heard of it: its boot-up message\); ") as caught:
+        drive.boot()
+    assert "no other node" not in str(caught.value)
+    assert 4.0 <= clock.now() <= 5.0
+
+
+def test_a_node_that_is_stopped_was_heard(drive: Drive, tiny: Any) -> None:
+    tiny.values[0x1017, 0] = 100
+    tiny.nmt_state = 4
+    tiny.nmt = tiny.sdo = lambda _: None
+    with pytest.raises(DriveError, match=r"heard of it: a heartbeat \(04h\)"):
+        drive.boot()
 
 
 def test_an_absent_drive_and_who_is_there_instead(
@@ -120,18 +175,18 @@ def test_what_the_eds_lacks_is_left_out(drive: Drive, tiny: Any, bus: Any, axis:
         del tiny.od[index]
         del tiny.values[index, 0 if index == 0x6072 else 1]
     report = Drive(bus, axis, clock, tiny.od).boot()
-    assert not {0x6072, 0x1029} & {row.index for row in report.written}
-    assert [row.index for row in left_out(axis, tiny.od)] == [0x1029, 0x6072]
+    assert not {0x6072, 0x1029} & {row.index for row in report.held}
+    assert [row.index for row in left_to_drive(axis, tiny.od)] == [0x1029, 0x6072]
 
 
 def test_what_there_is_no_doing_without_is_refused_before_anything_is_sent(
     tiny: Any, bus: Any, axis: Any, clock: Any
 ) -> None:
     with pytest.raises(InputError, match=r"drive\.eds: none\.eds lacks 6040h:00 controlword, .* more"):
-        Drive(bus, axis, clock, ObjectDictionary()).boot()
-    del tiny.od[0x6062]
-    with pytest.raises(InputError, match=r"lacks 6062h:00 position demand value, which"):
-        Drive(bus, axis, clock, tiny.od).boot()
+        Drive(bus, axis, clock, ObjectDictionary())
+    del tiny.od[0x6064]
+    with pytest.raises(InputError, match=r"lacks 6064h:00 position actual value, which"):
+        Drive(bus, axis, clock, tiny.od)
     assert bus.sent == []
 
 
@@ -156,32 +211,112 @@ WRITTEN = [
     ((0x1016, 1), "drive.heartbeat_ms"),
     ((0x1A01, 1), "load_encoder.source"),
     ((0x1800, 1), ""),
-    ((0x6007, 0), ""),
+    ((0x6007, 0), "drive.abort_connection_option"),
 ]
+STATED = {
+    "quick_stop_option": 6,
+    "halt_option": 1,
+    "following_error_time_ms": 20,
+    "abort_connection_option": 3,
+}
+
+
+@pytest.fixture
+def stated(bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]) -> Drive:
+    """A drive whose axis file states all of these."""
+    axis = build_axis(**{f"drive__{key}": value for key, value in STATED.items()})
+    return Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
 
 
 @pytest.mark.parametrize(("key", "field"), WRITTEN)
 def test_a_value_that_does_not_stick_is_found(
-    drive: Drive, tiny: Any, key: tuple[int, int], field: str
+    stated: Drive, tiny: Any, key: tuple[int, int], field: str
 ) -> None:
     tiny.stuck.add(key)
     tiny.values[key] = 77
     with pytest.raises(DriveError, match=f"{key[0]:04X}h:{key[1]:02X} .*but reads back 77") as caught:
-        drive.boot()
+        stated.boot()
     assert field in str(caught.value)
     assert tiny.nmt_state == 127
 
 
-@pytest.mark.parametrize(("key", "field"), WRITTEN)
-def test_a_refused_write_names_the_field(drive: Drive, tiny: Any, key: tuple[int, int], field: str) -> None:
-    def refuse(request: bytes) -> list[bytes]:
-        if request[0] >> 5 == 2:
-            return [b"\x43" + request[1:4] + bytes(4)]
-        return [b"\x80" + request[1:4] + (0x06090030).to_bytes(4, "little")]
+def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
+    """A script for an object that can be read, and refuses to be written."""
 
-    tiny.scripts[key] = refuse
-    with pytest.raises(SdoError, match=f"{key[0]:04X}h:{key[1]:02X} .*write refused.*06090030h") as caught:
+    def answer(request: bytes) -> list[bytes]:
+        if request[0] >> 5 == 2:
+            return [b"\x43" + request[1:4] + held.to_bytes(4, "little")]
+        return [b"\x80" + request[1:4] + code.to_bytes(4, "little")]
+
+    return answer
+
+
+@pytest.mark.parametrize("key", [(0x605A, 0), (0x605D, 0), (0x605B, 0), (0x6007, 0), (0x1029, 1)])
+@pytest.mark.parametrize("code", [0x06090030, 0x06090031, 0x06010002, 0x08000000])
+def test_a_value_that_nobody_chose_is_left_to_a_drive_that_refuses_it(
+    drive: Drive, tiny: Any, key: tuple[int, int], code: int
+) -> None:
+    tiny.scripts[key] = refusing(code, held=5)
+    report = drive.boot()
+    (note,) = report.notes
+    assert note.startswith("left to the drive (")
+    assert f"{key[0]:04X}h:{key[1]:02X}" in note
+    assert f"{code:08X}h" in note
+    assert "drive." in note
+    assert report.left == {key}
+    assert key not in {(row.index, row.sub) for row in report.held}
+    assert tiny.nmt_state == 5
+
+
+def test_a_read_only_limit_is_left_to_the_drive_even_if_it_is_stated(stated: Drive, tiny: Any) -> None:
+    for key in ((0x6065, 0), (0x605A, 0)):
+        tiny.scripts[key] = refusing(0x06010002, held=2)
+    report = stated.boot()
+    assert report.left == {(0x6065, 0), (0x605A, 0)}
+
+
+def test_a_drive_that_refuses_its_cycle_is_refused(drive: Drive, tiny: Any) -> None:
+    tiny.scripts[0x60C2, 1] = refusing(0x06010002, held=1)
+    with pytest.raises(SdoError, match=r"60C2h:01 .*read-only.*drive\.cycle_ms decides it"):
         drive.boot()
+
+
+def test_what_the_drive_holds_already_is_not_written(drive: Drive, tiny: Any) -> None:
+    first = drive.boot()
+    assert first.written
+    tiny.sdo_order.clear()
+    second = drive.boot()
+    assert second.written == ()
+    assert second.held == first.held
+    assert tiny.sdo_order == []
+
+
+def test_an_object_that_can_only_be_written_is_written(drive: Drive, tiny: Any) -> None:
+    tiny.od[0x605A].access_type = "wo"
+    tiny.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
+    assert 0x605A in {row.index for row in drive.boot().written}
+    tiny.od[0x605A].access_type = "rw"  # the drive itself knows better
+    tiny.scripts[0x605A, 0] = lambda request: [
+        b"\x80" + request[1:4] + (0x06010001).to_bytes(4, "little")
+        if request[0] >> 5 == 2
+        else b"\x60" + request[1:4] + bytes(4)
+    ]
+    assert 0x605A in {row.index for row in drive.boot().written}
+
+
+def test_a_pdo_whose_mapping_is_right_is_not_mapped_again(drive: Drive, tiny: Any) -> None:
+    drive.boot()
+    tiny.values[0x1800, 2] = 255
+    tiny.sdo_order.clear()
+    drive.boot()
+    assert tiny.sdo_order == [(0x1800, 1, 0x8000_0181), (0x1800, 2, 1), (0x1800, 1, 0x181)]
+
+
+@pytest.mark.parametrize(("key", "field"), WRITTEN)
+def test_a_refused_write_names_the_field(stated: Drive, tiny: Any, key: tuple[int, int], field: str) -> None:
+    tiny.scripts[key] = refusing(0x06090030)
+    with pytest.raises(SdoError, match=f"{key[0]:04X}h:{key[1]:02X} .*write refused.*06090030h") as caught:
+        stated.boot()
     assert field in str(caught.value)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -42,7 +43,8 @@ def test_in_csp_power_is_left_to_the_cycle(drive: Drive, tiny: Any) -> None:
     assert tiny.values[0x6060, 0] == Mode.CSP
     image = drive.image
     assert (image.motor_counts, image.load_counts, image.statusword) == (1000, 7200, 0x40)
-    assert image.rpdo.unpack(image.pack_rpdo_idle()) == (0x06, 1000)
+    ((can_id, data),) = image.pack_rpdo_idle()
+    assert (can_id, struct.unpack("<Hi", data)) == (0x201, (0x06, 1000))
 
 
 def test_before_the_boot_nothing_is_enabled(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> None:

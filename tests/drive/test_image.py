@@ -5,24 +5,35 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.drive import PdoLengthError, ProcessImage, State
-from hdbridge.errors import InputError
+from hdbridge.drive import PdoLengthError, ProcessImage, State, load_eds
+from hdbridge.drive.image import Frames
+from hdbridge.errors import InputError, TransitionError
+from tests.support.eds import OWN, mapped, stating, without
 
 
 def tpdo1(statusword: int, position: int, torque: int = 0) -> bytes:
     return struct.pack("<Hih", statusword, position, torque)
 
 
+def sent(frames: Frames) -> tuple[int, ...]:
+    """Controlword and target of the one RPDO."""
+    ((can_id, data),) = frames
+    assert can_id == 0x201
+    return struct.unpack("<Hi", data)
+
+
 def test_layout_of_the_cycle(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
     assert image.tpdo_ids == (0x181, 0x281)
-    assert image.rpdo_id == 0x201
+    assert [(layout.number, layout.can_id) for layout in image.rpdos] == [(1, 0x201)]
     assert image.heartbeat_id == 0x77F
     assert [str(entry) for layout in image.tpdos for entry in layout.codec.entries] == [
         "6041h:00 uint16",
@@ -110,7 +121,7 @@ def test_only_targets_within_the_limits_are_packed(
     image = ProcessImage(build_axis())
     least, greatest = image.limits_counts
     if isinstance(counts, int) and least <= counts <= greatest:
-        assert image.rpdo.unpack(image.pack_rpdo(counts)) == (0, counts)
+        assert sent(image.pack_rpdo(counts)) == (0, counts)
     else:
         with pytest.raises(InputError, match="not sent"):
             image.pack_rpdo(counts)  # type: ignore[arg-type]
@@ -130,7 +141,7 @@ def test_before_power_the_target_is_where_the_axis_is(axis: AxisConfig) -> None:
     image.accept(0x181, tpdo1(0x0040, -(2**31) + 10))
     assert image.motor_counts == 2**31 + 10
     image.power.go(State.OPERATION_ENABLED)
-    assert image.rpdo.unpack(image.pack_rpdo_idle()) == (0x06, -(2**31) + 10)
+    assert sent(image.pack_rpdo_idle()) == (0x06, -(2**31) + 10)
 
 
 def test_halt_sets_its_bit(axis: AxisConfig) -> None:
@@ -138,4 +149,123 @@ def test_halt_sets_its_bit(axis: AxisConfig) -> None:
     image.accept(0x181, tpdo1(0x0027, 0))
     image.power.go(State.OPERATION_ENABLED)
     image.halt = True
-    assert image.rpdo.unpack(image.pack_rpdo(0)) == (0x010F, 0)
+    assert sent(image.pack_rpdo(0)) == (0x010F, 0)
+
+
+def ip_frames(frames: Frames) -> tuple[int, int]:
+    ((_, data),) = frames
+    return struct.unpack("<Hi", data)
+
+
+def test_in_ip_the_target_is_enabled_in_operation_enabled_only(build_axis: Callable[..., AxisConfig]) -> None:
+    image = ProcessImage(build_axis(drive__mode="ip"))
+    assert [entry.mapping for entry in image.rpdos[0].codec.entries] == [0x60400010, 0x60C10120]
+    image.accept(0x181, tpdo1(0x0040, 100))
+    image.power.go(State.OPERATION_ENABLED)
+    for status, word in ((0x0040, 0x06), (0x0021, 0x07), (0x0023, 0x0F), (0x0027, 0x1F)):
+        image.accept(0x181, tpdo1(status, 100))
+        assert ip_frames(image.pack_rpdo_idle()) == (word, 100)
+    assert ip_frames(image.pack_rpdo(150)) == (0x1F, 150)
+    assert ip_frames(image.pack_rpdo_held()) == (0x1F, 150)
+    assert ip_frames(image.pack_rpdo_stop()) == (0x02, 100)
+    image.power.quick_stop()
+    assert ip_frames(image.pack_rpdo_held()) == (0x02, 150)
+    image.accept(0x181, tpdo1(0x0007, 100))
+    assert ip_frames(image.pack_rpdo_held()) == (0x02, 150)
+
+
+STATES = st.sampled_from([0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08, 0xFF])
+
+
+@given(
+    seen=st.lists(st.tuples(STATES, st.sampled_from(["go", "stop", "off", ""])), max_size=20),
+    halt=st.booleans(),
+)
+def test_in_ip_no_other_word_than_enable_operation_has_the_bit(
+    build_axis: Callable[..., AxisConfig], seen: list[tuple[int, str]], halt: bool
+) -> None:
+    image = ProcessImage(build_axis(drive__mode="ip"))
+    image.halt = halt
+    for status, wish in seen:
+        image.accept(0x181, tpdo1(status, 0))
+        with suppress(TransitionError):
+            if wish == "go":
+                image.power.go(State.OPERATION_ENABLED)
+            elif wish == "off":
+                image.power.go(State.SWITCH_ON_DISABLED)
+            elif wish == "stop":
+                image.power.quick_stop()
+        word, _ = ip_frames(image.pack_rpdo(7))
+        assert not word & 0x10 or (word & 0x0F == 0x0F and image.power.state is State.OPERATION_ENABLED)
+
+
+@pytest.fixture
+def other(tmp_path: Path, build_axis: Callable[..., AxisConfig]) -> Callable[[str], ProcessImage]:
+    """The image of a drive with another EDS."""
+
+    def make(eds: str) -> ProcessImage:
+        path = tmp_path / "drive.eds"
+        path.write_text(eds)
+        return ProcessImage(build_axis(), load_eds(path, 1))
+
+    return make
+
+
+def test_a_command_may_be_split_over_two_frames(other: Callable[[str], ProcessImage]) -> None:
+    image = other(mapped(mapped(OWN, 0x1400, 0x60600008, 0x60400010), 0x1402, 0x607A0020, 0x60B00020))
+    image.accept(0x181, tpdo1(0x0027, 300))
+    image.power.go(State.OPERATION_ENABLED)
+    assert image.pack_rpdo(123) == (
+        (0x201, struct.pack("<bH", 8, 0x0F)),
+        (0x401, struct.pack("<ii", 123, 0)),
+    )
+    assert image.pack_rpdo_stop() == (
+        (0x201, struct.pack("<bH", 8, 0x02)),
+        (0x401, struct.pack("<ii", 300, 0)),
+    )
+    with pytest.raises(InputError, match="not sent"):
+        image.pack_rpdo(1 << 31)
+
+
+def test_the_statusword_is_taken_from_wherever_it_is_mapped(other: Callable[[str], ProcessImage]) -> None:
+    image = other(mapped(OWN, 0x1801, 0x60E40120, 0x60410010, kind=1))
+    assert image.tpdo_ids == (0x181, 0x281, 0x381)
+    data = struct.pack("<iH", 5, 0x1237)
+    assert image.statusword_in(0x281, data) == 0x1237
+    assert image.statusword is None
+    assert image.statusword_in(0x181, bytes(8)) is None
+    assert image.statusword_in(0x281, bytes(5)) is None
+    image.accept(0x281, data)
+    assert (image.statusword, image.load_counts) == (0x1237, 5)
+
+
+def test_without_a_demand_the_target_stands_in_that_the_drive_has_reached(
+    other: Callable[[str], ProcessImage],
+) -> None:
+    """What is sent after SYNC k is taken at SYNC k+1, and reached at SYNC k+2."""
+    image = other(without(OWN, 0x6062))
+    image.seed(1000, 0, 0x0027)
+    image.power.go(State.OPERATION_ENABLED)
+    seen = []
+    for target in (1010, 1020, 1030, 1040):
+        image.accept(0x181, tpdo1(0x0027, 1000))
+        seen.append(image.demand_counts)
+        image.pack_rpdo(target)
+    assert seen == [1000, 1000, 1010, 1020]
+    image.accept(0x181, tpdo1(0x0040, 990))
+    assert image.demand_counts == 990
+
+
+def test_without_a_torque_there_is_none(other: Callable[[str], ProcessImage]) -> None:
+    image = other(without(OWN, 0x6077))
+    image.accept(0x181, struct.pack("<Hi", 0x0027, 5))
+    assert math.isnan(image.torque_permille)
+
+
+def test_positions_of_another_width_are_followed_over_their_wrap(
+    other: Callable[[str], ProcessImage],
+) -> None:
+    image = other(stating(stating(OWN, "6064", DataType="0x0003"), "6062", DataType="0x0003"))
+    for counts in (32_760, -32_766):
+        image.accept(0x181, struct.pack("<Hhhh", 0x0027, counts, 0, counts))
+    assert image.motor_counts == image.demand_counts == 32_770

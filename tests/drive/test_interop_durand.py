@@ -152,9 +152,8 @@ def cycle(drive: Drive, clock: Any, target_counts: int | None) -> None:
         else:
             drive.monitor.dispatch(frame)
     assert not waited
-    link.send(
-        image.rpdo_id, image.pack_rpdo_idle() if target_counts is None else image.pack_rpdo(target_counts)
-    )
+    for frame in image.pack_rpdo_idle() if target_counts is None else image.pack_rpdo(target_counts):
+        link.send(*frame)
 
 
 def test_boot_enable_and_follow(drive: Drive, peer: DurandDrive, clock: Any) -> None:

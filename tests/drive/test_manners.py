@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.interfacelock import holders, interface_lock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.files.bundled import bundled_profile
@@ -126,6 +127,17 @@ def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
             pass
     with interface_lock("socketcan", "can0", tmp_path):
         pass
+
+
+def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
+    assert holders(tmp_path) == {}
+    with interface_lock("socketcan", "can0", tmp_path), interface_lock("slcan", "/dev/ttyUSB0", tmp_path):
+        (tmp_path / "hdbridge-socketcan-can7.lock").touch()  # of one that has ended
+        (tmp_path / "another.lock").touch()
+        found = holders(tmp_path)
+    assert list(found) == [os.getpid()]
+    assert re.fullmatch(rf"s\w+can:.* is held by process {os.getpid()}, '.+'", found[os.getpid()])
+    assert holders(tmp_path) == {}
 
 
 def test_the_virtual_bus_needs_no_lock(tmp_path: Path) -> None:

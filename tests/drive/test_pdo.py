@@ -106,4 +106,4 @@ def test_type_names() -> None:
 def test_no_two_known_objects_share_an_address() -> None:
     assert STANDARD[0x6041, 0].name == "statusword"
     assert str(STANDARD[0x607D, 2]) == "607Dh:02 software position limit max"
-    assert [mode.supported_bit for mode in Mode] == [0x01, 0x20, 0x80]
+    assert [mode.supported_bit for mode in Mode] == [0x01, 0x20, 0x40, 0x80]

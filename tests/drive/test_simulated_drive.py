@@ -39,7 +39,8 @@ class Exchange:
                     self.drive.monitor.dispatch(frame)
             assert not waited
             idle = target_counts is None
-            link.send(image.rpdo_id, image.pack_rpdo_idle() if idle else image.pack_rpdo(target_counts))
+            for frame in image.pack_rpdo_idle() if idle else image.pack_rpdo(target_counts):
+                link.send(*frame)
             if self.clock.now() >= self.heartbeat_due_s:
                 link.send(image.heartbeat_id, b"\x05")
                 self.heartbeat_due_s = self.clock.now() + image.heartbeat_period_s
@@ -75,7 +76,7 @@ def state_of(drive: Drive) -> State:
 def test_it_boots_as_the_axis_file_says(drive: Drive) -> None:
     assert drive.report is not None
     assert drive.report.state is State.SWITCH_ON_DISABLED
-    assert drive.report.modes == (Mode.PP, Mode.HM, Mode.CSP)
+    assert drive.report.modes == (Mode.PP, Mode.HM, Mode.IP, Mode.CSP)
     assert drive.report.notes == ()
     assert drive.monitor.nodes[1].boot_ups == 1
 

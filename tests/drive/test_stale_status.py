@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
+from hdbridge.device.behaviour import Behaviour
+from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive, Mode, State
 from hdbridge.errors import DriveError
-from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.lockstep import simulated_bench
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -24,7 +24,7 @@ DELAYS_MS = (0.0, 8.0, 50.0)
 
 
 @contextmanager
-def drive_that_shows_late(delay_ms: float) -> Iterator[tuple[Drive, SimulatedDrive]]:
+def drive_that_shows_late(delay_ms: float) -> Iterator[tuple[Drive, DriveNode]]:
     truth = Truth.load(PROFILE).model_copy(update={"firmware": Behaviour(status_delay_ms=delay_ms)})
     with (
         simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id) as (bus, clock, node),

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.meanwhile import before_each
 
 from hdbridge.axis import Identity
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
@@ -280,3 +281,22 @@ def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
         assert went_back != active.number
         store.activate(profile, int(active.name), "and forth", DATE)
         assert store.find(profile, "active").number == active.number
+
+
+@pytest.mark.parametrize("doing", ["commit", "discard"])
+def test_a_log_that_is_read_while_the_daemon_commits_or_discards_the_pending_one(profile, doing):
+    store.propose(profile, model(41.0), "first", DATE)
+    store.commit(profile, DATE)
+    store.propose(profile, model(42.0), "second", DATE)
+    pending = profile / "pending.yaml"
+    done = []
+
+    def hook(event: str, path: Path) -> None:
+        if event == "open" and path == pending and not done:
+            done.append(doing)
+            store.commit(profile, DATE) if doing == "commit" else store.discard(profile)
+
+    with before_each(hook):
+        names = [each.name for each in store.log(profile)]
+    assert names == (["2", "1"] if doing == "commit" else ["1"])
+    assert done

@@ -19,12 +19,12 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import MonotonicClock
+from hdbridge.device.node import DriveNode
+from hdbridge.device.run import run
 from hdbridge.drive.supervision import Fault, Reaction
 from hdbridge.errors import BusError
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.machine import Machine
-from hdbridge.sim.node import SimulatedDrive
-from hdbridge.sim.run import run
 from hdbridge.sim.truth import Truth
 from tests.support.characters import CHARACTERS, FRIENDLY, RESTLESS, Character, PowerCount
 from tests.support.command import run_here
@@ -32,17 +32,13 @@ from tests.support.reliability import VCAN, Row, rows_of, try_out
 
 
 @contextmanager
-def drive_in_a_thread(
-    interface: str, profile: Path, character: Character = FRIENDLY
-) -> Iterator[SimulatedDrive]:
+def drive_in_a_thread(interface: str, profile: Path, character: Character = FRIENDLY) -> Iterator[DriveNode]:
     """The simulated drive on a socket of its own, with its fault injector within reach."""
     axis, truth = AxisConfig.load(profile), character.of_truth(Truth.load(profile))
     ended = threading.Event()
     with can.Bus(interface="socketcan", channel=interface, ignore_config=True) as bus:
         clock = MonotonicClock()
-        node = SimulatedDrive(
-            bus, Machine(truth, 0), axis.eds_path, 1, clock, nameplate_of(truth), truth.firmware
-        )
+        node = DriveNode(bus, Machine(truth, 0), axis.eds_path, 1, clock, nameplate_of(truth), truth.firmware)
 
         def serve() -> None:
             with suppress(BusError):  # the row has taken the interface away
@@ -62,7 +58,7 @@ class VcanBench:
     """A master that moves its axis over vcan."""
 
     master: Any
-    node: SimulatedDrive
+    node: DriveNode
     intruder: can.BusABC
     configure: Callable[..., None]
     interface: str
@@ -158,7 +154,7 @@ def check(bench: VcanBench, row: Row, character: Character) -> None:
             bench.interfere(0x080)  # the first SYNC of another program
         time.sleep(0.3)
         assert abs(bench.motor_counts - place) <= 2
-        assert power.times == 0, "power without a request"
+        assert power.times <= row.resumptions_on(character), "power without a request"
 
 
 # ------------------------------------------------------------------ manners

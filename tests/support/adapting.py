@@ -22,6 +22,7 @@ from hdbridge.daemon.adaptation.sink import reading_of
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
 from hdbridge.daemon.watch.encoder_health import EncoderHealth
+from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive
 from hdbridge.effects import Moment, Motion, Start
 from hdbridge.evaluation.stepping import Scatter, quantisation_floor_arcsec
@@ -29,7 +30,6 @@ from hdbridge.model import TransmissionModel
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.sim.lockstep import simulated_bench
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -153,7 +153,7 @@ class Sampler:
 class Work:
     """The axis, test by test; the adaptation hears what was measured and may change the model."""
 
-    def __init__(self, drive: Drive, node: SimulatedDrive, settings: AdaptationSettings | None) -> None:
+    def __init__(self, drive: Drive, node: DriveNode, settings: AdaptationSettings | None) -> None:
         self.history: list[Entry] = []
         self.adaptation = settings and Adaptation(MODEL, settings, reading_of(AXIS), self.history.append)
         self.health = EncoderHealth(AXIS, MODEL)

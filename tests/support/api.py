@@ -51,7 +51,7 @@ class Served:
 @contextmanager
 def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
     """Serve a machine until the end of the block."""
-    tcp = tcp_socket("127.0.0.1", 0)
+    tcp = tcp_socket(0)
     port = tcp.getsockname()[1]
     path = folder / "cell.sock"
     server = ApiServer(bridge, [Listener(unix_socket(path), Policy()), Listener(tcp, Policy(token=TOKEN))])

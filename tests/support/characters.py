@@ -5,24 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Final
+from typing import Final, Literal
 
 from hdbridge.axis import AxisConfig
-from hdbridge.sim.behaviour import Behaviour, Controlword, HeartbeatConsumer
-from hdbridge.sim.node import SimulatedDrive
+from hdbridge.device.behaviour import Behaviour, Controlword, HeartbeatConsumer
+from hdbridge.device.node import DriveNode
 from hdbridge.sim.truth import Truth
 
 
 @dataclass(frozen=True)
 class Character:
-    """A firmware, and what a quick stop ends in."""
+    """A firmware, what a quick stop ends in, and the mode of the control cycle."""
 
     name: str
     behaviour: Behaviour = Behaviour()
     quick_stop_option: int = 2
+    mode: Literal["csp", "ip"] = "csp"
 
     def of_axis(self, axis: AxisConfig) -> AxisConfig:
-        drive = axis.drive.model_copy(update={"quick_stop_option": self.quick_stop_option})
+        update = {"quick_stop_option": self.quick_stop_option, "mode": self.mode}
+        drive = axis.drive.model_copy(update=update)
         return axis.model_copy(update={"drive": drive})
 
     def of_truth(self, truth: Truth) -> Truth:
@@ -35,7 +37,7 @@ class Character:
 _RESTLESS: Final = {"controlword": Controlword.LEVEL, "holds_rpdo": True, "rpdo_before_tpdo": True}
 _SLUGGISH: Final = {
     "status_delay_ms": 50.0,
-    "sdo_delay_s": 0.1,
+    "sdo_delay_s": 2.0,
     "rpdo_timer": False,
     "heartbeat_consumer": HeartbeatConsumer.STOPS,
 }
@@ -45,7 +47,9 @@ RESTLESS: Final = Character("restless", Behaviour(**_RESTLESS), 6)
 SLUGGISH: Final = Character("sluggish", Behaviour(**_SLUGGISH), 6)
 """It shows late what it does."""
 AWKWARD: Final = Character("awkward", Behaviour(**_RESTLESS, **_SLUGGISH), 2)
-CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD)
+INTERPOLATED: Final = Character("interpolated", Behaviour(**_RESTLESS), 6, "ip")
+"""It resumes whenever it can, in interpolated position mode."""
+CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD, INTERPOLATED)
 
 
 def every_character() -> list[Character]:
@@ -64,7 +68,7 @@ def _every_character() -> Iterator[Character]:
 class PowerCount:
     """Counts how often a drive enters 'operation enabled'."""
 
-    def __init__(self, node: SimulatedDrive) -> None:
+    def __init__(self, node: DriveNode) -> None:
         self.times = 0
         firmware = node.firmware
         operate = firmware._operate

@@ -25,12 +25,13 @@ from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
+from hdbridge.daemon.setting import CompensationSetting
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
-from hdbridge.drive.objects import Mode
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character
 
@@ -120,7 +121,7 @@ class SteppedDaemon:
         memory: Memory,
         clock: VirtualClock,
         bus: SpoiltBus,
-        nodes: Sequence[SimulatedDrive],
+        nodes: Sequence[DriveNode],
         intruder: VirtualBus,
     ) -> None:
         self._begin, self.memory, self.clock = begin, memory, clock
@@ -189,6 +190,19 @@ class SteppedDaemon:
         answer = self.order(kind, axis, **fields)
         assert answer.kind is EventKind.DONE, answer.text
 
+    def setting(
+        self, axis: int = 0, scheme: Scheme = Scheme.EXTENDED, model: TransmissionModel | None = None,
+        *, load_loop: bool = False,
+    ) -> CompensationSetting:  # fmt: skip
+        """A compensation setting of an axis; of the article's model by default."""
+        config = self.axes[axis].config
+        model = model or TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
+        return CompensationSetting(model, scheme, load_loop=load_loop)
+
+    def use(self, setting: CompensationSetting, axis: int = 0) -> None:
+        """Have the loop compensate by a setting."""
+        self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
+
     def drive(self, axis: int) -> Drive:
         """The service's drive object of an axis, over the relay."""
         while len(self.drives) <= axis:
@@ -211,7 +225,7 @@ class SteppedDaemon:
     def prepare(self, axis: int = 0) -> dict[str, int]:
         """What is done by SDO before ENABLE; the command's fields."""
         drive = self.drive(axis)
-        drive.enable(Mode.CSP)
+        drive.enable()
         image = drive.image
         return {"i": image.motor_counts, "j": image.load_counts, "k": image.statusword or 0}
 
@@ -271,6 +285,7 @@ def stepped_daemon(
     setup: Callable[[AxisConfig, AxisSetup], AxisSetup] = lambda _, made: made,
     truth: Path | Truth = PROFILE / "truth.yaml",
     character: Character = FRIENDLY,
+    bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
     """A control loop with simulated axes, none verified yet; with the article's model by default."""
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
@@ -291,7 +306,7 @@ def stepped_daemon(
             return None if spoilt.down is not None else Link(spoilt, clock)
 
         def begin() -> Controller:
-            cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=1_000_000)
+            cycle = BusCycle(Link(spoilt, clock), clock, memory.period_s, bitrate_bps=bitrate_bps)
             setups = [
                 setup(each, AxisSetup(each, compensation_for(each, known.bound_to(each)))) for each in configs
             ]

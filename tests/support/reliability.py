@@ -18,10 +18,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from hdbridge.device.behaviour import Controlword
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
-from hdbridge.sim.behaviour import Controlword
-from hdbridge.sim.node import SimulatedDrive
 from tests.support.characters import FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
@@ -40,7 +40,7 @@ DAEMON_VCAN = "daemon, vcan"
 class Bench(Protocol):
     """An axis under way at constant speed, and what can be done to it."""
 
-    node: SimulatedDrive
+    node: DriveNode
     supervision: Supervision
     period_s: float
 
@@ -87,9 +87,16 @@ class Row:
         One that stops without an EMCY, and resumes at SYNC before it takes the values of its TPDOs, shows
         nothing. An option 605Ah below 5 rules that out.
         """
-        behaviour = character.behaviour
-        resumes = behaviour.controlword is Controlword.LEVEL and character.quick_stop_option >= 5
-        return self.without_a_word and resumes and behaviour.rpdo_before_tpdo
+        return self.resumptions_on(character) > 0 and character.behaviour.rpdo_before_tpdo
+
+    def resumptions_on(self, character: Character) -> int:
+        """How often a drive of this character may resume before a master can know that it has stopped.
+
+        If it stops without an EMCY, the first SYNC after that makes it resume by the buffered RPDO; its
+        TPDO of the same SYNC shows the stop. An option 605Ah below 5 rules that out.
+        """
+        by_level = character.behaviour.controlword is Controlword.LEVEL
+        return int(self.without_a_word and by_level and character.quick_stop_option >= 5)
 
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
         """The same in cycles of an axis."""

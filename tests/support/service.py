@@ -81,7 +81,7 @@ class Service:
 
     def bridge(self, **options: Any) -> ServiceBridge:
         """A service that begins now."""
-        options = {"runner": in_this_thread, "runtime": self.folder, **options}
+        options = {"runner": in_this_thread, **options}
         return ServiceBridge(self.machine, self.daemon.memory, self.timing, **options)
 
     @asynccontextmanager

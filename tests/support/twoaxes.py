@@ -14,12 +14,12 @@ import can
 from hdbridge.axis import AxisConfig
 from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.control.buscycle import BusCycle
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
-from hdbridge.sim.node import SimulatedDrive
 
 PROFILE: Final = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STEP_COUNTS: Final = 40
@@ -75,7 +75,7 @@ class TwoAxes:
 
     bus: LockstepBus
     clock: VirtualClock
-    nodes: tuple[SimulatedDrive, ...]
+    nodes: tuple[DriveNode, ...]
     cycle: BusCycle
     axes: tuple[AxisCycle, ...]
     drives: tuple[Drive, ...]

@@ -201,7 +201,7 @@ def test_a_second_drive_on_a_bus_of_the_machine_says_how_it_is_put_there():
 
 def test_a_drive_whose_bus_has_failed_is_told_of(monkeypatch):
     """Its thread has ended: the test does not go on as if nothing were."""
-    monkeypatch.setattr("hdbridge.sim.run.PATIENCE_S", 0.0)
+    monkeypatch.setattr("hdbridge.device.run.PATIENCE_S", 0.0)
 
     def use() -> None:
         with simulated_drive("article", bus="virtual") as drive:

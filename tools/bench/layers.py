@@ -26,6 +26,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.canframe import DataFrame
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.supervision import Supervision
@@ -35,7 +36,6 @@ from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import Sample
 from hdbridge.sim import fast
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench, nameplate_of, simulated_bench
-from hdbridge.sim.node import SimulatedDrive
 from hdbridge.sim.truth import Truth
 
 CYCLES = 250
@@ -48,7 +48,7 @@ TRUTH = Truth.load(FOLDER / "truth.yaml")
 NODE = AXIS.drive.node_id
 SYNC, TPDO1_ID, TPDO2_ID, RPDO1_ID = 0x80, 0x180 + NODE, 0x280 + NODE, 0x200 + NODE
 Block = Callable[[], object]
-Set = tuple[Drive, Cycle, LockstepBus, VirtualClock, SimulatedDrive]
+Set = tuple[Drive, Cycle, LockstepBus, VirtualClock, DriveNode]
 
 
 class Obedient:

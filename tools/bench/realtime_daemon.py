@@ -23,7 +23,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import pickle
 import select
 import subprocess
 import sys
@@ -31,7 +30,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,9 @@ from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 
 VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
@@ -92,14 +93,18 @@ class TurnClock(Waking):
 class Clients:
     """What the clients of one axis ask for, as time passes; about six seconds, and again."""
 
-    def __init__(self, memory: Memory, axis: int, model: bytes) -> None:
-        """``model`` is a pickled compensation, to change to in motion."""
-        self._memory, self._axis, self._model = memory, axis, model
+    def __init__(self, memory: Memory, axis: int, setting: CompensationSetting) -> None:
+        """``setting`` compensates the axis; it is changed to in motion."""
+        self._memory, self._axis, self._setting = memory, axis, setting
         self._stream = 0
         self.steps = self._steps()
 
     def _post(self, kind: CommandKind, **fields: float) -> None:
         self._memory.commands.post(kind, self._axis, **fields)  # type: ignore[arg-type]
+
+    def _use(self, setting: CompensationSetting) -> None:
+        slot = self._memory.settings[self._axis]
+        self._post(CommandKind.CHANGE, i=slot.put(setting.to_json()))
 
     def _steps(self) -> Iterator[float]:
         """Each `next` is one thing that is asked; what it gives is how long to wait for the next, s."""
@@ -112,12 +117,12 @@ class Clients:
                 yield JOG_EVERY_S
             self._post(CommandKind.STOP)
             yield 0.7
-            self._post(CommandKind.COMPENSATE, i=0)
+            self._use(replace(self._setting, scheme=Scheme.NONE))
             yield 0.3
-            self._post(CommandKind.COMPENSATE, i=1)
+            self._use(self._setting)
             self._post(CommandKind.MOVE, a=0.0, b=SPEED, c=math.nan)
             yield 0.1
-            self._post(CommandKind.CHANGE, i=self._memory.blobs.put(self._model))
+            self._use(replace(self._setting, scheme=Scheme.SYNCHRONOUS))
             yield 1.4
             yield from self._streamed()
 
@@ -148,7 +153,7 @@ def serve(fd: int, axes: int) -> int:
         seen: dict[str, Any] = {"samples": 0, "lost": 0, "told": {}, "refused": []}
         model = TransmissionModel.load(PROFILE / "model.yaml")
         clients = [
-            Clients(memory, axis, pickle.dumps(compensation_for(config, model.bound_to(config))))
+            Clients(memory, axis, CompensationSetting(model.bound_to(config), Scheme.EXTENDED))
             for axis, config in enumerate(configs_of(axes, 1e3 * memory.period_s))
         ]
         due: list[float] = []

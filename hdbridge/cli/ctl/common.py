@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import signal
+import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import console, notes, write_json
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import DaemonError, HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from hdbridge.client.axis import Axis
     from hdbridge.client.messages import AxisState
 
+STOP_S: Final = 3.0
+"""How long the answer to a stop is waited for."""
 AtOption = Annotated[
     str | None,
     typer.Option(
@@ -50,6 +54,39 @@ def connected(at: str | None) -> Client:
     from hdbridge.client import Client
 
     return Client(at, name="hdbridge ctl")
+
+
+@contextmanager
+def stopping(at: str | None) -> Iterator[Client]:
+    """The daemon, to stop something. If it cannot do it, the error names the process that holds the bus."""
+    from hdbridge.client import Client
+
+    try:
+        with Client(at, name="hdbridge ctl", timeout_s=STOP_S) as client:
+            yield client
+    except DaemonError as problem:
+        if type(problem) is not DaemonError:
+            raise  # it answers
+        raise DaemonError(f"{problem}; {_who_holds(at)}") from None
+
+
+def _who_holds(at: str | None) -> str:
+    """The processes that hold an interface, or listen at the daemon's socket, and what to do about them."""
+    from hdbridge.client.address import find
+    from hdbridge.drive.interfacelock import holders, process_words
+
+    found = holders()
+    with suppress(HdbridgeError, OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as raw:
+        raw.settimeout(STOP_S)
+        raw.connect(str(find(at).socket))
+        listens, _, _ = struct.unpack("3i", raw.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        # The service listens; its parent is the keeper, which holds the interface.
+        number = int(Path(f"/proc/{listens}/stat").read_text().rpartition(")")[2].split()[1])
+        found.setdefault(number, f"the daemon is {process_words(number)}")
+    if not found:
+        return "no process of this machine holds an interface"
+    what_to_do = ", ".join(f"'kill {number}'" for number in found)
+    return f"{'; '.join(found.values())}; {what_to_do} stops its axes in order and ends it"
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from hdbridge.cli.ctl.common import (
     connected,
     moving,
     stopped_by_signals,
+    stopping,
     tell,
 )
 from hdbridge.cli.options import JsonOption, note_clamped
@@ -92,7 +93,7 @@ def home(
 
 def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     """Brake axes to rest within their limits; they stay enabled. Needs no right to move."""
-    with connected(at) as client:
+    with stopping(at) as client:
         states = [client.axis(each).stop() for each in axes] if axes else client.stop().axes
     for each in states:
         tell(each, None)
@@ -100,7 +101,7 @@ def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
 
 def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     """Stop axes as fast as their drives can, latched until a reset. Needs no right to move."""
-    with connected(at) as client:
+    with stopping(at) as client:
         states = [client.axis(each).quick_stop() for each in axes] if axes else client.quick_stop().axes
     for each in states:
         tell(each, None)

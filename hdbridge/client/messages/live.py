@@ -82,7 +82,7 @@ class Samples(Report):
     cycle: list[int]
     late_us: list[float]
     busy_us: list[float]
-    bus_load: list[float]
+    bus_load: _Column = Field(description="share of the bus in use; None without a bit rate")
     skipped: list[int] = Field(description="periods left out since the loop began")
     axes: dict[Name, AxisColumns]
     events: list[Event] = Field(default=[], description="what happened meanwhile")

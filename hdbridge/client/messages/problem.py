@@ -52,11 +52,11 @@ class Problem(Report):
     @classmethod
     def of(cls, error: HdbridgeError, axis: str | None = None) -> Problem:
         """The problem that an error is over HTTP."""
-        status, title = next(row for kind, row in STATUS.items() if isinstance(error, kind))
+        kind, (status, title) = next(row for row in STATUS.items() if isinstance(error, row[0]))
         detail = str(error)
         said, _, hint = detail.rpartition("; ")
         return cls(
-            type=f"{TYPE_PREFIX}{type(error).__name__}",
+            type=f"{TYPE_PREFIX}{kind.__name__}",
             title=title,
             status=status,
             detail=detail,

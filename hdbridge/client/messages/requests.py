@@ -152,7 +152,9 @@ class SdoValue(Report):
     subindex: int = Field(ge=0, le=0xFF, examples=[0])
     name: str = Field(description="its name in the EDS", examples=["Position actual value"])
     type: str = Field(description="its type", examples=["int32"])
-    value: int | float | bool | str = Field(description="bytes are hexadecimal", examples=[123456])
+    value: int | float | bool | str | None = Field(
+        description="bytes are hexadecimal; None for a float that is not a number", examples=[123456]
+    )
 
 
 class Mark(Request):

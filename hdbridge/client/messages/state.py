@@ -32,8 +32,7 @@ class Fault(Report):
     )
 
     def __str__(self) -> str:
-        """What happened and what to do, each once: the supervision's own words end with the hint."""
-        return self.text if self.text.endswith(self.hint) else f"{self.text}; {self.hint}"
+        return f"{self.text}; {self.hint}"
 
 
 class Limits(Report):

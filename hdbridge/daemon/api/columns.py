@@ -40,7 +40,7 @@ def columns(
         cycle=samples["cycle"].tolist(),
         late_us=_plain(samples["late_us"]),
         busy_us=_plain(samples["busy_us"]),
-        bus_load=_plain(samples["bus_load"]),
+        bus_load=[*_plain(samples["bus_load"])],
         skipped=samples["skipped"].tolist(),
         axes={
             name: _axis(samples["axes"][:, place])

@@ -1,7 +1,8 @@
 """What stands before the application on each listener: nothing that breaks its policy reaches a route.
 
-Host and origin, token, rate, requests under way, size and depth of a body, time to send it. Stopping is
-exempt from the rate and the number of requests under way: it is never refused to a client that may speak.
+Host and origin, token, requests under way, size and depth of a body, time to send it. A stop is never refused
+to a client that may speak: it does not count among the requests under way, and its body is not waited for.
+A refusal closes the connection, so that the rest of a refused body is not read.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import json
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
 
 from hdbridge.client.messages.problem import CONTENT_TYPE, Problem
-from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, Rate, too_deep
+from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, too_deep
 from hdbridge.daemon.api.problems import refusal
 from hdbridge.daemon.api.traffic import Traffic
 
@@ -24,8 +27,6 @@ BODY_S: Final = 10.0
 """Time in which a body has to be there."""
 REQUESTS_MAXIMUM: Final = 64
 WEBSOCKETS_MAXIMUM: Final = 32
-RATE_PER_S: Final = 200.0
-RATE_BURST: Final = 400.0
 STOPS: Final = ("/stop", "/quick-stop")
 _HEADERS: Final = {
     b"x-content-type-options": b"nosniff",
@@ -33,6 +34,7 @@ _HEADERS: Final = {
     b"cache-control": b"no-store",
     b"content-security-policy": b"default-src 'none'; frame-ancestors 'none'",
 }
+_CLOSE: Final = (b"connection", b"close")
 _PATH_LOGGED: Final = 200
 _log = logging.getLogger(__name__)
 
@@ -46,7 +48,6 @@ class Guard:
         self._app = app
         self._policy = policy
         self._traffic = traffic
-        self._rate = Rate(RATE_PER_S, RATE_BURST, now)
         self._now = now
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -61,6 +62,7 @@ class Guard:
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
         began = self._now()
         status = 0
+        stops = scope["path"].endswith(STOPS)
 
         async def sending(message: Message) -> None:
             nonlocal status
@@ -68,19 +70,21 @@ class Guard:
                 status = message["status"]
                 present = {name.lower() for name, _ in message["headers"]}
                 more = [each for each in _HEADERS.items() if each[0] not in present]
+                if stops:
+                    more.append(_CLOSE)  # its body may still be under way
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
         problem = self._refused(scope)
         body = b""
-        if problem is None:
+        if problem is None and not stops:
             body, problem = await _read(scope, receive)
         try:
             if problem is not None:
                 await _answer(problem, sending, "http.response")
             else:
                 with self._traffic.under_way("http"):
-                    await self._app(scope, _replayed(body, receive), sending)
+                    await self._app(scope, receive if stops else _replayed(body, receive), sending)
         finally:
             self._traffic.count(scope["method"], status)
             looks = scope["method"] in {"GET", "HEAD"} and status < 400
@@ -91,7 +95,8 @@ class Guard:
         problem = self._refused(scope)
         if problem is None:
             _log.info("websocket", _about(scope))
-            with self._traffic.under_way("websocket"):
+            # A client may go at any moment, also while it is told why its WebSocket is closed.
+            with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
             return
@@ -107,8 +112,8 @@ class Guard:
         scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], str(scope["scheme"]))
         if not policy.knows_host(host):
             return refusal(
-                421, f"{host[:100]!a} is no name of this machine; expected an address, localhost, or one of "
-                "api.tcp.names in the machine file",
+                421, f"{host[:100]!a} is not a name of this machine; expected an address, localhost, or one "
+                "of api.tcp.names in the machine file",
             )  # fmt: skip
         if not policy.knows_origin(headers.get("origin"), host, scheme):
             return refusal(403, "asked by a page from elsewhere; expected none, or the daemon's own page")
@@ -120,8 +125,6 @@ class Guard:
             )  # fmt: skip
         if scope["path"].endswith(STOPS):
             return None
-        if not self._rate.admits(_peer(scope)):
-            return refusal(429, f"more than {RATE_PER_S:g} requests a second; send set-points by a stream")
         kind, most = ("http", REQUESTS_MAXIMUM) if scope["type"] == "http" else (
             "websocket", WEBSOCKETS_MAXIMUM
         )  # fmt: skip
@@ -169,7 +172,9 @@ def _replayed(body: bytes, receive: Receive) -> Receive:
 
 async def _answer(problem: Problem, send: Send, kind: str) -> None:
     content = json.dumps(problem.model_dump(exclude_none=True, exclude_defaults=True)).encode()
-    headers = [(b"content-type", CONTENT_TYPE.encode()), (b"content-length", str(len(content)).encode())]
+    headers = [
+        (b"content-type", CONTENT_TYPE.encode()), (b"content-length", str(len(content)).encode()), _CLOSE,
+    ]  # fmt: skip
     if problem.status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
     await send({"type": f"{kind}.start", "status": problem.status, "headers": headers})
@@ -184,10 +189,6 @@ def _headers(scope: Scope) -> dict[str, str]:
         text = value.decode("latin-1")
         found[key] = f"{found[key]}, {text}" if key in found else text
     return found
-
-
-def _peer(scope: Scope) -> str:
-    return str((scope.get("client") or ("unknown",))[0])
 
 
 def _about(scope: Scope) -> dict[str, Any]:

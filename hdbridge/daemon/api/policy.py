@@ -1,4 +1,4 @@
-"""Who may ask what on one listener. Pure: no socket, no clock but the one passed in.
+"""Who may ask what on one listener. Pure: no socket, no clock.
 
 A page that the user opens elsewhere can send requests to a server on the user's own machine. So a request
 is refused whose ``Host`` is a name that this machine does not have (DNS rebinding) or whose ``Origin`` is not
@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass
 from hmac import compare_digest
 from typing import Final
@@ -37,7 +35,7 @@ class Policy:
     token: str | None = None
     """To be shown by every request for the API; None on a Unix socket, whose file mode decides."""
     names: frozenset[str] = frozenset()
-    """Further names that this machine is reached by, lower case."""
+    """Names by which a reverse proxy is reached, lower case."""
 
     def __post_init__(self) -> None:
         token = self.token
@@ -60,8 +58,15 @@ class Policy:
         return True
 
     def knows_origin(self, origin: str | None, host: str, scheme: str) -> bool:
-        """Whether a request comes from no web page, or from one that was loaded from here."""
-        return origin is None or origin.lower() == f"{scheme}://{host}".lower()
+        """Whether a request comes from no web page, or from one that was loaded from here.
+
+        A page that was loaded through a reverse proxy has one of the names, over HTTPS.
+        """
+        if origin is None or origin.lower() == f"{scheme}://{host}".lower():
+            return True
+        kind, _, place = origin.lower().partition("://")
+        match = _HOST.fullmatch(place)
+        return kind == "https" and match is not None and match[1] in self.names
 
     def needs_token(self, path: str) -> bool:
         """Whether a path shows or does anything; pages without data do not."""
@@ -93,25 +98,3 @@ def too_deep(body: bytes) -> bool:
         elif first in b"]}":
             depth -= 1
     return False
-
-
-class Rate:
-    """A token bucket per client: ``per_s`` requests a second on average, ``burst`` at once.
-
-    Memory is bounded: the least recently seen of more than ``clients`` is forgotten.
-    """
-
-    def __init__(self, per_s: float, burst: float, now: Callable[[], float], clients: int = 1024) -> None:
-        self._per_s, self._burst, self._now, self._clients = per_s, burst, now, clients
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def admits(self, client: str) -> bool:
-        """Whether this client may ask now; it is counted by that."""
-        now = self._now()
-        left, before = self._buckets.pop(client, (self._burst, now))
-        left = min(self._burst, left + (now - before) * self._per_s)
-        admitted = left >= 1.0
-        self._buckets[client] = (left - admitted, now)
-        if len(self._buckets) > self._clients:
-            self._buckets.popitem(last=False)
-        return admitted

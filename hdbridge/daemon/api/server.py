@@ -1,7 +1,8 @@
 """The server under the application: uvicorn on sockets that are open already, one guard for each.
 
 uvicorn's own part is bounded here: connections, time to send a request's head, size of a message, time that a
-WebSocket may be silent.
+WebSocket may be silent. A connection too many takes the place of the one that has been idle the longest, so
+that connections without a request keep nobody out.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, cast
 
 import uvicorn
@@ -28,6 +28,9 @@ from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.service.interface import Bridge
 
 CONNECTIONS_MAXIMUM: Final = 256
+"""For each listener. More than the requests and WebSockets that may be under way, which are not closed."""
+ACCEPTED_AT_ONCE: Final = 64
+"""Fewer than those: a request that came with its connection is read before the connection can be closed."""
 HEAD_S: Final = 10.0
 """Time in which the head of a request has to be there."""
 HEAD_BYTES: Final = 16 << 10
@@ -44,9 +47,6 @@ class Listener:
 
     socket: socket.socket
     policy: Policy
-    certificate: Path | None = None
-    """Chain for TLS, PEM."""
-    key: Path | None = None
 
 
 class ApiServer:
@@ -54,14 +54,14 @@ class ApiServer:
 
     def __init__(self, bridge: Bridge, listeners: Sequence[Listener], metrics: Metrics | None = None) -> None:
         self.traffic = Traffic()
-        self._listeners = listeners
-        app = create_app(bridge, metrics or Metrics(), self.traffic)
-        self._servers = [_Server(_config(app, each, self.traffic)) for each in listeners]
+        self._app = create_app(bridge, metrics or Metrics(), self.traffic)
+        self._servers = [(self._server(each), each) for each in listeners]
+        self._group = asyncio.TaskGroup()
 
     @property
     def started(self) -> bool:
         """Whether every listener is served."""
-        return all(each.started for each in self._servers)
+        return all(server.started for server, _ in self._servers)
 
     async def run(self) -> None:
         """Serve until `stop`, or until the task is cancelled; open requests get a moment to end."""
@@ -69,14 +69,23 @@ class ApiServer:
         for name in ("uvicorn", "uvicorn.error", "websockets"):
             logging.getLogger(name).setLevel(logging.WARNING)
         logging.getLogger("uvicorn.error").addFilter(_worth_telling)
-        async with asyncio.TaskGroup() as group:
-            for server, listener in zip(self._servers, self._listeners, strict=True):
+        async with self._group as group:
+            for server, listener in self._servers:
                 group.create_task(server.serve(sockets=[listener.socket]))
+
+    def add(self, listener: Listener) -> None:
+        """Serve one more listener while it runs."""
+        server = self._server(listener)
+        self._servers.append((server, listener))
+        self._group.create_task(server.serve(sockets=[listener.socket]))
+
+    def _server(self, listener: Listener) -> _Server:
+        return _Server(_config(self._app, listener, self.traffic))
 
     def stop(self) -> None:
         """End soon; may be called from a signal handler or another thread."""
-        for each in self._servers:
-            each.should_exit = True
+        for server, _ in self._servers:
+            server.should_exit = True
 
 
 class _Server(uvicorn.Server):
@@ -86,6 +95,12 @@ class _Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         yield
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve; the kernel queues more connections than are accepted at once."""
+        await super().startup(sockets)
+        for each in sockets or ():
+            each.listen(BACKLOG)
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End; what clients have left open by then is cut."""
         await super().shutdown(sockets)
@@ -94,14 +109,35 @@ class _Server(uvicorn.Server):
 
 
 class _Connection(H11Protocol):
-    """Knows its peer by the kernel's word, and does not wait for ever for a request."""
+    """Knows its peer by the kernel's word, and does not wait for ever for a request or for its reader."""
 
     _watch: asyncio.TimerHandle | None = None
+    _idle_since_s = 0.0
+    _unsent = 0
+    """Bytes that waited for the reader at the last check."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.client = _client(transport) or self.client
+        self._idle_since_s = self.loop.time()
         self._watch = self.loop.call_later(HEAD_S, self._check)
+        others = [
+            each
+            for each in self.connections
+            if isinstance(each, _Connection) and each is not self and not each.transport.is_closing()
+        ]
+        idle = [each for each in others if each.idle]
+        if len(others) >= CONNECTIONS_MAXIMUM and idle:
+            min(idle, key=lambda each: each._idle_since_s).transport.abort()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no request is being answered: none has come as a whole."""
+        return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+
+    def on_response_complete(self) -> None:
+        self._idle_since_s = self.loop.time()
+        super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._watch is not None:
@@ -112,7 +148,8 @@ class _Connection(H11Protocol):
         """Close what has sent no whole head in all the time, or does not take what it was sent."""
         if self.transport.get_protocol() is not self:  # a WebSocket by now: its pings decide
             return
-        if self.transport.is_closing():
+        unsent, self._unsent = self._unsent, self.transport.get_write_buffer_size()
+        if self.transport.is_closing() or (unsent and unsent == self._unsent):
             self.transport.abort()
             return
         idle = self.cycle is None or self.cycle.response_complete
@@ -145,8 +182,9 @@ class _WebSocket(WebSocketsSansIOProtocol):
 
 
 def _worth_telling(record: logging.LogRecord) -> bool:
-    """Not what the server takes for an error of the application: a WebSocket that was refused."""
-    return "without completing handshake" not in record.getMessage()
+    """Drops what a client has done: a WebSocket that was refused, and a message that is not UTF-8."""
+    words = record.getMessage()
+    return "without completing handshake" not in words and "Invalid UTF-8" not in words
 
 
 def _client(transport: asyncio.BaseTransport) -> tuple[str, int] | None:
@@ -168,8 +206,7 @@ def _config(app: Any, listener: Listener, traffic: Traffic) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        backlog=BACKLOG,
-        limit_concurrency=CONNECTIONS_MAXIMUM,
+        backlog=ACCEPTED_AT_ONCE,
         timeout_keep_alive=IDLE_S,
         timeout_graceful_shutdown=ENDING_S,
         h11_max_incomplete_event_size=HEAD_BYTES,
@@ -177,6 +214,4 @@ def _config(app: Any, listener: Listener, traffic: Traffic) -> uvicorn.Config:
         ws_ping_interval=PING_S,
         ws_ping_timeout=PING_S,
         ws_per_message_deflate=False,
-        ssl_certfile=listener.certificate,
-        ssl_keyfile=listener.key,
     )

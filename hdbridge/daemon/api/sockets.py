@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import grp
-import ipaddress
 import os
 import socket
 import stat
@@ -19,7 +18,8 @@ from typing import Final, NamedTuple
 from hdbridge.errors import DaemonError, InputError
 
 MODE: Final = 0o660
-BACKLOG: Final = 128
+LOOPBACK: Final = "127.0.0.1"
+BACKLOG: Final = 1024
 PATH_MAXIMUM: Final = 107
 """Bytes that the kernel takes for the path of a Unix socket."""
 _CREDENTIALS: Final = struct.Struct("3i")
@@ -60,50 +60,30 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
     return listener
 
 
-def tcp_socket(host: str, port: int, option: str = "api.tcp.port") -> socket.socket:
-    """A listening TCP socket; DaemonError where the port is taken, InputError for a host that is none.
+def file_of(path: Path) -> tuple[int, int]:
+    """Device and inode of a socket file: another file of that name is not the one that was bound."""
+    found = path.lstat()
+    return found.st_dev, found.st_ino
 
-    ``option`` is where the port can be changed, for complaints.
+
+def tcp_socket(port: int, option: str = "api.tcp.port") -> socket.socket:
+    """A listening TCP socket that only this machine reaches.
+
+    DaemonError if the port is taken, which ``option`` has given; InputError if it cannot be bound.
     """
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except (socket.gaierror, UnicodeError):
-        raise InputError(f"api.tcp.host: found {host!r}; expected an address of this machine") from None
-    listener = socket.socket(family, kind, protocol)
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
+        listener.bind((LOOPBACK, port))
         listener.listen(BACKLOG)
     except OSError as problem:
         listener.close()
         if problem.errno == errno.EADDRINUSE:
             raise DaemonError(
-                f"{host}:{port}: another process listens there; stop it, or give {option} another number"
+                f"{LOOPBACK}:{port}: another process listens there; stop it, or give {option} another number"
             ) from None
-        raise InputError(f"{option}: {host}:{port} cannot be listened at: {problem.strerror}") from None
+        raise InputError(f"{LOOPBACK}:{port}: {option} cannot be bound: {problem.strerror}") from None
     return listener
-
-
-def check_exposure(host: str, *, tls: bool, unencrypted: bool) -> None:
-    """InputError where the token would cross a network in the clear and nobody has said that it may."""
-    if tls or unencrypted or is_loopback(host):
-        return
-    raise InputError(
-        f"api.tcp.host: found {host!r}, which others reach, without TLS: the token could be read on the way; "
-        "give api.tcp.certificate and api.tcp.key, listen at 127.0.0.1, or state api.tcp.unencrypted: true"
-    )
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches it."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def peer_of(connected: socket.socket) -> Peer | None:

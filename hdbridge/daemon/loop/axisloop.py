@@ -8,40 +8,35 @@ state, so that the turn itself decides nothing. `AxisLoop.after` looks at what t
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Callable
 from typing import Final
 
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
-from hdbridge.control.compensation import Compensation
 from hdbridge.daemon.loop.axissample import AxisSampler
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.knotfeed import KnotFeed
 from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
-from hdbridge.daemon.memory.blob import Blob
 from hdbridge.daemon.memory.knots import KnotQueue
 from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind
+from hdbridge.daemon.memory.setting import SettingSlot
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State, decode
-from hdbridge.drive.supervision import Reaction, Supervision
+from hdbridge.drive.supervision import EXPLAINED_HINT, Reaction, Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STOP_TIMEOUT_S
-from hdbridge.errors import HdbridgeError, InputError, TransitionError
+from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
-_NOT_A_PICKLE: Final = (
-    pickle.UnpicklingError, AttributeError, ImportError, EOFError, IndexError, KeyError, TypeError,
-    ValueError,
-)  # fmt: skip
 _UNDER_COMMAND: Final = (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING)
 
 
 class AxisLoop:
     """One axis; silent and unverified until the service says that its drive is verified."""
 
-    def __init__(self, index: int, setup: AxisSetup, knots: KnotQueue, blobs: Blob, tell: Tell) -> None:
+    def __init__(self, index: int, setup: AxisSetup, knots: KnotQueue, slot: SettingSlot, tell: Tell) -> None:
         config = setup.config
         self.index = index
         self.config = config
@@ -56,7 +51,8 @@ class AxisLoop:
         self.broken: frozenset[int] = frozenset()
         """The group of a stream that this axis has left before its end: the others are to stop."""
 
-        self._blobs, self._tell = blobs, tell
+        self._slot, self._tell = slot, tell
+        slot.use(0)
         self._feed = KnotFeed(knots, self.set_point)
         self._faults = FaultLog(index, self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
@@ -88,9 +84,7 @@ class AxisLoop:
             CommandKind.JOG: self._jog,
             CommandKind.STOP: self._stop,
             CommandKind.STREAM_END: lambda _: self._feed.end(),
-            CommandKind.COMPENSATE: lambda command: self.follower.engage(bool(command.i)),
             CommandKind.CHANGE: self._change,
-            CommandKind.LOAD_LOOP: lambda command: self.follower.switch_load_loop(bool(command.i)),
             CommandKind.DRIVE_FAULT_RESET: lambda _: self.image.power.reset_fault(),
         }
 
@@ -226,7 +220,7 @@ class AxisLoop:
         if state is not State.SWITCH_ON_DISABLED:
             raise TransitionError(
                 f"{self.config.name}: the drive is in '{state.value}', but it is enabled from 'switch on "
-                "disabled'; reset its fault, or disable it first"
+                f"disabled'; reset its fault ({RESET}), or disable it first"
             )
         self.image.check_target(command.i)
         self._seed(command)
@@ -247,7 +241,7 @@ class AxisLoop:
 
     def _quick_stop(self, _: Command) -> None:
         if self.state in (*_UNDER_COMMAND, AxisState.LENT):
-            self._why = "quick stop by command: latched; reset it when the axis may move again"
+            self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
             # What the service does by SDO is overruled by the next RPDO.
             self.image.power.quick_stop()
@@ -281,16 +275,11 @@ class AxisLoop:
             self.set_point.stop()
 
     def _change(self, command: Command) -> None:
-        try:
-            new = pickle.loads(self._blobs.get(command.i))
-        except _NOT_A_PICKLE as error:
-            raise InputError(f"{self.config.name}: what was sent cannot be loaded: {error}") from error
-        if not isinstance(new, Compensation):
-            raise InputError(f"{self.config.name}: {type(new).__name__} is no compensation")
-        moving = self.state in (AxisState.ENABLED, AxisState.STOPPING)
-        self.follower.change(new, moving=moving)
-        self._changing = moving
-        if not moving:
+        setting = CompensationSetting.from_json(self._slot.get(command.i))
+        self.follower.use(setting, moving=self.state in (AxisState.ENABLED, AxisState.STOPPING))
+        self._slot.use(command.i)
+        self._changing = self.follower.correction.changing
+        if not self._changing:
             self._tell(self.index, EventKind.CHANGED, command.id, 0)
 
     # ---------------------------------------------------------------- power
@@ -405,7 +394,10 @@ class AxisLoop:
         self.stands = True
         stop = self.supervision.stop
         code = FAULT_INDEX[stop.fault] if stop is not None else NO_FAULT
-        self._tell(self.index, EventKind.STOPPED, 0, code, self._stop_words())
+        error = self.cycle.stopped
+        explained = error is not None and error.hint == EXPLAINED_HINT
+        text = error.text if error is not None else self._why
+        self._tell(self.index, EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
         """Whether the quick stop of a command is over: the motor stands, or the time for it has passed."""

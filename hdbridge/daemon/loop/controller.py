@@ -55,7 +55,7 @@ class Controller:
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
-            AxisLoop(index, setup, memory.knots[index], memory.blobs, self._tell)
+            AxisLoop(index, setup, memory.knots[index], memory.settings[index], self._tell)
             for index, setup in enumerate(setups)
         )
         for axis in self.axes:
@@ -147,10 +147,7 @@ class Controller:
     def _command(self, command: Command) -> None:
         try:
             kind = CommandKind(command.kind)
-            if kind is CommandKind.ENDING:
-                self._tell(_ALL, EventKind.DONE, command.id)
-                self.end()
-            elif kind is CommandKind.STREAM_BEGIN:
+            if kind is CommandKind.STREAM_BEGIN:
                 self._begin_stream(command)
             elif command.axis == _ALL and kind in (CommandKind.QUICK_STOP, CommandKind.STOP):
                 for axis in self.axes:

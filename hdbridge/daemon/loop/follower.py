@@ -18,10 +18,12 @@ from hdbridge.control.loadloop import LoadLoop
 from hdbridge.control.sensed import Sensed
 from hdbridge.control.switchover import Correction
 from hdbridge.daemon.machinefile import LoadLoopSettings
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.effects import Moment, Observer
 from hdbridge.errors import InputError
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -81,23 +83,23 @@ class Follower:
         else:
             self.correction.disengage()
 
-    def change(self, new: Compensation, *, moving: bool) -> None:
-        """Go over to another compensation: by a ramp, or at once where nothing moves. InputError: unfit."""
-        new.model.check_bound_to(self._axis)
-        if moving:
-            self.correction.change(new)
-        else:
-            self.correction = Correction(new)
-        self.changed()
+    def use(self, setting: CompensationSetting, *, moving: bool) -> None:
+        """Compensate by a setting from now on: by a ramp if the axis moves, else at once.
 
-    def switch_load_loop(self, on: bool) -> None:
-        """The slow integral on, or faded out. InputError where the axis has none."""
-        if self._load_loop is None:
-            raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
-        if on:
-            # From what it adds now, so that nothing jumps; what it has doubted before it may look at again.
+        InputError, and nothing has changed, if the setting does not fit the axis.
+        """
+        new = setting.compensation(self._axis)
+        if new.model != self.correction.model:
+            if moving:
+                self.correction.change(new)
+            else:
+                self.correction = Correction(new)
+            self.changed()
+        self.engage(setting.scheme is not Scheme.NONE)
+        if setting.load_loop and not self._load_loop_on and self._load_loop is not None:
+            # It starts from the value that is in the target now, so that nothing jumps.
             self._load_loop.reset(self.loop_arcsec)
-        self._load_loop_on = on
+        self._load_loop_on = setting.load_loop
 
     # ---------------------------------------------------------------- turn by turn
 

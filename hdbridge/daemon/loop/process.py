@@ -29,7 +29,7 @@ from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, begin_child
 from hdbridge.drive.link import Link
 from hdbridge.errors import HdbridgeError
-from hdbridge.evaluation.stepping import Scheme
+from hdbridge.model import TransmissionModel
 
 AT_ONCE: Final = 2
 """``STOP_ASKED`` for an end by quick stop."""
@@ -49,10 +49,9 @@ def main(arguments: list[str]) -> int:
 
 
 def run(start: Start) -> None:
-    """Turn the loop of a machine until SIGTERM, ``STOP_ASKED`` or an ENDING command has brought it to rest.
+    """Turn the loop of a machine until SIGTERM or ``STOP_ASKED`` has brought it to rest.
 
-    Raises `BusError` where the bus cannot be opened, `BusInUseError` where another master is heard on it, and
-    `InputError` where a model cannot be read.
+    Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is heard on it.
     """
     machine = start.machine
     terminated = False
@@ -86,14 +85,9 @@ def run(start: Start) -> None:
 
 
 def setup_of(axis: Axis) -> AxisSetup:
-    """What an axis begins with: its active model, as far as its scheme uses it."""
-    scheme = axis.compensation
-    return AxisSetup(
-        axis.config,
-        compensation_for(axis.config, scheme.of(axis.model())),
-        compensating=scheme is not Scheme.NONE,
-        load_loop=axis.load_loop,
-    )
+    """An axis starts uncompensated; the service sends its setting before the axis can be enabled."""
+    nothing = compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
+    return AxisSetup(axis.config, nothing, compensating=False, load_loop=axis.load_loop)
 
 
 def _bitrate(start: Start) -> int | None:
@@ -123,7 +117,13 @@ def _simulated(machine: Machine, simulation: Simulation) -> Iterator[tuple[Link,
     from hdbridge.sim.paced import PacedClock  # noqa: PLC0415
 
     axes = [
-        SimulatedAxis(truth, axis.config.eds_path, axis.config.drive.node_id, simulation.seed + place)
+        SimulatedAxis(
+            truth,
+            axis.config.eds_path,
+            axis.config.drive.node_id,
+            simulation.seed + place,
+            axis.config.load_encoder.source.address,
+        )
         for place, (axis, truth) in enumerate(zip(machine.axes, simulation.truths, strict=True))
     ]
     clock = PacedClock(time.monotonic(), simulation.speed)

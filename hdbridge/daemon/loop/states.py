@@ -95,7 +95,7 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
         for state in (_S.UNVERIFIED, _S.DISABLED, _S.QUICK_STOPPED, _S.LATCHED)
     ),
     # What compensates is the service's choice at any time.
-    *(Transition(state, kind, state) for state in _S for kind in (_C.COMPENSATE, _C.CHANGE, _C.LOAD_LOOP)),
+    *(Transition(state, _C.CHANGE, state) for state in _S),
     *(Transition(state, _H.STOP_LATCHED, _S.QUICK_STOPPED) for state in _SPEAKING),
     *(
         Transition(state, _H.VERIFICATION_LOST, _S.LATCHED)
@@ -113,8 +113,8 @@ _WAY_OUT: Final = {
     _S.ENABLED: "disable it first",
     _S.STOPPING: "wait until it is disabled",
     _S.LENT: "wait until the service has given it back",
-    _S.QUICK_STOPPED: "remove the cause, then reset it",
-    _S.LATCHED: "remove the cause, verify the drive again, then reset it",
+    _S.QUICK_STOPPED: "remove the cause, then reset it: hdbridge ctl reset AXIS",
+    _S.LATCHED: "remove the cause, then reset it, which verifies the drive again: hdbridge ctl reset AXIS",
 }
 """What a person does where a command is refused."""
 

@@ -7,7 +7,7 @@
     outgoing    CAN frames that the service wants sent, bounded     service -> control process
     commands    bounded                                             service -> control process
     knots       one bounded queue per axis                          service -> control process
-    blob        one pickled object                                  service -> control process
+    settings    one slot per axis: what compensates it              service -> control process
 
 All numbers are in the machine's own byte order: both ends run on it. A slot begins and ends with its sequence
 number, counted from 1. A change of anything here is a new `VERSION`.
@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 1
+VERSION: Final = 2
 PAGE: Final = 4096
 LINE: Final = 64
 """A cache line: what two processes write lies in different ones."""
@@ -34,7 +34,7 @@ INCOMING_KEPT: Final = 4096
 OUTGOING_SLOTS: Final = 256
 COMMAND_SLOTS: Final = 256
 KNOT_SLOTS: Final = 8192
-BLOB_BYTES: Final = 1 << 20
+SETTING_BYTES: Final = 1 << 18
 TEXT_BYTES: Final = 400
 """Longest text of an event, bytes of UTF-8; more is cut."""
 NO_FAULT: Final = 255
@@ -93,16 +93,10 @@ class CommandKind(IntEnum):
     """a time-out s, i mask of the axes that begin in the same cycle, j number of the stream."""
     STREAM_END = 13
     """No more knots come: the axis goes to the last one and rests, or brakes."""
-    COMPENSATE = 14
-    """i is 1 to fade the correction in, 0 to fade it out."""
-    CHANGE = 15
-    """Another compensation; i is the number of the blob."""
-    LOAD_LOOP = 16
-    """i is 1 for the slow integral at the load on, 0 for off."""
-    DRIVE_FAULT_RESET = 17
+    CHANGE = 14
+    """Compensate by another setting; i is its number."""
+    DRIVE_FAULT_RESET = 15
     """Reset the drive's own fault, by its controlword."""
-    ENDING = 18
-    """Axis -1: stop all in order, disable, end the process."""
 
 
 class EventKind(IntEnum):
@@ -117,7 +111,9 @@ class EventKind(IntEnum):
     FAULT = 4
     """``code`` is the index in ``list(Fault)``, ``text`` the detail."""
     STOPPED = 5
-    """The supervision has latched; ``text`` is the whole explanation, ``code`` the index of its cause."""
+    """The supervision has latched; ``text`` explains it, ``code`` is the index of its cause (`NO_FAULT`: a
+    command), ``id`` is 1 if an emergency message of the drive explains it.
+    """
     MOTION_ENDED = 6
     """The set-point has come to rest; ``code`` is the `MotionMode` that has ended, ``id`` its command."""
     UNDERRUN = 7
@@ -277,7 +273,7 @@ class Layout(NamedTuple):
     outgoing: Place
     commands: Place
     knots: tuple[Place, ...]
-    blob: Place
+    settings: tuple[Place, ...]
     total: int
 
     @classmethod
@@ -297,5 +293,6 @@ class Layout(NamedTuple):
         outgoing = place(OUTGOING_SLOTS, FRAME.size)
         commands = place(COMMAND_SLOTS, COMMAND.size)
         knots = tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes))
-        blob = place(1, BLOB_BYTES)
-        return cls(axes, samples, events, incoming, outgoing, commands, knots, blob, -(-end // PAGE) * PAGE)
+        settings = tuple(place(1, SETTING_BYTES) for _ in range(axes))
+        total = -(-end // PAGE) * PAGE
+        return cls(axes, samples, events, incoming, outgoing, commands, knots, settings, total)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Self
 
-from hdbridge.daemon.memory.blob import Blob
 from hdbridge.daemon.memory.events import EventReader, EventWriter
 from hdbridge.daemon.memory.frames import IncomingReader, IncomingWriter, Outgoing
 from hdbridge.daemon.memory.knots import KnotQueue
@@ -12,6 +11,7 @@ from hdbridge.daemon.memory.layout import AXES_AT_MOST, Layout
 from hdbridge.daemon.memory.mailbox import Mailbox
 from hdbridge.daemon.memory.region import ORDERED, Region
 from hdbridge.daemon.memory.samples import SampleReader, SampleWriter
+from hdbridge.daemon.memory.setting import SettingSlot
 from hdbridge.daemon.memory.status import Status
 from hdbridge.errors import InputError
 
@@ -20,7 +20,7 @@ class Memory:
     """Shared memory for a number of axes on one bus.
 
     The control process writes ``samples``, ``events`` and ``incoming`` and takes from ``commands``,
-    ``outgoing``, ``knots`` and ``blobs``; the service does the opposite, with readers of its own
+    ``outgoing``, ``knots`` and ``settings``; the service does the opposite, with readers of its own
     (`reader`, `event_reader`, `incoming_reader`: as many as it likes).
     """
 
@@ -37,7 +37,7 @@ class Memory:
         self.outgoing = Outgoing(region, layout, checked=checked)
         self.commands = Mailbox(region, layout, checked=checked)
         self.knots = tuple(KnotQueue(region, place, checked=checked) for place in layout.knots)
-        self.blobs = Blob(region, layout)
+        self.settings = tuple(SettingSlot(region, place) for place in layout.settings)
         self.status = Status(region)
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -32,7 +33,9 @@ class AxisAbout:
     @classmethod
     def of(cls, axis: AxisConfig, identity: Identity | None = None) -> Self:
         """From the axis file and the drive that answered there."""
-        text = axis.path.read_text(encoding="utf-8") if axis.path.is_file() else ""
+        text = ""
+        with suppress(OSError):  # the axis file is there for people to read
+            text = axis.path.read_text(encoding="utf-8")
         channels = tuple(BY_KEY[key].value for key in axis.channels)
         return cls(axis.name, axis.gear.ratio, text, identity or axis.drive.identity, channels)
 

@@ -143,6 +143,8 @@ def _split(rows: Columns, cuts: NDArray[np.intp]) -> list[Columns]:
 
 def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
     columns = {"time_s": rows["cycle"] * period_s, **{name: rows[name] for name in MEASURED}}
+    if np.isnan(columns["motor_torque_nm"]).any():
+        del columns["motor_torque_nm"]  # the drive does not send it
     for place, channel in enumerate(axis.channels):
         if np.all(rows["flags"] & (SampleFlag.CHANNEL0_KNOWN << place)):
             columns[channel] = rows[f"reading{place}"]

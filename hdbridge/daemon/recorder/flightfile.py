@@ -21,6 +21,8 @@ from hdbridge.daemon.recorder.about import About
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE, Message, axis_messages, machine_messages
 
 PART: Final = ".part"
+KEPT: Final = "kept"
+"""Folder, within the recorder's, of the recordings that a fault is in."""
 CHUNK_BYTES: Final = 64 << 20
 """Larger than any second: chunks end where they are flushed."""
 EVENTS: Final = "/events"

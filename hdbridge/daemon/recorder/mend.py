@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, Footer, Header, Message, Metadata,
 from mcap.writer import Writer
 
 from hdbridge.daemon.recorder.flightfile import PART
-from hdbridge.daemon.recorder.reading import SUFFIX, records_of
+from hdbridge.daemon.recorder.reading import SUFFIX, GoneError, records_of
 from hdbridge.errors import InputError, OutputError
 
 MENDING: Final = ".mending"
@@ -30,6 +30,8 @@ def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> li
     for part in sorted(folder.glob(f"*{SUFFIX}{PART}")):
         try:
             path = mend(part)
+        except GoneError:
+            continue
         except (InputError, OutputError) as problem:
             say(str(problem))
             continue
@@ -41,7 +43,8 @@ def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> li
 def mend(path: Path) -> Path | None:
     """Mend one file; its name afterwards, or None where nothing of it was whole and it was removed.
 
-    A finished one stays as it is. InputError where it is being written; OutputError where there is no room.
+    A finished one stays as it is. InputError if it is being written, `GoneError` if it does not exist any
+    more, OutputError if there is no space.
     """
     target = path.with_name(path.name.removesuffix(PART))
     aside = target.with_name(f".{target.name}{MENDING}")
@@ -66,6 +69,11 @@ def mend(path: Path) -> Path | None:
                 path.unlink()
                 return None
             _sync_folder(path.parent)
+    except FileNotFoundError:
+        aside.unlink(missing_ok=True)
+        raise GoneError(
+            f"{path}: there is no such file; another process has finished or removed it"
+        ) from None
     except OSError as problem:
         aside.unlink(missing_ok=True)
         raise OutputError(

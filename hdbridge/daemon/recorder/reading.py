@@ -1,14 +1,19 @@
-"""Reads flight recordings, finished or not: everything up to the last whole chunk."""
+"""Reads flight recordings, finished or not: everything up to the last whole chunk.
+
+The recorder may be at work in the same folder: a file is renamed when it is finished and when it is kept, and
+removed when the folder is full. A recording is found under its present name as long as it exists.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.reader import SeekingReader
@@ -18,14 +23,19 @@ from numpy.typing import NDArray
 from zstandard import ZstdError
 
 from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightfile import EVENTS, MACHINE_TOPIC, MODEL, PART, axis_topic
+from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
 from hdbridge.files.regular import open_regular
 
+T = TypeVar("T")
 SUFFIX: Final = ".mcap"
 TORN: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
 """What reading the end of a file that was cut off may raise; ValueError: a checksum that is wrong."""
+
+
+class GoneError(InputError):
+    """The recording does not exist any more: the recorder, or a person, has removed it."""
 
 
 class Told(NamedTuple):
@@ -66,26 +76,56 @@ class Flight:
     models: tuple[ModelUsed, ...] = ()
 
 
-def flight_files(paths: list[Path]) -> list[Path]:
-    """Files as they are; of a folder its recordings and those that are kept, by their names, which begin with
-    their dates. InputError where there is none.
+def flight_files(paths: Sequence[Path]) -> list[Path]:
+    """Files as they are; for a folder its recordings, kept ones included, in the order of their dates.
+
+    InputError if a folder has none.
     """
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = [
-                each for each in path.rglob(f"*{SUFFIX}*") if each.name.endswith((SUFFIX, SUFFIX + PART))
-            ]
+            inside = _inside(path)
             if not inside:
                 raise InputError(f"{path}: no {SUFFIX} file in this folder; expected flight recordings")
             found += sorted(inside, key=lambda each: each.name)
-        elif not path.exists():
-            raise InputError(f"{path}: there is no such file or folder; expected a flight recording")
-        elif not (path.is_file() and path.name.endswith((SUFFIX, SUFFIX + PART))):
-            raise InputError(f"{path}: is no flight recording; expected a file that ends in {SUFFIX}")
-        else:
+        elif path.name.endswith((SUFFIX, SUFFIX + PART)):
             found.append(path)
+        else:
+            problem = "not a flight recording" if path.exists() else "no such file or folder"
+            raise InputError(f"{path}: {problem}; expected a file that ends in {SUFFIX}, or a folder of them")
     return found
+
+
+def _inside(folder: Path) -> list[Path]:
+    """The recordings of a folder, each once, whatever is renamed meanwhile."""
+    found: dict[Path, Path] = {}
+    for _ in range(2):  # a file that is renamed during the first look may be missing from it
+        for place, _, names in os.walk(folder):
+            for name in names:
+                if name.endswith((SUFFIX, SUFFIX + PART)):
+                    path = Path(place, name)
+                    found.setdefault(_places(path)[-1], path)
+    return [*found.values()]
+
+
+def _places(path: Path) -> tuple[Path, ...]:
+    """The names that a recording has one after the other, from ``path`` on."""
+    finished = path.with_name(path.name.removesuffix(PART))
+    kept = finished if path.parent.name == KEPT else path.parent / KEPT / finished.name
+    return (path, finished, kept)
+
+
+def each_flight(paths: Sequence[Path], look: Callable[[Path], T]) -> Iterator[T]:
+    """``look`` at each recording of files and folders.
+
+    One that the recorder removes meanwhile is left out; `GoneError` if it was named itself.
+    """
+    for path in flight_files(paths):
+        try:
+            yield look(path)
+        except GoneError:
+            if path in paths:
+                raise
 
 
 def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
@@ -113,7 +153,8 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
     times: list[int] = []
     finished = False
     wanted = None if axes is None else {MACHINE_TOPIC, *map(axis_topic, axes)}
-    with _opened(path) as file:
+    path, opened = _opened(path)
+    with opened as file:
         for record in records_of(file, path):
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
@@ -157,8 +198,9 @@ class Overview(NamedTuple):
 
 def overview(path: Path) -> Overview:
     """Of a finished file from its index, without reading its samples."""
-    size = path.stat().st_size
-    with _opened(path) as file:
+    path, opened = _opened(path)
+    with opened as file:
+        size = os.fstat(file.fileno()).st_size
         try:
             reader = SeekingReader(file)
             summary = reader.get_summary()
@@ -187,11 +229,16 @@ def overview(path: Path) -> Overview:
     )
 
 
-def _opened(path: Path) -> BinaryIO:
-    try:
-        return open_regular(path)
-    except OSError as problem:
-        raise InputError(f"{path}: cannot be read: {problem.strerror}") from None
+def _opened(path: Path) -> tuple[Path, BinaryIO]:
+    """The recording under its present name, opened."""
+    for place in _places(path):
+        try:
+            return place, open_regular(place)
+        except FileNotFoundError:
+            continue
+        except OSError as problem:
+            raise InputError(f"{place}: cannot be read: {problem.strerror}") from None
+    raise GoneError(f"{path}: there is no such file or folder; expected a flight recording")
 
 
 def _told(message: Message) -> Told:

@@ -18,11 +18,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from hdbridge.daemon.recorder.flightfile import PART
+from hdbridge.daemon.recorder.flightfile import KEPT, PART
 from hdbridge.daemon.recorder.reading import SUFFIX
 from hdbridge.daemon.recorder.settings import RecorderSettings
 
-KEPT: Final = "kept"
 _MB: Final = 1e6
 _DAY_S: Final = 86_400.0
 _NS: Final = 1_000_000_000

@@ -43,8 +43,8 @@ class Adapting:
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """From the observer."""
-        if self._axis.models.in_use.model is not self._of:
-            self._begin(self._axis.models.in_use.model)
+        if self._axis.models.chosen.model is not self._of:
+            self._begin(self._axis.models.chosen.model)
         if self._sink is None or self._health is None:
             return
         if len(samples):
@@ -78,11 +78,11 @@ class Adapting:
 
         A job measures with one model: it is not changed until the job has ended.
         """
-        if self._sink is None or self._axis.models.in_use.model is not self._of:
+        if self._sink is None or self._axis.models.chosen.model is not self._of:
             return
         model = self._sink.axes[0].adaptation.model
-        in_use = self._axis.models.in_use
-        if model.effects == (in_use.adapted or in_use.model).effects or self._axis.motion.busy(Kind.JOB):
+        chosen = self._axis.models.chosen
+        if model.effects == (chosen.adapted or chosen.model).effects or self._axis.motion.busy(Kind.JOB):
             return
         try:
             await self._axis.follow(model)

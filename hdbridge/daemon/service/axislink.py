@@ -9,6 +9,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
 from hdbridge.daemon.service.activity import Activity
 from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
+from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
 from hdbridge.errors import DaemonError, InputError, RefusedError, SafetyStop
@@ -111,7 +112,7 @@ class AxisLink:
         for event in log.of_axis(self.index, activity.since):
             if event.kind is EventKind.STOPPED:
                 activity.end("the supervision stopped it")
-                raise SafetyStop(f"{self.name}: {event.text}")
+                raise SafetyStop(f"{self.name}: {event.text}", stop_hint(event, self.name))
             if event.kind is EventKind.STATE:
                 stopping = AxisState(event.code) in _STOPPED
                 if not stopping and event.code != AxisState.ENABLED:

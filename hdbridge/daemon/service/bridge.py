@@ -13,7 +13,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -24,12 +23,13 @@ from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import Core
+from hdbridge.daemon.service.dispatch import ANSWER_S
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
-from hdbridge.daemon.service.models import recall, remember
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.daemon.service.power import UNKNOWN
+from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
 
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
 """Pauses before a drive is asked for again that could not be verified; the last one repeats."""
+SETTLE_AGAIN_S: Final = 0.5
+"""Pause before a compensation is sent again that the control process has not acknowledged."""
 EVENTS_TOLD: Final = 1000
 _log = logging.getLogger(__name__)
 
@@ -61,20 +63,16 @@ class ServiceBridge:
         memory: Memory,
         timing: Timing,
         *,
-        runtime: Path | None = None,
         recordings: Callable[[ServiceAxis], Path] = lambda axis: axis.axis.profile.folder / "recordings",
         runner: Runner = in_own_process,
         simulated: bool = False,
     ) -> None:
-        """``runtime`` is the folder in which the model in use is remembered; None: it is not.
-
-        ``recordings`` says where the recordings of an axis's jobs go, ``runner`` how they are done.
-        """
+        """``recordings`` says where the recordings of an axis's jobs go, ``runner`` how they are done."""
         self.machine = machine
         self.core = Core.of(memory, timing, machine.lease_s)
         self.book = JobBook(self.core, recordings, runner)
         self.axes: dict[str, ServiceAxis] = {
-            axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state, self._remember)
+            axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
             for index, axis in enumerate(machine.axes)
         }
         self.adaptations: dict[str, Adaptation] = {}
@@ -85,7 +83,6 @@ class ServiceBridge:
         self.marks: list[Callable[[str], None]] = []
         """Who wants to hear of remarks: the recorder."""
         self._names = tuple(self.axes)
-        self._remembered = runtime / f"{machine.name}.models.json" if runtime is not None else None
         self._simulated = simulated
         self._started = datetime.now(UTC)
         self._stopped: dict[str, Entry] = {}
@@ -94,6 +91,7 @@ class ServiceBridge:
         self._loop_pid = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._verifying: set[str] = set()
+        self._settling: set[str] = set()
 
     @property
     def lease(self) -> Lease:
@@ -103,15 +101,20 @@ class ServiceBridge:
     # ---------------------------------------------------------------- its life
 
     async def __aenter__(self) -> Self:
-        """Begin: find every axis as it is, and look after them from now on."""
+        """Begin: find every axis as it is, and look after them from now on.
+
+        Returns when the control process compensates each axis by its setting, or does not answer.
+        """
         self._loop_pid = self.core.memory.status.loop_pid
-        if self._remembered is not None:
-            recall(self._remembered, self._loop_pid, {name: each.models for name, each in self.axes.items()})
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
         # From here on each is being taken over: before its state is known, nobody else asks anything of it.
         await asyncio.sleep(0)
+        timing = self.core.timing
+        deadline_s = timing.clock.now() + ANSWER_S
+        while any(axis.unsettled for axis in self.axes.values()) and timing.clock.now() < deadline_s:
+            await timing.sleep(PERIOD_S)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -135,6 +138,9 @@ class ServiceBridge:
                     await axis.end_without_lease()
                 except HdbridgeError as error:
                     core.log.note(f"could not be stopped: {error}", axis.link.index)
+                if axis.unsettled and axis.name not in self._settling:
+                    self._settling.add(axis.name)
+                    self._start(self._settle(axis))
                 if axis.link.state in UNKNOWN and self._bus_up and axis.name not in self._verifying:
                     self._verifying.add(axis.name)
                     self._start(self._verify(axis))
@@ -147,8 +153,11 @@ class ServiceBridge:
             event = entry.event
             if event is None:
                 continue
-            if event.kind is EventKind.STOPPED and 0 <= event.axis < len(self._names):
-                self._stopped[self._names[event.axis]] = entry
+            name = self._names[event.axis] if event.axis >= 0 else ""
+            if event.kind is EventKind.STOPPED:
+                self._stopped[name] = entry
+            elif event.kind is EventKind.STATE and event.code in LATCHED:
+                self._stopped.pop(name, None)  # why it stopped is told when it stands
             elif event.kind is EventKind.BUS_DOWN:
                 self._bus_up = False
             elif event.kind is EventKind.BUS_UP:
@@ -158,17 +167,24 @@ class ServiceBridge:
             if self._loop_pid:
                 self.core.log.note("the control process was started again: every axis is disabled")
                 self._bus_up = True
-                for axis in self.axes.values():
-                    self._start(self._put_back(axis))
             self._loop_pid = pid
-            self._remember()
 
-    async def _put_back(self, axis: ServiceAxis) -> None:
-        """A new control process compensates by the machine file; have it use what was in use."""
+    async def _settle(self, axis: ServiceAxis) -> None:
+        """Send the chosen compensation until the control process has acknowledged it."""
+        noted = ""
         try:
-            await axis.put_back()
-        except HdbridgeError as error:
-            self.core.log.note(f"the compensation could not be put back: {error}", axis.link.index)
+            while axis.unsettled:
+                try:
+                    await axis.settle()
+                except HdbridgeError as error:
+                    if str(error) != noted:
+                        noted = str(error)
+                        self.core.log.note(
+                            f"the compensation could not be put back: {error}", axis.link.index
+                        )
+                    await self.core.timing.sleep(SETTLE_AGAIN_S)
+        finally:
+            self._settling.discard(axis.name)
 
     async def _take_over(self, axis: ServiceAxis) -> None:
         try:
@@ -195,13 +211,6 @@ class ServiceBridge:
                         _log.warning("not verified", extra={"axis": axis.name, "why": told})
         finally:
             self._verifying.discard(axis.name)
-
-    def _remember(self) -> None:
-        """Keep what is in use for the next service."""
-        if self._remembered is not None:
-            with suppress(HdbridgeError):
-                models = {name: each.models for name, each in self.axes.items()}
-                remember(self._remembered, self.core.memory.status.loop_pid, models)
 
     # ---------------------------------------------------------------- what is
 
@@ -238,6 +247,7 @@ class ServiceBridge:
 
     def axis_state(self, name: str) -> messages.AxisState:
         """Everything about one axis at the newest cycle."""
+        self._look()
         adaptation = self.adaptations.get(name)
         return reports.axis_state(
             self._axis(name),

@@ -42,10 +42,11 @@ class Dispatcher:
         RefusedError with the control process's own words, and nothing was done; DaemonError where it does
         not answer.
         """
+        loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)
         deadline_s = self._timing.clock.now() + within_s
         while (answer := self._answer(command_id)) is None:
-            self._check(kind, deadline_s, within_s)
+            self._check(kind, loop_pid, deadline_s, within_s)
             await self._timing.sleep(POLL_S)
         return answer
 
@@ -54,10 +55,11 @@ class Dispatcher:
     ) -> Event:
         """The same for blocking work."""
         clock = self._timing.clock
+        loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)
         deadline_s = clock.now() + within_s
         while (answer := self._answer(command_id)) is None:
-            self._check(kind, deadline_s, within_s)
+            self._check(kind, loop_pid, deadline_s, within_s)
             clock.sleep_until(clock.now() + POLL_S)
         return answer
 
@@ -68,7 +70,12 @@ class Dispatcher:
             raise RefusedError(answer.text)
         return answer
 
-    def _check(self, kind: CommandKind, deadline_s: float, within_s: float) -> None:
+    def _check(self, kind: CommandKind, loop_pid: int, deadline_s: float, within_s: float) -> None:
+        if self._memory.status.loop_pid != loop_pid:
+            raise DaemonError(
+                f"the control process died before it answered {kind.name}; another one has taken its place, "
+                "with every axis disabled"
+            )
         if self._timing.clock.now() >= deadline_s:
             raise DaemonError(
                 f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is gone; "

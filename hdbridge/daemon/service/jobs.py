@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hdbridge.client import messages
 from hdbridge.client.messages import JobKind, JobState
-from hdbridge.daemon.memory import CommandKind
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.joborder import Told, Work, options_of
 from hdbridge.daemon.service.jobpipe import Begin, Served
@@ -154,8 +153,8 @@ class JobBook:
             problem = messages.Problem.of(
                 HdbridgeError(f"an error in hdbridge: {error!r}"), running.axis.name
             )
-        await self._put_back(running.axis)
         running.activity.end(f"job {running.job.id} is {state.value}")
+        await running.axis.vacate()
         running.update(
             state=state,
             problem=problem,
@@ -165,15 +164,6 @@ class JobBook:
         )
         why = f": {problem.detail}" if problem is not None else ""
         self._core.log.note(f"job {running.job.id} is {state.value}{why}", running.axis.link.index)
-
-    async def _put_back(self, axis: ServiceAxis) -> None:
-        """Compensate the axis as before."""
-        try:
-            await axis.put_back()
-            if axis.axis.load_loop is not None:
-                await axis.link.do(CommandKind.LOAD_LOOP, i=int(axis.load_loop_on))
-        except HdbridgeError as error:
-            self._core.log.note(f"the compensation could not be put back: {error}", axis.link.index)
 
 
 def _uninterrupted(runner: Runner, work: Work, rig: DaemonRig, told: Told) -> dict[str, Any] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -15,18 +15,19 @@ from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
 from hdbridge.daemon.service.interface import WayPoint
-from hdbridge.daemon.service.models import AxisModels, Choice
+from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.daemon.service.power import UNKNOWN, AxisPower
 from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.drive.values import Object, Value
-from hdbridge.errors import RefusedError
+from hdbridge.errors import HdbridgeError, RefusedError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.service.core import Core
+    from hdbridge.daemon.setting import CompensationSetting
     from hdbridge.model import TransmissionModel
 
 CHANGE_S: Final = 120.0
@@ -44,25 +45,20 @@ class ServiceAxis:
         core: Core,
         begin_job: Callable[[ServiceAxis, str, messages.JobKind, Mapping[str, Any]], messages.Job],
         report: Callable[[str], messages.AxisState],
-        changed: Callable[[], None] = lambda: None,
     ) -> None:
-        """``begin_job`` begins a job for the lease's holder, ``report`` says everything about an axis, and
-        ``changed`` hears of another model in use.
-        """
+        """``begin_job`` begins a job for the lease's holder, ``report`` says everything about an axis."""
         self.axis = axis
         self.name = axis.name
         self.core = core
         self.link = AxisLink(core, index, axis.name)
         self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
-        self.models = AxisModels(axis)
+        self.models = AxisModels(axis, core.memory.settings[index])
         self.power = AxisPower(self.link, self.commissioning, self.models.check_drive)
         self.motion = AxisMotion(self.link, axis.config.limits)
-        self.load_loop_on = axis.load_loop is not None
-        """Whether the slow integral of the measured error is wanted."""
         self._begin_job = begin_job
         self._report = report
-        self._changed = changed
         self._changing = asyncio.Lock()
+        self._job_runs = False
         self._doing = ""
         """What a client has begun that has the drive to itself, in words."""
         self._drive = asyncio.Lock()
@@ -104,6 +100,7 @@ class ServiceAxis:
         self.check_may(holder)
         async with self._alone("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled anew")
+            await self.settle()
             await self.power.enable()
 
     async def disable(self, holder: str) -> None:
@@ -225,47 +222,51 @@ class ServiceAxis:
         """Compensate by this part of the model in use."""
         self.check_may(holder)
         async with self._changing:
-            await self.change(await self.core.timing.work(self.models.with_scheme, scheme))
+            await self._use(await self.core.timing.work(self.models.with_scheme, scheme))
 
     async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
         """Make another model of the profile the active one, and use it."""
         self.check_may(holder)
         identity = self.commissioning.identity
         async with self._changing:
-            await self.change(await self.core.timing.work(self.models.found, version, identity))
+            await self._use(await self.core.timing.work(self.models.found, version, identity))
             date = datetime.now(UTC)
             await self.core.timing.work(self.models.activate, version, identity, date)
-            self._changed()
+            await self._use(self.models.chosen)
 
-    async def put_back(self) -> None:
-        """Have the control process compensate by what is in use, whatever it did meanwhile."""
+    @property
+    def unsettled(self) -> bool:
+        """Whether the control process does not use the chosen setting, and no job is the reason."""
+        return not self.models.settled and not self._job_runs
+
+    async def settle(self) -> None:
+        """Have the control process compensate by the chosen setting, if it does not."""
         async with self._changing:
-            await self.change(await self.core.timing.work(self.models.made, self.models.in_use))
+            if not self.models.settled:
+                await self._use(self.models.chosen)
 
     async def follow(self, model: TransmissionModel) -> None:
-        """Compensate by the model in use as its parameters were moved; what is in use keeps its name."""
+        """Compensate by the chosen model with the parameters moved; the model keeps its version."""
         async with self._changing:
-            await self.change(await self.core.timing.work(self.models.moved, model))
+            await self._use(await self.core.timing.work(self.models.moved, model))
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
-        """The slow integral of the measured error on or off."""
+        """Switch the load loop on or off."""
         self.check_may(holder)
-        await self.link.do(CommandKind.LOAD_LOOP, i=int(on))
-        self.load_loop_on = on
+        async with self._changing:
+            await self._use(self.models.with_load_loop(on))
 
-    async def change(self, choice: Choice) -> None:
-        """Have the control process change to another compensation, and wait until it has."""
+    async def _use(self, setting: CompensationSetting) -> None:
+        """Have the control process compensate by a setting, and wait until it does."""
+        if self._job_runs:
+            raise RefusedError(f"{self.name}: a job measures on this axis; wait for its end, or cancel it")
         log, index = self.core.log, self.link.index
         since = log.newest
-        if choice.compensating:
-            await self.link.do(CommandKind.CHANGE, i=self.core.memory.blobs.put(choice.pickled))
-        await self.link.do(CommandKind.COMPENSATE, i=int(choice.compensating))
-        self.models.taken(choice)
-        self._changed()
-        if choice.compensating:
-            await self.link.until(
-                lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
-            )
+        await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))
+        self.models.chosen = setting
+        await self.link.until(
+            lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
+        )
 
     # ---------------------------------------------------------------- objects of the drive, jobs
 
@@ -290,8 +291,15 @@ class ServiceAxis:
         return self._begin_job(self, holder, kind, options or {})
 
     def occupy(self, activity: Activity) -> None:
-        """A job has the axis from now on."""
+        """A job has the axis and its compensation from now on, until `vacate`."""
         self.motion.replace(activity, "a job took its place")
+        self._job_runs = True
+
+    async def vacate(self) -> None:
+        """The job has ended: the axis is compensated as before."""
+        self._job_runs = False
+        with suppress(HdbridgeError):  # the bridge tries again
+            await self.settle()
 
     async def close(self) -> None:
         """Nothing more is begun; the axis goes on with what it was told."""

@@ -82,8 +82,8 @@ class AxisPower:
             await link.do(CommandKind.DRIVE_FAULT_RESET)
             if not await link.until(lambda: link.power is not State.FAULT, FAULT_RESET_S):
                 raise DriveError(
-                    f"{link.name}: the drive's fault stays after a reset; remove its cause (603Fh and the "
-                    "drive's manual tell it), then reset again"
+                    f"{link.name}: the drive's fault stays after a reset; remove its cause (see 603Fh and "
+                    f"the drive's manual), then reset it again: hdbridge ctl reset {link.name}"
                 )
         await self._rest()
 

@@ -11,17 +11,19 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from typing import Final
 
 from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.runtime import runtime_folder
 from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.journal import Journal
@@ -35,6 +37,8 @@ from hdbridge.errors import HdbridgeError
 THREADS_PER_AXIS: Final = 2
 """An axis may be verified while another of its requests blocks."""
 SPARE_THREADS: Final = 4
+LOOK_S: Final = 1.0
+"""How often the socket file is looked for."""
 FOLLOW_S: Final = 1.0
 """How often is looked whether an adaptation proposes another model."""
 LAST_WORDS_S: Final = 35.0
@@ -66,7 +70,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, runtime=start.runtime, simulated=simulated,
+            machine, memory, timing, simulated=simulated,
             recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
         )  # fmt: skip
         metrics = Metrics()
@@ -83,10 +87,14 @@ async def serve(start: Start, memory: Memory) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
-            following = group.create_task(_follow(adapting))
+            beside = [
+                group.create_task(_follow(adapting)),
+                group.create_task(_keep_socket(start, server, bridge.core.log.note)),
+            ]
             await told.wait()
             await _last_words(bridge, memory)
-            following.cancel()
+            for task in beside:
+                task.cancel()
             server.stop()
 
 
@@ -122,10 +130,33 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
         made.append(Listener(others[0], Policy(page_token)))
     elif tcp is not None:
         token = machine.beside(tcp.token_file).read_text(encoding="ascii").strip()
-        policy = Policy(token, frozenset(each.lower() for each in tcp.names))
-        pem = [machine.beside(each) if each is not None else None for each in (tcp.certificate, tcp.key)]
-        made.append(Listener(others[0], policy, *pem))
+        made.append(Listener(others[0], Policy(token, frozenset(each.lower() for each in tcp.names))))
     return made
+
+
+async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
+    """Bind the Unix socket again whenever its file is gone; connections that are open stay."""
+    path, bound, noted = start.socket, start.socket_file, ""
+    while True:
+        found = (0, 0)
+        with suppress(OSError):
+            found = file_of(path)
+        if found == bound:
+            await asyncio.sleep(LOOK_S)
+            continue
+        try:
+            if start.machine.api.socket is None:
+                runtime_folder()
+            listener = unix_socket(path, start.machine.api.group)
+            bound, noted = file_of(path), ""
+        except (HdbridgeError, OSError) as problem:
+            if str(problem) != noted:
+                noted = str(problem)
+                note(f"clients cannot connect: the socket file is gone and cannot be bound again: {problem}")
+            await asyncio.sleep(LOOK_S)
+            continue
+        server.add(Listener(listener, Policy()))
+        note(f"{path}: the socket file was gone; it is bound again")
 
 
 async def _say_when_served(server: ApiServer, memory: Memory) -> None:

@@ -11,7 +11,7 @@ from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.models import InUse
+from hdbridge.daemon.setting import CompensationSetting
 
 _log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ class Recording:
         self._note: str | None = None
         self.recorder: FlightRecorder | None = None
         """None where there is no folder for it."""
-        self._told: dict[str, InUse] = {}
+        self._told: dict[str, CompensationSetting] = {}
         about = About.of(
             machine.name, tuple(AxisAbout.of(axis.config) for axis in machine.axes), machine.cycle_s
         )

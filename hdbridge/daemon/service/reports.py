@@ -12,7 +12,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, SampleFlag
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.drive.states import State
-from hdbridge.drive.supervision import ROWS, Fault, Reaction
+from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS, Fault, Reaction
 from hdbridge.motion import MotionMode
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.service.lease import Lease
-    from hdbridge.daemon.service.models import InUse
     from hdbridge.daemon.service.ports import ServiceAxis
+    from hdbridge.daemon.setting import CompensationSetting
 
 FAULTS: Final = tuple(Fault)
 STATES: Final = tuple(messages.ControlState)
 MODES: Final = tuple(messages.MotionMode)
-_LATCHED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+LATCHED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 _KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
-_WITH_FAULT: Final = frozenset({EventKind.FAULT, EventKind.STOPPED})
 
 
 def fault_of(code: int) -> Fault | None:
@@ -50,7 +49,10 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
             text=entry.text,
             hint=entry.hint or None,
         )
-    fault = fault_of(event.code) if event.kind in _WITH_FAULT else None
+    fault = fault_of(event.code) if event.kind is EventKind.FAULT else None
+    hint = ROWS[fault].hint if fault is not None else None
+    if event.kind is EventKind.STOPPED:
+        hint = stop_hint(event, axis or "AXIS")
     return messages.Event(
         sequence=entry.number,
         kind=_KINDS[event.kind],
@@ -58,8 +60,20 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
         cycle=event.cycle,
         axis=axis,
         text=_words(event, fault),
-        hint=ROWS[fault].hint if fault is not None else None,
+        hint=hint,
     )
+
+
+def stop_hint(stopped: Event, axis: str) -> str:
+    """What a person does about a stop."""
+    fault = fault_of(stopped.code)
+    if stopped.id:
+        return EXPLAINED_HINT
+    return ROWS[fault].hint if fault is not None else _reset_hint(axis)
+
+
+def _reset_hint(axis: str) -> str:
+    return f"reset it when the axis may move again: hdbridge ctl reset {axis}"
 
 
 def _words(event: Event, fault: Fault | None) -> str:
@@ -91,7 +105,7 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
     )
 
 
-def model_in_use(in_use: InUse) -> messages.ModelInUse | None:
+def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
     """The model and its age; None where there is none."""
     if not in_use.model.effects:
         return None
@@ -99,7 +113,7 @@ def model_in_use(in_use: InUse) -> messages.ModelInUse | None:
     age_s = max((datetime.now(UTC) - date).total_seconds(), 0.0) if date is not None else None
     return messages.ModelInUse(
         version=in_use.version,
-        file=str(in_use.file),
+        file=str(in_use.file or ""),
         date=date,
         age_s=age_s,
         reason=str(in_use.model.provenance.get("reason", "")),
@@ -170,7 +184,7 @@ def axis_state(
         model=model_in_use(in_use),
         load_loop=messages.LoadLoopState(
             configured=axis.axis.load_loop is not None,
-            on=axis.load_loop_on,
+            on=in_use.load_loop,
             correction_arcsec=link.value("loop_arcsec"),
         ),
         adaptation=adaptation,
@@ -185,7 +199,7 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
     link = axis.link
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
-    latched = link.state in _LATCHED
+    latched = link.state in LATCHED
     if not latched and link.power is not State.FAULT:
         return None
     event = stopped.event if stopped is not None else None
@@ -193,14 +207,16 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
         fault = fault_of(event.code)
     if fault is None and not latched:
         fault = Fault.DRIVE_FAULT
+    if event is not None:
+        text, hint = event.text, stop_hint(event, axis.name)
+    elif fault is not None:
+        text, hint = fault.value, ROWS[fault].hint
+    else:
+        text, hint = "quick stop by command", _reset_hint(axis.name)
     return messages.Fault(
         name=fault.name if fault is not None else "COMMAND",
-        text=event.text
-        if event is not None
-        else fault.value
-        if fault is not None
-        else "quick stop by command",
-        hint=ROWS[fault].hint if fault is not None else "reset it when the axis may move again",
+        text=text,
+        hint=hint,
         cycle=event.cycle if event is not None else None,
         date=stopped.date if stopped is not None else None,
         needs_verification=link.state is AxisState.LATCHED,

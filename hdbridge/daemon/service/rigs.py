@@ -5,7 +5,6 @@ Blocking, for one worker thread; several benches of a job follow each other.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Unpack
@@ -20,6 +19,7 @@ from hdbridge.daemon.service.activity import Activity
 from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
 from hdbridge.daemon.service.power import POWER_S
 from hdbridge.daemon.service.procedures import DaemonBench
+from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.errors import DaemonError, HdbridgeError, SafetyStop
 from hdbridge.model import TransmissionModel
 
@@ -80,11 +80,7 @@ class DaemonRig:
         """Power on, standing still, compensated anew from here on."""
         if self.state is not AxisState.DISABLED:
             self.disable()
-        number = self.core.memory.blobs.put(pickle.dumps(compensation))
-        self.command(CommandKind.CHANGE, i=number)
-        self.command(CommandKind.COMPENSATE, i=1)
-        if self._axis.axis.load_loop is not None:
-            self.command(CommandKind.LOAD_LOOP, i=0)  # what is measured is the axis without it
+        self.command(CommandKind.CHANGE, i=self._axis.models.send_for_job(compensation.model))
         seeds = self._axis.commissioning.prepare()
         self.command(CommandKind.ENABLE, POWER_S, **seeds.arguments())
 
@@ -142,9 +138,11 @@ class DaemonRig:
         while clock.now() < deadline_s:
             told = [each for each in log.of_axis(self.index, since) if each.kind is EventKind.STOPPED]
             if told:
-                return SafetyStop(f"{self._axis.name}: {told[-1].text}")
+                name = self._axis.name
+                return SafetyStop(f"{name}: {told[-1].text}", stop_hint(told[-1], name))
             self.wait(self.period_s)
-        return SafetyStop(f"{self._axis.name}: {self._activity.over or 'the axis was stopped; reset it'}")
+        why = self._activity.over or f"the axis was stopped; reset it: hdbridge ctl reset {self._axis.name}"
+        return SafetyStop(f"{self._axis.name}: {why}")
 
     def _look(self) -> None:
         rows, _ = self._reader.read()

@@ -29,7 +29,7 @@ class Watching:
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """From the observer. The whole committed model is watched, whatever part compensates or adapts."""
         for place, port in enumerate(self._bridge.axes.values()):
-            model = port.models.in_use.model
+            model = port.models.chosen.model
             if self._used[place] is not model:
                 self._used[place] = model
                 self._sink.use(place, model)

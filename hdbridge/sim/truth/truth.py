@@ -13,8 +13,8 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from hdbridge.device.behaviour import Behaviour
 from hdbridge.files.yamlfile import document_from_text, read_yaml, wrong
-from hdbridge.sim.behaviour import Behaviour
 from hdbridge.sim.truth.gear import TrueGear
 from hdbridge.sim.truth.load import TrueLoad
 from hdbridge.sim.truth.motor import TrueMotor, TrueServo

@@ -42,9 +42,8 @@ def test_half_a_second_request_is_closed_after_the_first_was_answered(hasty):
 
 
 def test_a_body_that_does_not_come_is_told(hasty):
-    head = b"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 9\r\n\r\n"
+    head = b"POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
     assert b"HTTP/1.1 408" in said(hasty, head + b"{")
-    assert hasty.bridge.stopped == []
 
 
 @pytest.mark.parametrize(

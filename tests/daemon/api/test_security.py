@@ -1,4 +1,4 @@
-"""Who may ask what: sockets, token, host and origin, sizes, rates, the log."""
+"""Who may ask what: sockets, token, host and origin, sizes, the log."""
 
 import grp
 import logging
@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.api import TOKEN
 
-from hdbridge.daemon.api.policy import DEPTH_MAXIMUM, Policy, Rate, too_deep
-from hdbridge.daemon.api.sockets import check_exposure, peer_of, tcp_socket, unix_socket
+from hdbridge.daemon.api.policy import DEPTH_MAXIMUM, Policy, too_deep
+from hdbridge.daemon.api.sockets import peer_of, tcp_socket, unix_socket
 from hdbridge.errors import DaemonError, InputError
 
 
@@ -77,20 +77,7 @@ def test_the_kernel_tells_who_is_at_the_other_end():
 
 def test_a_port_that_is_taken_is_said(api):
     with pytest.raises(DaemonError, match="another process"):
-        tcp_socket("127.0.0.1", api.port)
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "cell.example"])
-def test_the_network_needs_tls_or_an_explicit_word(host):
-    with pytest.raises(InputError, match="without TLS"):
-        check_exposure(host, tls=False, unencrypted=False)
-    check_exposure(host, tls=True, unencrypted=False)
-    check_exposure(host, tls=False, unencrypted=True)
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.8.8.8"])
-def test_this_machine_alone_needs_none(host):
-    check_exposure(host, tls=False, unencrypted=False)
+        tcp_socket(api.port)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +138,26 @@ def test_a_name_that_is_not_this_machines_is_refused(api, host, over):
 def test_an_address_and_a_name_of_this_machine_are_known(host):
     assert Policy().knows_host(host)
     assert Policy(names=frozenset({"cell.example"})).knows_host("Cell.Example:8402")
+
+
+@pytest.mark.parametrize(
+    ("origin", "known"),
+    [
+        ("https://cell.example", True),
+        ("https://Cell.Example:8443", True),
+        ("http://127.0.0.1:8402", True),
+        (None, True),
+        ("http://cell.example", False),
+        ("https://evil.example", False),
+        ("https://cell.example.evil", False),
+        ("https://cell.example@evil", False),
+        ("null", False),
+    ],
+)
+def test_a_page_that_was_loaded_through_the_reverse_proxy_is_known_by_its_name(origin, known):
+    policy = Policy(names=frozenset({"cell.example"}))
+    assert policy.knows_origin(origin, "127.0.0.1:8402", "http") is known
+    assert Policy().knows_origin("https://cell.example", "127.0.0.1:8402", "http") is False
 
 
 @pytest.mark.parametrize(
@@ -227,49 +234,13 @@ def test_depth_is_counted_outside_of_texts_only(depth, opening):
     assert too_deep(opening * depth) == (levels > DEPTH_MAXIMUM)
 
 
-def test_each_client_has_a_rate_of_its_own():
-    rate = Rate(10.0, 5.0, lambda: 0.0)
-    assert [rate.admits("a") for _ in range(6)] == [True] * 5 + [False]
-    assert rate.admits("b")
-
-
-def test_the_rate_recovers_with_time_and_remembers_a_bounded_number():
-    now = 0.0
-    rate = Rate(10.0, 5.0, lambda: now, clients=3)
-    for _ in range(5):
-        assert rate.admits("a")
-    assert not rate.admits("a")
-    now = 0.11
-    assert rate.admits("a")
-    assert not rate.admits("a")
-    for each in "bcd":
-        rate.admits(each)
-    assert rate.admits("a"), "forgotten by then"
-
-
-def test_over_the_limit_only_stopping_goes_on(api, monkeypatch):
-    monkeypatch.setattr(Rate, "admits", lambda self, client: False)
-    with api.over_socket() as client:
-        assert client.get("/state").status_code == 429
-        assert client.post("/stop").status_code == 200
-        assert client.post("/axes/joint-1/quick-stop").status_code == 200
-
-
-def test_too_many_requests_under_way_leave_room_for_a_stop(api):
-    api.server.traffic.open["http"] += 64
-    try:
-        with api.over_socket() as client:
-            assert client.get("/state").status_code == 503
-            assert client.post("/quick-stop").status_code == 200
-    finally:
-        api.server.traffic.open["http"] -= 64
-
-
 def test_a_client_that_goes_away_in_its_request_costs_nothing(api):
     """Reset in the middle of a body; the next one is served."""
     with socket.create_connection(("127.0.0.1", api.port)) as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        raw.sendall(b"POST /api/v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\nhalf")
+        raw.sendall(
+            f"POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n"
+            "Content-Length: 100\r\n\r\nhalf".encode()
+        )
     with api.over_socket() as client:
         assert client.get("/state").status_code == 200
-    assert api.bridge.stopped == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import struct
 from dataclasses import replace
 
@@ -17,6 +16,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
 from hdbridge.drive.states import State
+from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel
 from hdbridge.motion import MotionMode
 
@@ -437,14 +437,14 @@ def test_compensation_is_faded_out_and_in(enabled: SteppedDaemon) -> None:
     id_ = enabled.move(7.3)
     enabled.until(lambda: enabled.ended(id_))
     record(enabled)
-    enabled.done(K.COMPENSATE, i=0)
+    enabled.use(enabled.setting(scheme=Scheme.NONE))
     enabled.run(1.0)
     axis = record(enabled)
     assert axis["weight"][-1] == 0.0
     assert axis["correction_arcsec"][-1] == 0.0
     assert not axis["flags"][-1] & SampleFlag.COMPENSATING
     assert np.abs(np.diff(axis["issued_deg"])).max() < 50 * 20_000 * 0.004 / 3600
-    enabled.done(K.COMPENSATE, i=1)
+    enabled.use(enabled.setting())
     enabled.run(1.0)
     assert record(enabled)["weight"][-1] == 1.0
 
@@ -453,11 +453,8 @@ def test_another_model_takes_over_without_a_jump(enabled: SteppedDaemon) -> None
     enabled.run(1.0)
     enabled.move(30.0, velocity_deg_s=5.0)
     enabled.run(1.0)
-    config = enabled.axes[0].config
-    model = TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
-    other = compensation_for(config, model.only(("synchronous",)))
     record(enabled)
-    enabled.done(K.CHANGE, i=enabled.memory.blobs.put(pickle.dumps(other)))
+    enabled.use(enabled.setting(scheme=Scheme.SYNCHRONOUS))
     enabled.run(2.0)
     assert len(enabled.told(E.CHANGED)) == 1
     axis = record(enabled)
@@ -471,18 +468,16 @@ def test_another_model_takes_over_without_a_jump(enabled: SteppedDaemon) -> None
 def test_a_model_of_another_axis_is_refused(enabled: SteppedDaemon) -> None:
     other = article_axes(2)[1]
     model = TransmissionModel.load(PROFILE / "model.yaml").bound_to(other)
-    number = enabled.memory.blobs.put(pickle.dumps(compensation_for(other, model)))
-    answer = enabled.order(K.CHANGE, i=number)
+    slot = enabled.memory.settings[0]
+    enabled.use(enabled.setting())
+    number = slot.in_use
+    answer = enabled.order(K.CHANGE, i=slot.put(enabled.setting(model=model).to_json()))
     assert answer.kind is E.REFUSED
     assert "made for 'axis2'" in answer.text
-    assert enabled.order(K.CHANGE, i=number + 1).kind is E.REFUSED
-    assert enabled.order(K.CHANGE, i=enabled.memory.blobs.put(pickle.dumps("none"))).kind is E.REFUSED
-
-
-def test_a_load_loop_that_there_is_not_is_refused(enabled: SteppedDaemon) -> None:
-    answer = enabled.order(K.LOAD_LOOP, i=1)
-    assert answer.kind is E.REFUSED
-    assert "has no load loop" in answer.text
+    for data in (b"", b"none", b"[]", b"{}", b"[" * 100_000, enabled.setting().to_json()[:-1]):
+        assert enabled.order(K.CHANGE, i=slot.put(data)).kind is E.REFUSED
+    assert enabled.order(K.CHANGE, i=slot.number + 1).kind is E.REFUSED
+    assert slot.in_use == number
 
 
 def test_the_compensation_may_begin_switched_off() -> None:
@@ -540,10 +535,10 @@ def test_the_load_loop_takes_away_what_the_model_leaves_and_fades_when_switched_
         assert axis["loop_arcsec"][-1] * left > 0.0
         assert axis["load_target_deg"][-1] == 7.3
         assert np.abs(np.diff(axis["loop_arcsec"])).max() <= 40.0 * 0.004 * (1 + 1e-9)
-        daemon.done(K.LOAD_LOOP, i=0)
+        daemon.use(daemon.setting(model=without))
         daemon.run(3.0)
         assert record(daemon)["loop_arcsec"][-1] == 0.0
-        daemon.done(K.LOAD_LOOP, i=1)
+        daemon.use(daemon.setting(model=without, load_loop=True))
         daemon.run(4.0)
         assert record(daemon)["loop_arcsec"][-1] != 0.0
         # The encoder slips: what it shows at rest is not believed any more.

@@ -24,7 +24,7 @@ def test_all_axes_brake_in_order_and_lose_power(pair: SteppedDaemon) -> None:
     pair.done(K.JOG, 1, a=-10.0, b=30.0)
     pair.run(1.0)
     pair.samples.read()
-    pair.post(K.ENDING, -1)
+    pair.controller.end()
     ended(pair)
     assert pair.states == [S.DISABLED, S.DISABLED]
     samples, _ = pair.samples.read()
@@ -80,7 +80,7 @@ def test_from_every_state(daemon: SteppedDaemon, state: str) -> None:
         else:
             daemon.interfere(0x080)
         daemon.run(0.05)
-    daemon.post(K.ENDING, -1)
+    daemon.controller.end()
     ended(daemon)
     assert daemon.nodes[0].firmware.motion.machine is not None
     if state != "latched":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
+from collections.abc import Callable
 
 import pytest
 from support.daemon import SteppedDaemon
@@ -121,13 +122,73 @@ def test_one_late_cycle_costs_a_period_and_nothing_else(enabled: SteppedDaemon) 
     assert event.id == Reaction.GO
 
 
-def test_faults_that_change_nothing_are_told_once_a_second(enabled: SteppedDaemon) -> None:
-    for _ in range(500):
-        enabled.interfere(0x081, struct.pack("<HB5x", 0x3110, 1))
+def each_cycle(can_id: int, data: bytes = b"", **kind: bool) -> Callable[[SteppedDaemon], None]:
+    """A frame of another node in each of 500 cycles."""
+
+    def do(daemon: SteppedDaemon) -> None:
+        for _ in range(500):
+            daemon.interfere(can_id, data, **kind)
+            daemon.turn()
+
+    return do
+
+
+def wish(**faults: int) -> Callable[[SteppedDaemon], None]:
+    """A fault of the simulated drive's TPDOs, for two seconds."""
+
+    def do(daemon: SteppedDaemon) -> None:
+        for name, value in faults.items():
+            setattr(daemon.nodes[0].faults, name, value)
+        daemon.run(2.0)
+
+    return do
+
+
+def every_tenth_tpdo_lost(daemon: SteppedDaemon) -> None:
+    for _ in range(50):
+        daemon.nodes[0].faults.drop_tpdos = 1
+        daemon.turn(10)
+
+
+@pytest.mark.parametrize(
+    ("happens", "fault", "reactions"),
+    [
+        (each_cycle(0x080), Fault.FOREIGN_SYNC, [Reaction.QUICK_STOP]),
+        (each_cycle(0x201, bytes(6)), Fault.OWN_ID_ELSEWHERE, [Reaction.QUICK_STOP]),
+        (each_cycle(0x181, bytes(6), is_extended_id=True), Fault.DISCARDED_FRAME, [Reaction.GO]),
+        (each_cycle(0x081, struct.pack("<HB5x", 0x3110, 1)), Fault.EMERGENCY, [Reaction.GO]),
+        (wish(drop_tpdos=500), Fault.LOST_TPDO, [Reaction.FREEZE, Reaction.QUICK_STOP]),
+        (wish(shorten_tpdos=500), Fault.WRONG_LENGTH, [Reaction.FREEZE, Reaction.QUICK_STOP]),
+        (wish(duplicate_tpdos=500), Fault.DUPLICATE_TPDO, [Reaction.GO]),
+        (every_tenth_tpdo_lost, Fault.LOST_TPDO, [Reaction.FREEZE]),
+    ],
+)
+def test_a_fault_is_one_event_and_not_one_per_cycle(
+    enabled: SteppedDaemon,
+    happens: Callable[[SteppedDaemon], None],
+    fault: Fault,
+    reactions: list[Reaction],
+) -> None:
+    moving(enabled)
+    happens(enabled)
+    told = [each.id for each in enabled.told(E.FAULT) if each.code == FAULT_INDEX[fault]]
+    assert told == reactions
+    enabled.run(1.5)
+    if enabled.states == [S.QUICK_STOPPED]:
+        enabled.done(K.RESET)
+        enabled.until(lambda: enabled.states == [S.DISABLED])
+    happens(enabled)
+    again = [each.id for each in enabled.told(E.FAULT) if each.code == FAULT_INDEX[fault]]
+    assert again[: len(told)] == told
+    assert again[len(told) :] == reactions
+
+
+def test_emergencies_with_different_codes_are_all_told(enabled: SteppedDaemon) -> None:
+    for number in range(200):
+        enabled.interfere(0x081, struct.pack("<HBB4x", (0x3110, 0x4210, 0x8110)[number % 3], 1, number))
         enabled.turn()
-    told = [each for each in enabled.told(E.FAULT) if each.code == FAULT_INDEX[Fault.EMERGENCY]]
-    assert len(told) == 2
-    assert "3110h" in told[0].text
+    told = [each.text for each in enabled.told(E.FAULT) if each.code == FAULT_INDEX[Fault.EMERGENCY]]
+    assert [each[5:10] for each in told] == ["3110h", "4210h", "8110h"]
     assert enabled.states == [S.ENABLED]
 
 

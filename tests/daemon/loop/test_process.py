@@ -84,13 +84,11 @@ def test_it_turns_tells_who_it_is_and_answers(simulated: Running) -> None:
     assert answer.kind is EventKind.REFUSED
 
 
-@pytest.mark.parametrize("how", ["command", "signal", "cell"])
+@pytest.mark.parametrize("how", ["signal", "cell"])
 def test_it_ends_in_order_when_asked(simulated: Running, how: str) -> None:
     memory = simulated.memory
     simulated.until(lambda: memory.status.loop_count > 2)
-    if how == "command":
-        memory.commands.post(CommandKind.ENDING, -1)
-    elif how == "signal":
+    if how == "signal":
         simulated.process.send_signal(signal.SIGTERM)
     else:
         memory.status.set(Cell.STOP_ASKED, 1)

@@ -18,10 +18,10 @@ from support.service import play, until
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError
 from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.device.node import DriveNode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import DriveError, IdentityError
-from hdbridge.sim.node import SimulatedDrive
 
 S, K, E = AxisState, CommandKind, EventKind
 INT32 = 1 << 31
@@ -38,7 +38,7 @@ def faults(bench: DaemonBench, axis: int = 0) -> set[Fault]:
     return {event.fault for event in bench.daemon.axes[axis].supervision.events}
 
 
-def powered(node: SimulatedDrive) -> bool:
+def powered(node: DriveNode) -> bool:
     """Whether a drive would follow a set-point."""
     return node.firmware.state.name == State.OPERATION_ENABLED.name
 

@@ -63,7 +63,8 @@ def test_motion_is_possible_only_while_enabled() -> None:
 
 def test_a_refusal_says_what_to_do() -> None:
     assert refusal(S.QUICK_STOPPED, CommandKind.ENABLE) == (
-        "enable is not possible while the axis is quick stopped: remove the cause, then reset it"
+        "enable is not possible while the axis is quick stopped: remove the cause, then reset it: "
+        "hdbridge ctl reset AXIS"
     )
 
 

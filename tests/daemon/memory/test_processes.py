@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind, Memory
-from hdbridge.daemon.memory.layout import HEADER, KNOT_SLOTS, Layout
+from hdbridge.daemon.memory.layout import HEADER, KNOT_SLOTS, VERSION, Layout
 from hdbridge.errors import InputError
 
 HAMMER = """
@@ -142,7 +142,7 @@ def foreign(data: bytes, size: int) -> int:
     return fd
 
 
-def header(version: int = 1, axes: int = 1, size: int | None = None) -> bytes:
+def header(version: int = VERSION, axes: int = 1, size: int | None = None) -> bytes:
     return HEADER.pack(b"hdbridge", version, axes, 1_000_000, size or Layout.of(1).total, 0, False)
 
 
@@ -151,7 +151,7 @@ def header(version: int = 1, axes: int = 1, size: int | None = None) -> bytes:
     [
         (b"", 0, "is not the shared memory of hdbridge"),
         (b"something else altogether" * 10, 8192, "is not the shared memory of hdbridge"),
-        (header(version=99), 8192, "version 99, expected 1.*restart"),
+        (header(version=99), 8192, "version 99, expected .*restart"),
         (header(axes=0), 8192, "0 axes"),
         (header(), 8192, "8192 bytes, expected"),
         (header(), Layout.of(1).total, "another release"),

@@ -1,4 +1,4 @@
-"""Mailbox, events, knots, frames and blob: bounded, in order, nothing twice."""
+"""Mailbox, events, knots, frames and settings: bounded, in order, nothing twice."""
 
 from __future__ import annotations
 
@@ -112,17 +112,23 @@ def test_knots_of_two_axes_do_not_mix_and_are_bounded(memory: Memory) -> None:
     assert first.peek() is None
 
 
-def test_the_blob_gives_only_what_was_stored_under_that_number(memory: Memory) -> None:
-    first = memory.blobs.put(b"one" * 1000)
-    assert memory.blobs.get(first) == b"one" * 1000
-    second = memory.blobs.put(b"two")
-    assert memory.blobs.get(second) == b"two"
-    for number in (first, 0, second + 1):
-        with pytest.raises(InputError, match="overwritten"):
-            memory.blobs.get(number)
+def test_a_slot_gives_only_the_setting_of_that_number(memory: Memory) -> None:
+    slot, other = memory.settings[:2]
+    with pytest.raises(InputError, match="not in the slot"):
+        slot.get(slot.number)
+    first = slot.put(b"one" * 1000)
+    assert slot.get(first) == b"one" * 1000
+    second = slot.put(b"two")
+    other.put(b"another axis's")
+    assert slot.get(second) == b"two"
+    for number in (first, 0, second + 1, -second):
+        with pytest.raises(InputError, match="not in the slot"):
+            slot.get(number)
     with pytest.raises(InputError, match="takes 2000000 bytes"):
-        memory.blobs.put(bytes(2_000_000))
-    assert memory.blobs.get(second) == b"two"
+        slot.put(bytes(2_000_000))
+    assert slot.get(second) == b"two"
+    slot.use(second)
+    assert (slot.in_use, other.in_use) == (second, 0)
 
 
 class MailboxMachine(RuleBasedStateMachine):

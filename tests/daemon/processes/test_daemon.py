@@ -45,7 +45,16 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         assert recorder["on"]
         assert daemon.axis()["load_target_deg"] == pytest.approx(3.0, abs=1e-9)
 
+        daemon.ask("compensate", scheme="hysteresis")
         (control,), (service,) = daemon.pids("control"), daemon.pids("service")
+
+        os.kill(service, signal.SIGSTOP)
+        stop = run_to_its_end(tmp_path, "stop", command="ctl")
+        os.kill(service, signal.SIGCONT)
+        assert stop.returncode == 7
+        assert f"the daemon is process {daemon.process.pid}, '" in stop.stderr
+        assert f"'kill {daemon.process.pid}' stops its axes in order" in stop.stderr
+
         before = daemon.cycle()
         os.kill(service, signal.SIGKILL)
         daemon.until(lambda: len(daemon.pids("service")) == 2, "the service returns")
@@ -54,11 +63,21 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         daemon.forget_lease()
         assert daemon.until_axis("enabled")["load_target_deg"] == pytest.approx(3.0, abs=1e-9)
         daemon.ask("move", target_deg=1.0)
+        assert daemon.axis()["scheme"] == "hysteresis"
 
         os.kill(control, signal.SIGKILL)
         daemon.until(lambda: len(daemon.pids("control")) == 2, "the control process returns")
         assert daemon.until_axis("disabled")["power"] != "operation enabled"
+        daemon.until(lambda: daemon.axis()["scheme"] == "hysteresis", "its compensation returns")
+        daemon.ask("enable")
+        assert daemon.ask("move", target_deg=2.0).json()["correction_arcsec"] != 0.0
         assert len(daemon.pids("service")) == 2
+
+        daemon.socket.unlink()
+        daemon.until(daemon.socket.exists, "the socket file is bound again")
+        assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o660
+        with httpx.Client(transport=httpx.HTTPTransport(uds=str(daemon.socket), verify=False)) as new:
+            assert new.get("http://hdbridge/api/v1/state").status_code == 200
 
         daemon.process.send_signal(signal.SIGHUP)
         assert daemon.ended() == 0
@@ -114,9 +133,9 @@ def test_what_it_refuses(
     assert not list(tmp_path.glob("hdbridge/*.sock"))
 
 
-def run_to_its_end(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_to_its_end(folder: Path, *arguments: str, command: str = "run") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "hdbridge", "run", *arguments],
+        [sys.executable, "-m", "hdbridge", command, *arguments],
         env={**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}, cwd=folder,
         capture_output=True, text=True, check=False,
     )  # fmt: skip

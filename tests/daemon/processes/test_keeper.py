@@ -141,18 +141,23 @@ def test_who_dies_or_hangs_is_replaced_and_the_other_goes_on(keeper: Callable[..
     kept.until(lambda: set(kept.said[-2:]) == {"control ends", "service ends"}, "they end in order")
 
 
-def test_a_control_process_that_dies_again_and_again_ends_all(keeper: Callable[..., Kept]) -> None:
+@pytest.mark.parametrize(
+    ("number", "how"), [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGTERM, "exit status 0")]
+)
+def test_a_control_process_that_dies_again_and_again_ends_all(
+    keeper: Callable[..., Kept], number: signal.Signals, how: str
+) -> None:
+    """SIGTERM to it alone is a death like any other: only the keeper ends the daemon."""
     kept = keeper()
     kept.until_told("READY=1")
     for times in range(1, 5):
-        os.kill(kept.until_begun("control", times), signal.SIGKILL)
+        os.kill(kept.until_begun("control", times), number)
     assert kept.until_ended() == 1
     assert len(kept.pids("control")) == 4
     assert len(kept.pids("service")) == 1
     assert kept.names().count("control process died") == 4
-    assert [event["how"] for event in kept.events if event["event"] == "control process died"] == [
-        "ended by SIGKILL"
-    ] * 4
+    died = [event["how"] for event in kept.events if event["event"] == "control process died"]
+    assert died == [how] * 4
 
 
 @pytest.mark.parametrize(("kind", "status"), [("CONTROL", 3), ("SERVICE", 2), ("SERVICE", 1)])

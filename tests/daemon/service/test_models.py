@@ -6,10 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.effect_examples import EXAMPLES
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.client.messages import JobKind
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.switchover import Correction
+from hdbridge.daemon.machinefile import LoadLoopSettings
+from hdbridge.daemon.memory import Cell
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.effects import Hysteresis
-from hdbridge.errors import InputError
+from hdbridge.errors import DaemonError, InputError, RefusedError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel, store
 
@@ -130,20 +140,217 @@ def test_an_axis_without_a_model_runs_uncompensated(tmp_path: Path) -> None:
         play(story(service))
 
 
-def test_a_new_control_process_gets_what_was_in_use(service: Service) -> None:
-    from hdbridge.daemon.memory import Cell
+SCHEMES = {"axis1": "synchronous", "axis2": "hysteresis"}
 
+
+def used(service: Service) -> list[list[str]]:
+    """The effects that the control loop compensates on each axis."""
+    return [[each.name for each in axis.follower.correction.model.effects] for axis in service.daemon.axes]
+
+
+def settled(bridge: ServiceBridge) -> bool:
+    return all(axis.models.settled for axis in bridge.axes.values())
+
+
+def watched(service: Service, bridge: ServiceBridge) -> list[tuple[list[str], list[str]]]:
+    """Wherever the effects in use and those that the API reports differ, for a second."""
+    differing = []
+    for _ in range(round(1.0 / service.daemon.period_s)):
+        service.daemon.turn()
+        said = [
+            [] if axis.models.in_use.scheme is Scheme.NONE else
+            [each.name for each in axis.models.in_use.compensating.effects]
+            for axis in bridge.axes.values()
+        ]  # fmt: skip
+        if said != used(service):
+            differing.append((said, used(service)))
+    return differing
+
+
+@pytest.fixture
+def pair(tmp_path: Path):
+    """Two axes, the second with a load loop."""
+    with stepped_service(tmp_path, axes=2) as made:
+        first, second = made.machine.axes
+        made.machine = replace(made.machine, axes=(first, replace(second, load_loop=LoadLoopSettings())))
+        yield made
+
+
+def begin_uncompensated(service: Service) -> None:
+    """The control process starts again, as the keeper does it: with no model, and a new process number."""
+    service.daemon.begin_again()
+    for axis in service.daemon.axes:
+        axis.follower.correction = Correction(
+            compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
+        )
+    status = service.daemon.memory.status
+    status.set(Cell.LOOP_PID, status.loop_pid + 1)
+
+
+async def choose(bridge: ServiceBridge, token: str) -> None:
+    for name, scheme in SCHEMES.items():
+        await bridge.axes[name].compensate(token, Scheme(scheme))
+
+
+def test_each_axis_gets_its_own_compensation_back_after_each_restart_of_the_control_process(
+    pair: Service,
+) -> None:
     async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            service.daemon.memory.status.set(Cell.LOOP_PID, 1)
-            await bridge.core.timing.sleep(0.1)
-            await axis.compensate(token, Scheme.SYNCHRONOUS)
-            number = service.daemon.memory.blobs.number
-            service.daemon.memory.status.set(Cell.LOOP_PID, 2)
-            await until(bridge, lambda: service.daemon.memory.blobs.number > number)
+        async with pair.enabled() as (bridge, token):
+            await choose(bridge, token)
+            for _ in range(7):
+                begin_uncompensated(pair)
+                assert [axis.state().scheme for axis in bridge.axes.values()] == ["none", "none"]
+                assert not any(axis.state().load_loop.on for axis in bridge.axes.values())
+                await until(bridge, lambda: settled(bridge))
+                assert used(pair) == [["synchronous"], ["hysteresis"]]
+                assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+                assert [axis.state().load_loop.on for axis in bridge.axes.values()] == [False, True]
             told = [each.text for each in bridge.events().events]
             assert "the control process was started again: every axis is disabled" in told
-            assert axis.state().scheme == "synchronous"
 
     play(story())
+
+
+def test_an_axis_is_not_enabled_with_another_compensation_than_the_chosen_one(pair: Service) -> None:
+    async def story() -> None:
+        async with pair.ready() as bridge:
+            token = bridge.lease.take("test")
+            await choose(bridge, token)
+            begin_uncompensated(pair)
+            await bridge.axes["axis2"].enable(token)
+            assert used(pair)[1] == ["hysteresis"]
+
+    play(story())
+
+
+@pytest.mark.parametrize("lost", range(1, 4))
+def test_a_setting_that_is_lost_is_sent_again(pair: Service, lost: int) -> None:
+    async def story() -> None:
+        async with pair.ready() as bridge:
+            token = bridge.lease.take("test")
+            await choose(bridge, token)
+            begin_uncompensated(pair)
+            for _ in range(lost):  # each time the new control process dies before it has read a command
+                await bridge.core.timing.sleep(0.0)
+                bridge.core.observer.poll()
+                begin_uncompensated(pair)
+            await until(bridge, lambda: settled(bridge))
+            assert used(pair) == [["synchronous"], ["hysteresis"]]
+
+    play(story())
+
+
+def test_a_new_service_finds_what_the_control_process_uses(pair: Service) -> None:
+    async def story() -> None:
+        async with pair.enabled() as (bridge, token):
+            await choose(bridge, token)
+            await bridge.axes["axis2"].switch_load_loop(token, on=False)
+            chosen = [axis.models.chosen for axis in bridge.axes.values()]
+        for axis in pair.machine.axes:
+            axis.profile.model.unlink()  # the next one needs no file for it
+        before = pair.daemon.memory.settings[0].number
+        async with pair.bridge() as bridge:
+            assert [axis.models.in_use for axis in bridge.axes.values()] == chosen
+            assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+            assert not bridge.axes["axis2"].state().load_loop.on
+            assert pair.daemon.memory.settings[0].number == before  # nothing was sent again
+            # Both processes die.
+        begin_uncompensated(pair)
+        async with pair.bridge() as bridge:
+            assert settled(bridge)
+            assert used(pair) == [["synchronous"], ["hysteresis"]]
+
+    play(story())
+
+
+def test_a_service_that_died_while_it_wrote_a_setting_starts_with_the_machine_file(pair: Service) -> None:
+    async def story() -> None:
+        async with pair.enabled() as (bridge, token):
+            await choose(bridge, token)
+        slot = pair.daemon.memory.settings[0]
+        slot._sent[0] = -slot.number - 1
+        async with pair.bridge() as bridge:
+            assert settled(bridge)
+            assert [axis.state().scheme for axis in bridge.axes.values()] == ["extended", "hysteresis"]
+            assert used(pair) == [["synchronous", "hysteresis"], ["hysteresis"]]
+
+    play(story())
+
+
+def test_a_refused_setting_is_never_reported_and_does_not_come_back(pair: Service) -> None:
+    async def story() -> None:
+        async with pair.enabled() as (bridge, token):
+            await choose(bridge, token)
+            axis = bridge.axes["axis1"]
+            other = replace(axis.models.chosen, model=replace(axis.models.chosen.model, ratio=50.1))
+            with pytest.raises(RefusedError, match="ratio"):
+                await axis._use(other)
+            assert axis.state().scheme == "synchronous"
+            assert not watched(pair, bridge)
+            await until(bridge, lambda: settled(bridge))
+        async with pair.bridge() as bridge:
+            assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+
+    play(story())
+
+
+def test_an_answer_that_comes_too_late_changes_nothing_that_is_reported(pair: Service) -> None:
+    async def story() -> None:
+        async with pair.enabled() as (bridge, token):
+            await choose(bridge, token)
+            daemon = pair.daemon
+            turn, daemon.controller.turn = daemon.controller.turn, lambda: daemon.hang(daemon.period_s)
+            axis = bridge.axes["axis1"]
+            with pytest.raises(DaemonError, match="did not answer"):
+                await axis.compensate(token, Scheme.EXTENDED)
+            assert axis.state().scheme == "synchronous"
+            daemon.controller.turn = turn
+            assert not watched(pair, bridge)
+            await until(bridge, lambda: settled(bridge))
+            assert used(pair) == [["synchronous"], ["hysteresis"]]
+
+    play(story())
+
+
+@given(data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_setting_reads_back_exactly(data: st.DataObject) -> None:
+    names = data.draw(st.lists(st.sampled_from(sorted(EXAMPLES)), unique=True, max_size=5))
+    effects = [data.draw(EXAMPLES[each]) for each in names]
+    model = TransmissionModel(
+        data.draw(st.floats(30.0, 200.0)), tuple(effects), {each: {"offset_arcsec": 0.3} for each in names},
+        {"axis": "arm", "date": "2026-03-01T12:00:00+00:00", "drive": {"vendor": 0x539}},
+    )  # fmt: skip
+    setting = CompensationSetting(
+        model, data.draw(st.sampled_from(Scheme)), data.draw(st.none() | st.integers(1, 99)),
+        data.draw(st.none() | st.just(Path("/a/model.yaml"))), data.draw(st.booleans()),
+        data.draw(st.none() | st.just(replace(model, ratio=50.0))),
+    )  # fmt: skip
+    assert CompensationSetting.from_json(setting.to_json()) == setting
+
+
+def test_during_a_job_the_model_of_the_job_is_reported(pair: Service) -> None:
+    seen = set()
+
+    async def story() -> None:
+        async with pair.ready() as bridge:
+            token = bridge.lease.take("test")
+            await choose(bridge, token)
+            turn = pair.daemon.turn
+
+            def looked(turns: int = 1) -> None:
+                turn(turns)
+                state = bridge.axes["axis2"].state()
+                effects = tuple(state.model.effects) if state.model is not None else ()
+                seen.add((state.scheme.value, effects, state.load_loop.on, tuple(used(pair)[1])))
+
+            pair.daemon.turn = looked
+            job = await bridge.axes["axis2"].job(token, JobKind.STEP, {"count": 2, "scheme": "both"})
+            await until(bridge, lambda: bridge.jobs()[-1].state != "running")
+            assert bridge.jobs()[-1].state == "done", job.problem
+            await until(bridge, lambda: settled(bridge))
+
+    play(story())
+    both = ("synchronous", "hysteresis")
+    assert seen == {("hysteresis", both, True, ("hysteresis",)), ("both", both, False, both)}

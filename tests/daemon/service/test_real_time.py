@@ -51,7 +51,7 @@ def test_many_things_at_once(tmp_path: Path, slower: int) -> None:
             lambda: memory.status.loop_count, memory.period_s, lambda: slower * time.monotonic(), math.inf
         )
         timing = RealTiming(8, clock)
-        async with ServiceBridge(service.machine, memory, timing, runtime=tmp_path) as bridge:
+        async with ServiceBridge(service.machine, memory, timing) as bridge:
             await verified(bridge)
             token = bridge.lease.take("test")
             await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))

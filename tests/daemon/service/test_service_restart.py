@@ -85,17 +85,17 @@ def test_what_was_lent_is_taken_back(service: Service) -> None:
     play(story())
 
 
-def test_the_choice_is_forgotten_with_the_control_process(service: Service) -> None:
+def test_the_choice_outlives_both_processes(service: Service) -> None:
     async def first() -> None:
         async with service.enabled() as (bridge, token):
-            await bridge.axes["axis1"].compensate(token, Scheme.NONE)
+            await bridge.axes["axis1"].compensate(token, Scheme.SYNCHRONOUS)
 
     play(first())
+    service.daemon.begin_again()
     service.daemon.memory.status.set(Cell.LOOP_PID, 4711)
 
     async def second() -> None:
         async with service.bridge() as bridge:
-            await bridge.core.timing.sleep(0.5)
-            assert bridge.axes["axis1"].state().scheme == "extended"
+            assert bridge.axes["axis1"].state().scheme == "synchronous"
 
     play(second())

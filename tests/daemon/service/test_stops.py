@@ -8,6 +8,9 @@ import pytest
 from support.daemon import SteppedDaemon
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.cli.ctl.look import _event as printed
+from hdbridge.client import messages
+from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
 
@@ -38,6 +41,16 @@ def no_room(daemon: SteppedDaemon) -> None:
     daemon.bus.no_room_for = 0x201
 
 
+def said_once(bridge: ServiceBridge, fault: messages.Fault | None, *more: str) -> None:
+    """Whatever a person reads about a stop says once what to do about it."""
+    assert fault is not None
+    (event,) = [each for each in bridge.events().events if each.kind == "stopped"]
+    assert event.hint == fault.hint
+    for words in (str(fault), printed(event), *more):
+        assert words.count(fault.hint) == 1, words
+        assert fault.hint not in fault.text
+
+
 LATCHED = [
     (lost_tpdos, Fault.LOST_TPDO),
     (drive_fault, Fault.DRIVE_FAULT),
@@ -57,10 +70,11 @@ def test_a_quick_stop_is_latched_until_a_reset(
             await axis.move(token, 100.0, wait=False)
             await bridge.core.timing.sleep(1.0)
             spoil(service.daemon)
-            with pytest.raises(SafetyStop, match=fault.value):
+            with pytest.raises(SafetyStop, match=fault.value) as raised:
                 await axis.move(token, 150.0)
             state = axis.state()
             assert state.state == "quick-stopped"
+            said_once(bridge, state.fault, str(raised.value))
             assert state.fault is not None
             assert state.fault.name == fault.name
             assert state.fault.hint
@@ -224,5 +238,25 @@ def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
             assert axis.state().power == "switch on disabled"
             await axis.enable(token)
             await axis.move(token, 1.0)
+
+    play(story())
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_quick_stop_by_a_client_says_once_how_to_release_it(service: Service, obeys: bool) -> None:
+    async def story() -> None:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            await axis.move(token, 100.0, wait=False)
+            await bridge.core.timing.sleep(1.0)
+            if not obeys:
+                service.daemon.nodes[0].dictionary[0x605A, 0].put(0)  # a quick stop does nothing
+            await axis.quick_stop()
+            await until(bridge, lambda: any(each.kind == "stopped" for each in bridge.events().events))
+            fault = axis.state().fault
+            assert fault is not None
+            assert fault.text.startswith("quick stop by command: latched")
+            assert fault.hint.endswith("hdbridge ctl reset axis1")
+            said_once(bridge, fault)
 
     play(story())

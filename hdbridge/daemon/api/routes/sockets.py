@@ -7,7 +7,6 @@ no more are taken than the buffer has room for.
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
 from typing import Final, TypeVar
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
@@ -32,6 +31,7 @@ _NOT_VALID: Final = 1008
 _NEWEST: Final = 2**62
 """Later than any event."""
 _NORMAL: Final = 1000
+_GONE: Final = 1006
 
 
 def socket_routes(bridge: Bridge) -> APIRouter:
@@ -51,21 +51,18 @@ def socket_routes(bridge: Bridge) -> APIRouter:
         for ended in await asyncio.gather(*sides, return_exceptions=True):
             if isinstance(ended, InputError):
                 await _close(websocket, str(ended))
-            elif isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect | TimeoutError):
+            elif isinstance(ended, Exception):
                 raise ended
 
     @routes.websocket("/axes/{axis}/stream")
     async def stream(websocket: WebSocket, axis: str) -> None:
         """Set-points: `StreamBegin`, then `StreamPoints`; each is answered (`StreamAnswer`)."""
         await _accept(websocket)
-        with suppress(WebSocketDisconnect):
-            try:
-                await _stream(bridge, websocket, axis)
-            except (HdbridgeError, TimeoutError) as problem:
-                late = InputError(f"nothing came within {BEGIN_S:g} s; expected StreamBegin")
-                error = problem if isinstance(problem, HdbridgeError) else late
-                await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
-                await _close(websocket, str(error))
+        try:
+            await _stream(bridge, websocket, axis)
+        except HdbridgeError as error:
+            await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
+            await _close(websocket, str(error))
 
     return routes
 
@@ -110,8 +107,11 @@ class _Feed:
 
 
 async def _stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
-    async with asyncio.timeout(BEGIN_S):
-        begin = await _receive(websocket, StreamBegin)
+    try:
+        async with asyncio.timeout(BEGIN_S):
+            begin = await _receive(websocket, StreamBegin)
+    except TimeoutError:
+        raise InputError(f"nothing came within {BEGIN_S:g} s; expected StreamBegin") from None
     stream = await port(bridge, axis).stream(begin.lease, begin.timeout_s)
     async with stream:
         await _send(websocket, StreamAnswer(accepted=0))
@@ -150,8 +150,11 @@ async def _receive(websocket: WebSocket, kind: type[M]) -> M:
 
 
 async def _send(websocket: WebSocket, message: BaseModel) -> None:
-    async with asyncio.timeout(SEND_S):
-        await websocket.send_text(message.model_dump_json())
+    try:
+        async with asyncio.timeout(SEND_S):
+            await websocket.send_text(message.model_dump_json())
+    except TimeoutError:
+        raise WebSocketDisconnect(_GONE) from None
 
 
 async def _close(websocket: WebSocket, reason: str) -> None:

@@ -1,0 +1,62 @@
+"""The compensation setting of one axis: written by the service, acknowledged by the loop."""
+
+from __future__ import annotations
+
+import threading
+import zlib
+
+from hdbridge.daemon.memory.layout import LINE, Place
+from hdbridge.daemon.memory.region import Region
+from hdbridge.errors import InputError
+
+
+class SettingSlot:
+    """Both ends of one axis's slot. It holds the setting that was sent last, under its number.
+
+    It outlives both processes: a service that starts reads from it what the one before had sent.
+    """
+
+    def __init__(self, region: Region, place: Place) -> None:
+        self._view = region.view
+        self._offset, _, self._capacity = place
+        self._sent = region.cells(self._offset - 2 * LINE, 3)  # number, length, crc
+        self._used = region.cells(self._offset - LINE, 1)
+        self._putting = threading.Lock()  # between threads of the service; the loop knows nothing of it
+
+    @property
+    def number(self) -> int:
+        """Number of the setting in the slot; 0 before the first, negative while one is being written."""
+        return int(self._sent[0])
+
+    @property
+    def in_use(self) -> int:
+        """Number of the setting that the loop uses; 0 if it has taken none since it started."""
+        return int(self._used[0])
+
+    def put(self, data: bytes) -> int:
+        """Store a setting; returns its number, which is the argument of CHANGE. InputError if too large."""
+        if len(data) > self._capacity:
+            raise InputError(
+                f"the compensation takes {len(data)} bytes, the control process takes at most "
+                f"{self._capacity}: use a model with fewer effects"
+            )
+        with self._putting:
+            number: int = abs(self._sent[0]) + 1
+            self._sent[0] = -number
+            self._view[self._offset : self._offset + len(data)] = data
+            self._sent[1], self._sent[2] = len(data), zlib.crc32(data)
+            self._sent[0] = number
+        return number
+
+    def get(self, number: int) -> bytes:
+        """The setting of that number. InputError if the slot does not hold it whole."""
+        length: int = self._sent[1]
+        data = bytes(self._view[self._offset : self._offset + min(max(length, 0), self._capacity)])
+        whole = len(data) == length and zlib.crc32(data) == self._sent[2]
+        if number <= 0 or self._sent[0] != number or not whole:
+            raise InputError(f"the compensation setting number {number} is not in the slot; send it again")
+        return data
+
+    def use(self, number: int) -> None:
+        """The loop's acknowledgement: it uses this setting from now on."""
+        self._used[0] = number

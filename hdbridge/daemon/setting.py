@@ -1,0 +1,78 @@
+"""What compensates an axis, as the service sends it to the control process."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.compensation import Compensation
+from hdbridge.errors import InputError
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.model import TransmissionModel
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+
+
+@dataclass(frozen=True, slots=True)
+class CompensationSetting:
+    """The model of an axis, the part of it that compensates, and the load loop."""
+
+    model: TransmissionModel
+    scheme: Scheme
+    version: int | None = None
+    """Number of the model in the profile's history; None if it has none."""
+    file: Path | None = None
+    """File of the model; None of one that a job has made."""
+    load_loop: bool = False
+    """Whether the load loop is on."""
+    adapted: TransmissionModel | None = None
+    """The model with the parameters that the adaptation has moved; None: as committed."""
+
+    @property
+    def compensating(self) -> TransmissionModel:
+        """The model as it compensates: the adapted parameters, the effects of the scheme."""
+        return self.scheme.of(self.adapted or self.model)
+
+    def compensation(self, axis: AxisConfig) -> Compensation:
+        """The inverse for the control loop; that of the whole model if the scheme is `NONE`.
+
+        InputError if the model does not fit the axis.
+        """
+        whole = self.adapted or self.model
+        return compensation_for(axis, whole if self.scheme is Scheme.NONE else self.scheme.of(whole))
+
+    def to_json(self) -> bytes:
+        """The setting as JSON; `from_json` reads it back exactly."""
+        return json.dumps(
+            {
+                "model": self.model.document(),
+                "scheme": self.scheme.value,
+                "version": self.version,
+                "file": str(self.file) if self.file is not None else None,
+                "load_loop": self.load_loop,
+                "adapted": self.adapted.document() if self.adapted is not None else None,
+            },
+            default=str,
+        ).encode()
+
+    @classmethod
+    def from_json(cls, data: bytes) -> Self:
+        """Reads `to_json`; InputError for anything else."""
+        try:
+            given = json.loads(data)
+            file = None if given["file"] is None else Path(given["file"])
+            adapted = given["adapted"]
+            return cls(
+                model=TransmissionModel.from_document(given["model"], file),
+                scheme=Scheme(given["scheme"]),
+                version=given["version"],
+                file=file,
+                load_loop=given["load_loop"],
+                adapted=None if adapted is None else TransmissionModel.from_document(adapted, file),
+            )
+        except (ValueError, TypeError, KeyError, RecursionError) as problem:
+            raise InputError(f"the compensation setting cannot be read: {problem}") from problem

@@ -1,0 +1,284 @@
+"""The object dictionary of the simulated drive: what its EDS declares, and the values that live behind it.
+
+An entry is a stored value, or is bound to a function that reads the drive at this moment. Writing checks
+access, length and range as CiA 301 demands, and then asks the entry's guard, which may refuse. PDO mappings
+are compiled from entries once (``pdo.py``), so nothing here runs in the cyclic path but stored values and
+bound functions.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.edsfile import shared_eds
+
+BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
+"""The objects that the firmware works with."""
+NUMBERS: Final = {
+    datatypes.BOOLEAN: "B",
+    datatypes.INTEGER8: "b",
+    datatypes.INTEGER16: "h",
+    datatypes.INTEGER32: "i",
+    datatypes.INTEGER64: "q",
+    datatypes.UNSIGNED8: "B",
+    datatypes.UNSIGNED16: "H",
+    datatypes.UNSIGNED32: "I",
+    datatypes.UNSIGNED64: "Q",
+    datatypes.REAL32: "f",
+    datatypes.REAL64: "d",
+}
+"""Data types of numbers, as ``struct`` format characters; an object of any other type holds bytes."""
+_PDOS: Final = (0x1400, 0x1BFF)
+"""PDOs exist or not: the firmware does without those that the EDS does not list."""
+
+MAX_STRING: Final = 64
+"""Longest string, in bytes, that can be written to a writable string object."""
+
+
+class Abort(IntEnum):
+    """SDO abort codes (CiA 301)."""
+
+    TOGGLE = 0x05030000
+    COMMAND = 0x05040001
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    LENGTH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    RANGE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    STATE = 0x08000022
+
+
+class SdoAbortError(Exception):
+    """An access that the drive refuses, with the abort code it answers."""
+
+    def __init__(self, code: Abort, what: str = "") -> None:
+        super().__init__(what or f"{code.name} ({code:08X}h)")
+        self.code = code
+
+
+class Entry:
+    """One (index, sub-index).
+
+    ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
+    value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is told after it was
+    stored. The firmware uses a ``hidden`` entry, and the bus does not see it.
+    """
+
+    __slots__ = (
+        "_bits",
+        "bound",
+        "codec",
+        "default",
+        "follower",
+        "guard",
+        "hidden",
+        "high",
+        "index",
+        "low",
+        "mappable",
+        "name",
+        "readable",
+        "sub",
+        "value",
+        "writable",
+    )
+
+    def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
+        """``own`` is the same object in the bundled EDS: its default serves if the drive's EDS gives none."""
+        self.index: Final[int] = variable.index
+        self.sub: Final[int] = variable.subindex
+        self.name: Final[str] = variable.name
+        code = NUMBERS.get(variable.data_type or 0)
+        self.codec: Final = struct.Struct("<" + code) if code else None
+        self.hidden = False
+        self.readable: Final = "r" in variable.access_type or variable.access_type == "const"
+        self.writable: Final = "w" in variable.access_type
+        self.mappable: Final = bool(variable.pdo_mappable) and code is not None
+        self.low: Final[int | None] = variable.min
+        self.high: Final[int | None] = variable.max
+        other_type = own is None or own.data_type != variable.data_type
+        self._bits = self.bits if other_type and code not in {*"fd"} else 0
+        default = variable.default if variable.default is not None or own is None else own.default
+        empty: int | str = 0 if code else ""
+        self.default: Any = empty if default is None else default
+        if isinstance(self.default, str):
+            self.default = self.default.encode()
+        elif self._bits and isinstance(self.default, int):
+            self.default = self._wrapped(self.default)
+        self.value: Any = self.default  # of what the codec says
+        self.bound: Callable[[], int] | None = None
+        self.guard: Callable[[int], None] | None = None
+        self.follower: Callable[[int], None] | None = None
+
+    def __repr__(self) -> str:
+        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
+
+    @property
+    def bits(self) -> int:
+        """Length in bits, as a PDO mapping entry states it."""
+        return 8 * self.codec.size if self.codec else 0
+
+    def bind(self, read: Callable[[], int]) -> None:
+        """Make reads, by SDO and by PDO, call ``read``."""
+        self.bound = (lambda: self._wrapped(read())) if self._bits else read
+
+    def _wrapped(self, value: int) -> int:
+        """A value of any integer type in the type of this EDS."""
+        assert self.codec is not None
+        size = self.codec.size
+        wrapped: int = self.codec.unpack((value % (1 << 8 * size)).to_bytes(size, "little"))[0]
+        return wrapped
+
+    def reader(self) -> Callable[[], int]:
+        """What a TPDO calls to get the value."""
+        return self.bound if self.bound is not None else self.number
+
+    def number(self) -> int:
+        """The present value of an integer entry."""
+        value: int = self.value if self.bound is None else self.bound()
+        return value
+
+    def read(self) -> bytes:
+        """The present value as an SDO server sends it."""
+        if not self.readable:
+            raise SdoAbortError(Abort.WRITE_ONLY)
+        if self.codec is None:
+            assert isinstance(self.value, bytes)
+            return self.value
+        return self.codec.pack(self.number())
+
+    def check_length(self, size: int) -> None:
+        """Refuse a read-only entry and a length that does not fit."""
+        if not self.writable:
+            raise SdoAbortError(Abort.READ_ONLY)
+        longest = self.codec.size if self.codec else MAX_STRING
+        if size > longest:
+            raise SdoAbortError(Abort.TOO_LONG)
+        if self.codec and size < longest:
+            raise SdoAbortError(Abort.TOO_SHORT)
+
+    def write(self, data: bytes) -> None:
+        """Check and store what an SDO client wrote."""
+        self.check_length(len(data))
+        if self.codec is None:
+            self.value = bytes(data)
+        else:
+            self.put(self.codec.unpack(data)[0])
+
+    def put(self, value: int) -> None:
+        """Check and store a number, whoever wrote it."""
+        if self.high is not None and value > self.high:
+            raise SdoAbortError(Abort.TOO_HIGH)
+        if self.low is not None and value < self.low:
+            raise SdoAbortError(Abort.TOO_LOW)
+        if self.guard is not None:
+            self.guard(value)
+        self.value = value
+        if self.follower is not None:
+            self.follower(value)
+
+    def writer(self) -> Callable[[int], None]:
+        """What an RPDO calls with a received value; one out of range is refused by ``SdoAbortError``."""
+        plain = self.low is None and self.high is None and self.guard is None and self.follower is None
+        return self._store if plain else self.put
+
+    def _store(self, value: int) -> None:
+        self.value = value
+
+
+class Dictionary:
+    """All entries of one node, by (index, sub-index).
+
+    The firmware works with every object of the bundled EDS. Those that ``eds_path`` does not list are hidden:
+    no SDO or PDO reaches them, and they keep the bundled default.
+    """
+
+    def __init__(self, eds_path: Path, node_id: int) -> None:
+        self._path = eds_path
+        self._entries: dict[tuple[int, int], Entry] = {}
+        own = _variables(shared_eds(BUNDLED, node_id).dictionary)
+        declared = shared_eds(eds_path, node_id).dictionary
+        variables = _variables(declared)
+        for key, variable in variables.items():
+            self._add(variable, own.get(key))
+        device = declared.device_information
+        for sub, number in enumerate(
+            (device.vendor_number, device.product_number, device.revision_number), 1
+        ):
+            named = variables.get((0x1018, sub))
+            if named is not None and named.default is None and number is not None:
+                self._entries[0x1018, sub].default = number  # only [DeviceInfo] gives it
+        for key, variable in own.items():
+            if key not in self._entries and not _PDOS[0] <= variable.index <= _PDOS[1]:
+                self._add(variable, variable).hidden = True
+        self._note_indices()
+
+    def _add(self, variable: ODVariable, own: ODVariable | None) -> Entry:
+        entry = Entry(variable, own)
+        if own is not None and (entry.codec is None) != (own.data_type not in NUMBERS):
+            raise InputError(
+                f"{self._path}: {entry} is of data type {variable.data_type:04X}h, and the simulated drive's "
+                f"of {own.data_type:04X}h; a drive with this EDS cannot be simulated"
+            )
+        self._entries[entry.index, entry.sub] = entry
+        return entry
+
+    def _note_indices(self) -> None:
+        self._indices = {entry.index for entry in self}
+
+    def __getitem__(self, key: tuple[int, int]) -> Entry:
+        """An entry for the firmware, hidden or not."""
+        return self._entries[key]
+
+    def open(self, index: int, sub: int) -> Entry:
+        """An entry for the bus; refuses those that the drive does not show."""
+        entry = self._entries.get((index, sub))
+        if entry is None or entry.hidden:
+            code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT
+            raise SdoAbortError(code, f"there is no object {index:04X}h:{sub:02X}")
+        return entry
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        entry = self._entries.get(key)
+        return entry is not None and not entry.hidden
+
+    def __iter__(self) -> Iterator[Entry]:
+        return (entry for entry in self._entries.values() if not entry.hidden)
+
+    def remove(self, index: int, sub: int) -> None:
+        """Be a drive that does not have this object."""
+        self._entries[index, sub].hidden = True
+        self._note_indices()
+
+    def value(self, index: int, sub: int = 0) -> int:
+        """The present number behind an integer entry."""
+        return self._entries[index, sub].number()
+
+    def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
+        """Put the defaults back into all stored values of these indices; no guard is asked."""
+        for entry in self._entries.values():
+            if first <= entry.index <= last:
+                entry.value = entry.default
+
+
+def _variables(od: ObjectDictionary) -> dict[tuple[int, int], ODVariable]:
+    found = {}
+    for item in od.values():
+        for each in [item] if isinstance(item, ODVariable) else item.subindices.values():
+            found[each.index, each.subindex] = each
+    return found

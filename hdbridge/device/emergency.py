@@ -1,0 +1,111 @@
+"""Errors of the simulated drive: what is active, the error register, the history, and EMCY messages."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from enum import IntEnum
+from functools import partial
+from typing import Final
+
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+
+HISTORY_DEPTH: Final = 8
+_FRAME: Final = struct.Struct("<HB5s")
+_DISABLED: Final = 1 << 31
+
+
+class ErrorCode(IntEnum):
+    """Emergency error codes that the drive produces by itself (CiA 301, CiA 402)."""
+
+    NONE = 0x0000
+    COMMUNICATION = 0x8100
+    HEARTBEAT = 0x8130
+    PDO_TOO_SHORT = 0x8210
+    PDO_TOO_LONG = 0x8220
+    RPDO_TIMEOUT = 0x8250
+    FOLLOWING_ERROR = 0x8611
+
+
+class Emergency:
+    """The EMCY producer. An error occurs once, stays active, and is cleared once."""
+
+    def __init__(self, dictionary: Dictionary, send: Callable[[int, bytes], None]) -> None:
+        self._dictionary = dictionary
+        self._send = send
+        self.active: list[int] = []
+        """Codes of the errors that have not ended, oldest first."""
+        dictionary[0x1001, 0].bind(self._register)
+        dictionary[0x1014, 0].guard = self._check_can_id
+        dictionary[0x1003, 0].guard = _only_zero
+        dictionary[0x1003, 0].bind(lambda: len(self._history))
+        dictionary[0x1003, 0].follower = lambda _: self._history.clear()
+        self._history: list[int] = []
+        for sub in range(1, HISTORY_DEPTH + 1):
+            dictionary[0x1003, sub].bind(partial(self._past, sub - 1))
+
+    def reset(self) -> None:
+        """As after power-on; nothing is sent."""
+        self.active.clear()
+        self._history.clear()
+
+    def _past(self, age: int) -> int:
+        return self._history[age] if age < len(self._history) else 0
+
+    def occur(self, code: int, additional: bytes = b"") -> None:
+        """Make ``code`` active and send it, unless it already is; ``additional`` are up to five bytes."""
+        if code in self.active:
+            return
+        self.active.append(code)
+        self._history.insert(0, code)
+        del self._history[HISTORY_DEPTH:]
+        self._transmit(code, additional)
+
+    def clear(self, code: int) -> None:
+        """End one error; the last one to end sends 'error reset'."""
+        if code in self.active:
+            self.active.remove(code)
+            self._transmit(self.active[-1] if self.active else ErrorCode.NONE, b"")
+
+    def clear_all(self) -> None:
+        """End all errors, as a fault reset does."""
+        if self.active:
+            self.active.clear()
+            self._transmit(ErrorCode.NONE, b"")
+
+    def _transmit(self, code: int, additional: bytes) -> None:
+        can_id = self._dictionary.value(0x1014)
+        if not can_id & _DISABLED:
+            self._send(can_id & 0x7FF, _FRAME.pack(code, self._register(), additional))
+
+    def _register(self) -> int:
+        """Object 1001h: bit 0 any error, bits 1 to 7 by the class of the code."""
+        register = 0
+        for code in self.active:
+            register |= 1 | _register_bit(code)
+        return register
+
+    @staticmethod
+    def _check_can_id(value: int) -> None:
+        if not 0x81 <= value & 0x7FF <= 0xFF or value & 0x7FFFF800:
+            raise SdoAbortError(Abort.RANGE)
+
+
+def _register_bit(code: int) -> int:
+    for high_byte, bit in (
+        (0x86, 0x20),
+        (0x20, 0x02),
+        (0x30, 0x04),
+        (0x40, 0x08),
+        (0x80, 0x10),
+        (0xF0, 0x80),
+    ):
+        mask = 0xFF00 if high_byte == 0x86 else 0xF000
+        if code & mask == high_byte << 8:
+            return bit
+    return 0
+
+
+def _only_zero(value: int) -> None:
+    if value != 0:
+        raise SdoAbortError(Abort.RANGE)

@@ -1,0 +1,285 @@
+"""The operating modes of the simulated drive: PP, homing, interpolated and cyclic synchronous position.
+
+A mode turns set-points into the demand of the next period. Power states, stopping and supervision are the
+firmware's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final
+
+from hdbridge.device.dictionary import Abort, SdoAbortError
+from hdbridge.device.motion import Motion, wrap_int32
+from hdbridge.device.powerstate import Control, Status
+from hdbridge.device.profile import Profile, move
+
+INDEX_PULSE: Final = {33: -1, 34: 1}
+"""Methods that move to the next index pulse, and in which direction."""
+HOMING_METHODS: Final = (*INDEX_PULSE, 35, 37)
+"""35 is the old number of 37."""
+
+_NEW: Final = int(Control.NEW_SET_POINT)
+_IMMEDIATELY: Final = int(Control.CHANGE_IMMEDIATELY)
+_RELATIVE: Final = int(Control.RELATIVE)
+_REACHED: Final = int(Status.TARGET_REACHED)
+_BIT_12: Final = int(Status.MODE_12)
+_BIT_13: Final = int(Status.MODE_13)
+
+
+class Mode:
+    """An operating mode while OPERATION ENABLED. This one, 0, is 'no mode': it holds the position."""
+
+    number: ClassVar[int] = 0
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+
+    def enter(self) -> None:
+        """Begin at the present demand, at rest."""
+
+    def resume(self) -> None:
+        """Go on after a halt."""
+
+    def control(self, word: int, rising: int) -> None:
+        """A controlword came; ``rising`` are the bits that it sets anew."""
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        """Demand (counts) and its velocity (counts/s) at the end of the next period."""
+        return self.motion.demand_counts, 0.0
+
+    def observe(self, period_s: float) -> None:
+        """Look at the encoders after a period."""
+
+    def status(self) -> int:
+        """Bits 10, 12 and 13 of the statusword."""
+        return 0
+
+
+class CyclicSynchronousPosition(Mode):
+    """CSP: interpolate linearly to the target over one period, no faster than the motor may turn."""
+
+    number = 8
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__(motion)
+        self._target = motion.dictionary[0x607A, 0]
+        self._offset = motion.dictionary[0x60B0, 0]
+
+    def _aim(self) -> int:
+        """The user's position to be reached with the next period."""
+        target: int = self._target.value + self._offset.value
+        return target
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        motion = self.motion
+        motion.limited = False
+        goal = motion.goal(self._aim())
+        step = goal - motion.demand_counts
+        longest = motion.max_speed_counts_s * period_s
+        if abs(step) > longest:
+            motion.limited = True
+            step = longest if step > 0.0 else -longest
+            goal = motion.demand_counts + step
+        return goal, step / period_s
+
+    def status(self) -> int:
+        return _BIT_12
+
+
+class InterpolatedPosition(CyclicSynchronousPosition):
+    """IP: interpolate linearly to 60C1h:01 over one period while bit 4 is set; hold the position else."""
+
+    number = 7
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__(motion)
+        self._data = motion.dictionary[0x60C1, 1]
+        self._active = False
+        motion.dictionary[0x60C0, 0].guard = _check_submode
+
+    def _aim(self) -> int:
+        data: int = self._data.value
+        return data
+
+    def enter(self) -> None:
+        self._active = False
+
+    def control(self, word: int, rising: int) -> None:
+        self._active = bool(word & _NEW)
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        return super().step(period_s) if self._active else (self.motion.demand_counts, 0.0)
+
+    def status(self) -> int:
+        return _BIT_12 if self._active else 0
+
+
+class ProfilePosition(Mode):
+    """PP: trapezoidal moves to set-points, of which one may wait while another is under way."""
+
+    number = 1
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__(motion)
+        self.enter()
+
+    def enter(self) -> None:
+        self._profile: Profile | None = None
+        self._elapsed_s = 0.0
+        self._goal = self.motion.demand_counts
+        self._waiting: float | None = None
+        self._acknowledged = False
+        self._requested = False
+        self._in_window_s = 0.0
+        self._reached = True
+
+    def resume(self) -> None:
+        if not self._reached:
+            self._start(self._goal)
+
+    def control(self, word: int, rising: int) -> None:
+        self._requested = bool(word & _NEW)
+        if rising & _NEW and not self._acknowledged:
+            goal = self._set_point(relative=bool(word & _RELATIVE))
+            self._acknowledged = True
+            if self._profile is not None and not word & _IMMEDIATELY:
+                self._waiting = goal
+            else:
+                self._waiting = None
+                self._start(goal)
+        self._release()
+
+    def _set_point(self, *, relative: bool) -> float:
+        motion = self.motion
+        target = motion.dictionary.value(0x607A)
+        if relative:  # CiA 402: to the preceding set-point, not to where the axis happens to be
+            before = self._goal if self._waiting is None else self._waiting
+            target = wrap_int32(motion.user(before) + target)
+        motion.limited = False
+        return motion.goal(target)
+
+    def _release(self) -> None:
+        """Withdraw the acknowledgement when the request is gone and another set-point can be taken."""
+        if self._acknowledged and not self._requested and self._waiting is None:
+            self._acknowledged = False
+
+    def _start(self, goal: float) -> None:
+        motion, value = self.motion, self.motion.dictionary.value
+        self._goal = goal
+        self._elapsed_s = 0.0
+        self._in_window_s = 0.0
+        self._reached = False
+        self._profile = move(
+            motion.demand_counts,
+            motion.velocity_counts_s,
+            goal,
+            min(value(0x6081), value(0x607F), motion.max_speed_counts_s),
+            min(value(0x6083), value(0x60C5)),
+            min(value(0x6084), value(0x60C6)),
+        )
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        if self._profile is None:
+            return self.motion.demand_counts, 0.0
+        self._elapsed_s += period_s
+        demand, velocity = self._profile.at(self._elapsed_s)
+        if self._elapsed_s >= self._profile.duration_s:
+            self._profile = None
+        return demand, velocity
+
+    def observe(self, period_s: float) -> None:
+        if self._profile is not None:
+            return
+        if self._waiting is not None:
+            goal, self._waiting = self._waiting, None
+            self._start(goal)
+            self._release()
+            return
+        value = self.motion.dictionary.value
+        if abs(self._goal - self.motion.motor_counts) > value(0x6067):
+            self._in_window_s = 0.0
+            self._reached = False
+            return
+        self._in_window_s += period_s
+        self._reached = self._reached or self._in_window_s * 1000.0 >= value(0x6068)
+
+    def status(self) -> int:
+        return (_REACHED if self._reached else 0) | (_BIT_12 if self._acknowledged else 0)
+
+
+class Homing(Mode):
+    """HM: methods 33 and 34 move to the next index pulse, 35 and 37 take the present position.
+
+    Where the axis then is becomes 607Ch. The index pulse comes once per motor turn.
+    """
+
+    number = 6
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__(motion)
+        self.referenced = False
+        self.enter()
+        motion.dictionary[0x6098, 0].guard = _check_method
+
+    def enter(self) -> None:
+        self._attained = False
+        self._failed = False
+        self._profile: Profile | None = None
+        self._elapsed_s = 0.0
+
+    def control(self, word: int, rising: int) -> None:
+        if not word & _NEW:
+            self._profile = None  # withdrawing the start bit breaks homing off
+        if not rising & _NEW:
+            return
+        motion, value = self.motion, self.motion.dictionary.value
+        moved_per_ms = abs(motion.machine.velocity_counts_s) * 1e-3
+        self._failed = moved_per_ms > 1.0 or motion.velocity_counts_s != 0.0
+        self._attained = False
+        if self._failed:
+            return
+        method = value(0x6098)
+        if method not in INDEX_PULSE:
+            self._attain(motion.motor_counts)
+            return
+        turn = value(0x608F, 1)
+        here = motion.demand_counts / turn
+        index = math.ceil(here) - 1 if INDEX_PULSE[method] * motion.sign < 0 else math.floor(here) + 1
+        self._elapsed_s = 0.0
+        acceleration = value(0x609A)
+        self._profile = move(
+            motion.demand_counts, 0.0, float(index * turn), value(0x6099, 2), acceleration, acceleration
+        )
+
+    def step(self, period_s: float) -> tuple[float, float]:
+        if self._profile is None:
+            return self.motion.demand_counts, 0.0
+        self._elapsed_s += period_s
+        demand, velocity = self._profile.at(self._elapsed_s)
+        if self._elapsed_s >= self._profile.duration_s:
+            self._profile = None
+            self._attain(round(demand))
+        return demand, velocity
+
+    def _attain(self, counts: int) -> None:
+        """Declare a position of the motor encoder to be 607Ch."""
+        motion = self.motion
+        motion.home_counts = motion.dictionary.value(0x607C) - motion.sign * counts
+        motion.preload_target()
+        self._attained = self.referenced = True
+
+    def status(self) -> int:
+        if self._profile is not None:
+            return 0
+        return _REACHED | (_BIT_12 if self._attained else 0) | (_BIT_13 if self._failed else 0)
+
+
+def _check_submode(submode: int) -> None:
+    if submode != 0:  # linear interpolation
+        raise SdoAbortError(Abort.RANGE)
+
+
+def _check_method(method: int) -> None:
+    if method not in HOMING_METHODS:
+        raise SdoAbortError(Abort.RANGE)

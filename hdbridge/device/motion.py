@@ -1,0 +1,168 @@
+"""Where the simulated drive's axis is and is told to be, in the plant's counts and in the user's.
+
+The plant counts without bound and knows no home; the user has int32 positions with polarity and home offset.
+Everything that moves is computed in the plant's counts; int32 appears only where objects are read or written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from hdbridge.device.dictionary import Dictionary
+
+_HALF: Final = 1 << 31
+_MASK: Final = (1 << 32) - 1
+
+
+def wrap_int32(value: int) -> int:
+    """``value`` modulo 2**32, in the range of an int32."""
+    return ((value + _HALF) & _MASK) - _HALF
+
+
+class Machine(Protocol):
+    """The plant as the firmware sees it: servo loops that follow a demand, and encoders."""
+
+    dt_s: float
+    torque_limit_permille: float
+
+    @property
+    def motor_counts(self) -> int: ...
+    @property
+    def load_counts(self) -> int: ...
+    @property
+    def velocity_counts_s(self) -> float: ...
+    @property
+    def torque_permille(self) -> int: ...
+    @property
+    def temperature_c(self) -> float: ...
+    @property
+    def load_torque_nm(self) -> float: ...
+    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+        """Servo on: the demand moves linearly from start to end during ``substeps``."""
+        ...
+
+    def coast(self, substeps: int, braked: bool) -> None:
+        """Power stage off, holding brake open or closed."""
+        ...
+
+
+class Motion:
+    """Demand and actual position of the axis, shared by the firmware and its operating modes.
+
+    ``demand_counts`` and ``velocity_counts_s`` are of the demand, in the plant's coordinates;
+    ``motor_counts`` and ``load_counts`` are the encoders as last sampled. ``limited`` becomes true when a
+    limit cut a target.
+    """
+
+    def __init__(self, dictionary: Dictionary, machine: Machine) -> None:
+        self.dictionary = dictionary
+        self.machine = machine
+        self.home_counts = 0
+        self.limited = False
+        self.demand_counts = float(machine.motor_counts)
+        self.velocity_counts_s = 0.0
+        self.motor_counts = machine.motor_counts
+        self.load_counts = machine.load_counts
+        self.load_velocity_counts_s = 0.0
+        self.motor_jump_counts = 0
+        self.load_jump_counts = 0
+        self.load_reading: Callable[[int], int] | None = None
+        self._owed_s = 0.0
+        self._targets = dictionary[0x607A, 0], dictionary[0x60C1, 1]
+        for index, sub in ((0x607D, 1), (0x607D, 2), (0x607E, 0), (0x6080, 0)):
+            dictionary[index, sub].follower = lambda _: self.take_parameters()
+        self.take_parameters()
+
+    def take_parameters(self) -> None:
+        """Work out what depends on objects that only SDO writes, so that no period has to."""
+        value = self.dictionary.value
+        self.sign = -1 if value(0x607E) & 0x80 else 1
+        """-1 where object 607Eh reverses positions, else 1."""
+        self.max_speed_counts_s: float = value(0x6080) * value(0x608F, 1) / 60.0
+        """Object 6080h in counts/s."""
+        low, high = value(0x607D, 1), value(0x607D, 2)
+        self._has_limits = low < high and (low > -_HALF or high < _HALF - 1)
+        self._low, self._high = low, high
+
+    def user(self, counts: float) -> int:
+        """The user's (unbounded) position of a plant position."""
+        return self.sign * round(counts) + self.home_counts
+
+    def goal(self, target: int) -> float:
+        """The plant position of a user's int32 target: the one nearest to the demand, within the limits.
+
+        An axis that already is beyond a software limit may stay where it is and come back; it is not
+        dragged inside.
+        """
+        sign = self.sign
+        here = sign * round(self.demand_counts) + self.home_counts
+        distance = ((target - here + _HALF) & _MASK) - _HALF
+        if self._has_limits:
+            low, high = self._low, self._high
+            here32 = ((here + _HALF) & _MASK) - _HALF
+            reach = here32 + distance
+            if not low <= reach <= high:
+                allowed = min(max(reach, min(low, here32)), max(high, here32))
+                if allowed != reach:
+                    self.limited = True
+                    distance = allowed - here32
+        return sign * (here + distance - self.home_counts)
+
+    def actual_position(self) -> int:
+        """Object 6064h."""
+        return ((self.sign * self.motor_counts + self.home_counts + _HALF) & _MASK) - _HALF
+
+    def demand_position(self) -> int:
+        """Object 6062h."""
+        return ((self.sign * round(self.demand_counts) + self.home_counts + _HALF) & _MASK) - _HALF
+
+    def load_position(self) -> int:
+        """Object 60E4h:01, to which neither homing nor polarity applies."""
+        return ((self.load_counts + _HALF) & _MASK) - _HALF
+
+    def preload_target(self) -> None:
+        """Make the demand the target, so that a mode that begins does not move."""
+        for target in self._targets:
+            target.value = wrap_int32(self.user(self.demand_counts))
+
+    def take_actual_as_demand(self) -> None:
+        """Demand rest where the axis is."""
+        self.demand_counts = float(self.motor_counts)
+        self.velocity_counts_s = 0.0
+
+    def follow(self, demand_counts: float, velocity_counts_s: float, period_s: float) -> None:
+        """Move the demand, and the plant after it, for one period."""
+        substeps = self._substeps(period_s)
+        if substeps:
+            jump = self.motor_jump_counts  # the loops close on the encoder as it reads
+            self.machine.follow(self.demand_counts - jump, demand_counts - jump, substeps)
+        self.demand_counts = demand_counts
+        self.velocity_counts_s = velocity_counts_s
+        self._sample(period_s)
+
+    def coast(self, period_s: float) -> None:
+        """Let the plant go for one period; the holding brake closes at rest."""
+        substeps = self._substeps(period_s)
+        at_rest = abs(self.machine.velocity_counts_s) * period_s < 1.0
+        if substeps:
+            self.machine.coast(substeps, at_rest)
+        self._sample(period_s)
+        self.take_actual_as_demand()
+
+    def _substeps(self, period_s: float) -> int:
+        """Whole substeps of the plant in this period; what is left over is kept for the next."""
+        dt_s = self.machine.dt_s
+        self._owed_s += period_s
+        substeps = int(self._owed_s / dt_s + 1e-6)
+        self._owed_s -= substeps * dt_s
+        return substeps
+
+    def _sample(self, period_s: float) -> None:
+        machine = self.machine
+        self.motor_counts = machine.motor_counts + self.motor_jump_counts
+        counts = machine.load_counts + self.load_jump_counts
+        if self.load_reading is not None:
+            counts = self.load_reading(counts)
+        before, self.load_counts = self.load_counts, counts
+        self.load_velocity_counts_s = (self.load_counts - before) / period_s

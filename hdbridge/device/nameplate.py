@@ -1,0 +1,43 @@
+"""What distinguishes one simulated drive from the next: serial number, encoders, gear, rated torque."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from hdbridge.device.dictionary import Dictionary
+
+LOAD_OBJECT: Final = (0x60E4, 1)
+
+
+@dataclass(frozen=True)
+class Nameplate:
+    """Values of the read-only objects 1018h:04, 6076h, 608Fh, 6091h, 6092h, 60E6h and 60E9h."""
+
+    serial: int = 1
+    motor_counts_per_turn: int = 8000
+    load_counts_per_turn: int = 2_880_000
+    gear_motor_turns: int = 50
+    gear_load_turns: int = 1
+    rated_torque_mnm: int = 320
+    load_object: tuple[int, int] = LOAD_OBJECT
+    """Index and sub-index of the object that the load encoder is read from."""
+
+    def engrave(self, dictionary: Dictionary) -> None:
+        """Make these the values, and the defaults to which a reset returns."""
+        # Positions are counts of the motor: with one of gear ratio and feed alone, they do not know the gear.
+        motor_turns, load_turns = self.gear_motor_turns, self.gear_load_turns
+        if (0x6091, 1) not in dictionary or (0x6092, 1) not in dictionary:
+            motor_turns = load_turns = 1
+        for key, value in {
+            (0x1018, 4): self.serial,
+            (0x6076, 0): self.rated_torque_mnm,
+            (0x608F, 1): self.motor_counts_per_turn,
+            (0x6091, 1): motor_turns,
+            (0x6091, 2): load_turns,
+            (0x6092, 1): self.motor_counts_per_turn * motor_turns,
+            (0x6092, 2): load_turns,
+            (0x60E6, 1): self.load_counts_per_turn,
+            (0x60E9, 1): self.load_counts_per_turn,
+        }.items():
+            dictionary[key].default = dictionary[key].value = value

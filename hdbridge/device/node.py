@@ -1,0 +1,424 @@
+"""The simulated drive as a CANopen node: NMT, heartbeats, SYNC, PDOs, SDO and EMCY around the firmware.
+
+Upon SYNC the node first sends its synchronous TPDOs with the values of that moment, then applies the
+synchronous RPDOs that came since the last one, then runs its axis for exactly one period of object 60C2h.
+(Some drives apply RPDOs first: `Behaviour` has this and other choices of a firmware.)
+When SYNC stays away for one and a half periods, and before the first, the axis runs on the clock instead: a
+drive without a master stops by itself. Single-threaded: everything happens inside ``poll``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import can
+
+from hdbridge.canframe import DataFrame
+from hdbridge.clock import Clock
+from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.emergency import Emergency, ErrorCode
+from hdbridge.device.faults import Faults, Outgoing
+from hdbridge.device.firmware import Firmware
+from hdbridge.device.motion import Machine
+from hdbridge.device.nameplate import Nameplate
+from hdbridge.device.nmt import Nmt, NmtCommand
+from hdbridge.device.pdo import ReceivePdo, TransmitPdo
+from hdbridge.device.sdo_server import SdoServer
+
+PDO_COUNT: Final = 512
+LONGEST_CATCH_UP_S: Final = 1.0
+"""A node that was not polled for longer than this does not make up for it."""
+
+FRAMES_PER_POLL: Final = 64
+
+_NEVER: Final = float("inf")
+_HEARTBEAT: Final = 0x700
+
+
+_INITIALISING = Nmt.INITIALISING
+# For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
+
+_AFTER_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
+"""Object 1029h:01: the NMT state after a communication error; 1 changes nothing."""
+
+
+class DriveNode:
+    """A CiA-402 drive on ``bus``, moving ``machine``.
+
+    ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
+    the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware.
+    ``poll`` must be called when frames may have come and at ``next_event_s``.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        machine: Machine,
+        eds_path: Path,
+        node_id: int,
+        clock: Clock,
+        nameplate: Nameplate | None = None,
+        behaviour: Behaviour | None = None,
+    ) -> None:
+        self.bus = bus
+        self.node_id = node_id
+        self.behaviour = behaviour or Behaviour()
+        self.faults = Faults()
+        self.lost_frames = 0
+        self._sync_s = -_NEVER
+        self.dictionary = Dictionary(Path(eds_path), node_id)
+        self._clock = clock
+        self._now_s = clock.now()
+        self._assemble(machine, nameplate or Nameplate())
+        self._begin()
+
+    def _assemble(self, machine: Machine, nameplate: Nameplate) -> None:
+        nameplate.engrave(self.dictionary)
+        self.dictionary.restore()
+        self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
+        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour)
+        if nameplate.load_object in self.dictionary:
+            self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
+        self._sdo = SdoServer(self.dictionary)
+        self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in self._pdos(0x1800)]
+        holds, receiving = self.behaviour.holds_rpdo, self._pdos(0x1400)
+        self._rpdos = [ReceivePdo(self.dictionary, number, self._route, holds=holds) for number in receiving]
+        entry = self.dictionary
+        entry[0x1005, 0].guard = _check_sync_id
+        entry[0x1005, 0].follower = lambda _: self._route()
+        entry[0x1016, 1].guard = _check_consumer
+        entry[0x1016, 1].follower = lambda _: self._change_watch()
+        entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
+        for sub in (1, 2):
+            entry[0x60C2, sub].follower = lambda _: self._take_period()
+
+    def _pdos(self, first: int) -> list[int]:
+        """Numbers of the PDOs that the dictionary has, by their first communication parameter."""
+        own = self.dictionary
+        numbers = range(1, PDO_COUNT + 1)
+        return [n for n in numbers if (first + n - 1, 1) in own and (first + 0x200 + n - 1, 0) in own]
+
+    def _begin(self) -> None:
+        """Start from the dictionary as it stands; the boot-up message is still to come."""
+        self.nmt = Nmt.INITIALISING
+        self._sdo.reset()
+        self._sdo_from_s = self._now_s + self.behaviour.sdo_delay_s
+        self._take_period()
+        self._run_due_s = self._now_s + self._period_s
+        for pdo in (*self._tpdos, *self._rpdos):
+            pdo.compile()
+        self._watch_heartbeat()
+        self._route()
+        self._start_heartbeat()
+        self._due_s = self._now_s
+
+    def _boot(self) -> None:
+        self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
+        self._enter(Nmt.PRE_OPERATIONAL)
+
+    def _take_period(self) -> None:
+        value = self.dictionary.value
+        self._period_s = value(0x60C2, 1) / 10.0 ** -value(0x60C2, 2)
+        self._measures_period = (0x60C2, 1) not in self.dictionary
+
+    def _measure_period(self, now_s: float) -> None:
+        """A drive without object 60C2h takes its period from SYNC."""
+        since_s, self._sync_s = now_s - self._sync_s, now_s
+        if 0.0 < since_s < LONGEST_CATCH_UP_S:
+            self._period_s = since_s
+
+    def _watch_heartbeat(self) -> None:
+        """Object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
+        word = self.dictionary.value(0x1016, 1)
+        self._watched_s = (word & 0xFFFF) * 1e-3
+        self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
+        self._watch_due_s = _NEVER
+        self._watch_ended = False
+
+    def _change_watch(self) -> None:
+        self._watch_heartbeat()
+        self._listen()
+
+    def _start_heartbeat(self) -> None:
+        self._heartbeat_s = self.dictionary.value(0x1017) * 1e-3
+        self._heartbeat_due_s = self._now_s + self._heartbeat_s if self._heartbeat_s else _NEVER
+        self._due_s = self._now_s
+
+    def _route(self) -> None:
+        """Note which frames and which SYNCs concern which PDO."""
+        running = self.nmt is Nmt.OPERATIONAL
+        tpdos = [pdo for pdo in self._tpdos if running and pdo.valid]
+        rpdos = [pdo for pdo in self._rpdos if running and pdo.valid]
+        self._sync_tpdos = [pdo for pdo in tpdos if pdo.is_synchronous]
+        self._event_tpdos = [pdo for pdo in tpdos if not pdo.is_synchronous]
+        self._sync_rpdos = [pdo for pdo in rpdos if pdo.is_synchronous]
+        self._rpdo_by_id = {pdo.can_id: pdo for pdo in rpdos}
+        self._rpdo_due_s = _NEVER
+        self._due_s = self._now_s
+        self._listen()
+
+    def _listen(self) -> None:
+        """Note what takes the data of each frame that concerns the node as it is now."""
+        takers: dict[int | None, Callable[[bytearray, float], None]] = {
+            self._watched_id: self._on_watched_heartbeat,
+            0x000: self._on_nmt,
+        }
+        for can_id, pdo in self._rpdo_by_id.items():
+            takers[can_id] = partial(self._on_rpdo, pdo)
+        if self.nmt is not Nmt.STOPPED:
+            takers[0x600 + self.node_id] = self._on_sdo_request
+            takers[self.dictionary.value(0x1005) & 0x7FF] = self._on_sync
+        self._takers = takers
+
+    # ---------------------------------------------------------------- the outside
+
+    def poll(self, now_s: float) -> None:
+        """Take in the frames that have come, answer them, and do what is due until ``now_s``."""
+        self._now_s = now_s
+        if self.nmt is _INITIALISING:
+            self._boot()
+        receive, now = self.bus.recv, self._clock.now
+        # Bounded, and each frame at its own time: a master that answers at once (as in an SDO transfer) can
+        # keep this loop busy for long, and the watchdogs must not be behind then.
+        left = FRAMES_PER_POLL
+        while left and (message := receive(0)) is not None:
+            left -= 1
+            now_s = now()
+            self.handle(message, now_s)
+        self.run_until(now_s)
+
+    def run_until(self, now_s: float) -> None:
+        """Do what is due until ``now_s`` without looking at the bus; ``poll`` ends with it."""
+        self._now_s = now_s
+        if self.faults.concerns_poll:
+            self.faults.concerns_poll = False
+            self._make_faults()
+        if now_s >= self._due_s:
+            self._do_what_is_due(now_s)
+        if self._event_tpdos:
+            self._send_events(now_s)
+
+    def next_event_s(self) -> float:
+        """When ``poll`` must be called at the latest, on the clock's scale."""
+        return self._now_s if self.faults.concerns_poll else self._due_s
+
+    def handle(self, message: can.Message, now_s: float) -> None:
+        """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
+        self._now_s = now_s
+        take = self._takers.get(message.arbitration_id)
+        if take is None or self.faults.silent or self.faults.deaf:
+            return
+        if type(message) is DataFrame or not (
+            message.is_extended_id or message.is_remote_frame or message.is_error_frame
+        ):
+            take(message.data, now_s)
+
+    # ---------------------------------------------------------------- frames
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if self.faults.silent or can_id in self.faults.muted_ids:
+            return
+        try:
+            self.bus.send(DataFrame(can_id, data))
+        except can.CanOperationError:
+            self.lost_frames += 1  # as on a bus that is down: a drive drops the frame and carries on
+
+    def _send_unless_stopped(self, can_id: int, data: bytes) -> None:
+        if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
+            self._send(can_id, data)
+
+    def _on_sync(self, _: bytearray, now_s: float) -> None:
+        if self._measures_period:
+            self._measure_period(now_s)
+        if self.behaviour.rpdo_before_tpdo:
+            self._apply_rpdos()
+        tpdos: list[Outgoing] = []
+        for tpdo in self._sync_tpdos:
+            data = tpdo.on_sync()
+            if data is not None:
+                tpdos.append((tpdo.can_id, data))
+        if self.faults.concerns_tpdos:
+            tpdos = self.faults.spoil(tpdos)
+        for can_id, data in tpdos:
+            self._send(can_id, data)
+        self._apply_rpdos()
+        self._advance()
+        self._run_due_s = now_s + 1.5 * self._period_s
+        self._due_s = self._next_due_s()
+
+    def _apply_rpdos(self) -> None:
+        for rpdo in self._sync_rpdos:
+            if rpdo.pending is not None:
+                pending, rpdo.pending = rpdo.pending, None
+                rpdo.apply(pending)
+
+    def _on_rpdo(self, pdo: ReceivePdo, data: bytearray, now_s: float) -> None:
+        if len(data) < pdo.length:
+            self.emergency.occur(ErrorCode.PDO_TOO_SHORT)
+            return
+        if pdo.event_timer_s:
+            pdo.deadline_s = now_s + pdo.event_timer_s
+            before_s = self._rpdo_due_s
+            due_s = pdo.deadline_s
+            if len(self._rpdo_by_id) > 1:
+                due_s = min([each.deadline_s for each in self._rpdo_by_id.values()])
+            self._rpdo_due_s = due_s
+            if before_s <= self._due_s or due_s < self._due_s:  # else something else comes first
+                self._due_s = self._next_due_s()
+        if len(data) > pdo.length:
+            self.emergency.occur(ErrorCode.PDO_TOO_LONG)
+        elif self.emergency.active:
+            for code in (ErrorCode.PDO_TOO_SHORT, ErrorCode.PDO_TOO_LONG):
+                self.emergency.clear(code)
+        if pdo.is_synchronous:
+            pdo.pending = data
+        else:
+            pdo.apply(data)
+
+    def _on_sdo_request(self, data: bytearray, now_s: float) -> None:
+        if now_s < self._sdo_from_s:
+            return
+        if answer := self._sdo.respond(bytes(data)):
+            self._send(0x580 + self.node_id, answer)
+
+    def _on_nmt(self, data: bytearray, _: float) -> None:
+        if len(data) < 2 or data[1] not in (0, self.node_id):
+            return
+        command = data[0]
+        if command == NmtCommand.START:
+            self._enter(Nmt.OPERATIONAL)
+        elif command == NmtCommand.STOP:
+            self._leave_operational(Nmt.STOPPED)
+        elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
+            self._leave_operational(Nmt.PRE_OPERATIONAL)
+        elif command == NmtCommand.RESET_NODE:
+            self._reset_node()
+        elif command == NmtCommand.RESET_COMMUNICATION:
+            self.firmware.connection_lost(ErrorCode.COMMUNICATION)
+            self.dictionary.restore(0x1000, 0x1FFF)
+            self._begin()
+            self._boot()
+
+    def _enter(self, state: Nmt) -> None:
+        if self.nmt is state:
+            return
+        self.nmt = state
+        for pdo in (*self._tpdos, *self._rpdos):
+            pdo.restart()
+        self._route()
+
+    def _leave_operational(self, state: Nmt) -> None:
+        """Stop the PDOs; an axis that lives on them has lost its master (6007h)."""
+        lost = state is Nmt.STOPPED or (self.nmt is Nmt.OPERATIONAL and self.firmware.follows_the_bus)
+        if lost:
+            self.firmware.connection_lost(ErrorCode.COMMUNICATION)
+        self._enter(state)
+
+    def _reset_node(self) -> None:
+        self.dictionary.restore()
+        self.emergency.reset()
+        self.firmware.reset()
+        self._begin()
+        self._boot()
+
+    def _on_watched_heartbeat(self, _: bytearray, now_s: float) -> None:
+        if self._watch_ended:
+            return
+        self._watch_due_s = now_s + self._watched_s
+        self.emergency.clear(ErrorCode.HEARTBEAT)
+        self._due_s = self._next_due_s()
+
+    def _make_faults(self) -> None:
+        for code, additional in self.faults.take_errors():
+            self.firmware.fault(code, additional)
+        for code in self.faults.take_lost_masters():
+            self.firmware.connection_lost(code)
+        for code in self.faults.take_missed_masters():
+            self.emergency.occur(code)
+            self.firmware.connection_lost(code)
+        if self.faults.take_opening():
+            self.firmware.power_cut()
+        if self.faults.take_departure():
+            self._leave_operational(Nmt.PRE_OPERATIONAL)
+            self._send_heartbeat()
+        if self.faults.take_boot_up():
+            self._reset_node()
+
+    # ---------------------------------------------------------------- time
+
+    def _advance(self) -> None:
+        motion, faults = self.firmware.motion, self.faults
+        motion.load_jump_counts, motion.load_reading = faults.load_jump_counts, faults.load_reading
+        motion.motor_jump_counts = faults.motor_jump_counts
+        self.firmware.advance(self._period_s)
+
+    def _next_due_s(self) -> float:
+        due_s = min(self._run_due_s, self._heartbeat_due_s, self._watch_due_s, self._rpdo_due_s)
+        for tpdo in self._event_tpdos:
+            due_s = min(due_s, tpdo.due_s(self._now_s))
+        return due_s
+
+    def _do_what_is_due(self, now_s: float) -> None:
+        self._run_due_s = max(self._run_due_s, now_s - LONGEST_CATCH_UP_S)
+        while self._run_due_s <= now_s:
+            self._run_due_s += self._period_s
+            self._advance()
+        if self._watch_due_s <= now_s:
+            self._lose_heartbeat()
+        if self._rpdo_due_s <= now_s:
+            self._miss_rpdo(now_s)
+        if self._heartbeat_due_s <= now_s:
+            self._send_heartbeat()
+            late = now_s - self._heartbeat_due_s
+            skipped = int(late / self._heartbeat_s)
+            self._heartbeat_due_s += (1 + skipped) * self._heartbeat_s
+        self._due_s = self._next_due_s()
+
+    def _send_heartbeat(self) -> None:
+        if not self.faults.mute_heartbeat:
+            self._send(_HEARTBEAT + self.node_id, bytes([self.nmt]))
+
+    def _send_events(self, now_s: float) -> None:
+        for tpdo in self._event_tpdos:
+            data = tpdo.on_event(now_s)
+            if data is not None:
+                self._send(tpdo.can_id, data)
+        self._due_s = self._next_due_s()
+
+    def _lose_heartbeat(self) -> None:
+        self._watch_due_s = _NEVER
+        self._watch_ended = self.behaviour.heartbeat_consumer is HeartbeatConsumer.STOPS
+        if self.faults.ignore_lost_heartbeat:
+            return
+        self.emergency.occur(ErrorCode.HEARTBEAT)
+        if self.faults.only_report_lost_heartbeat:
+            return
+        self.firmware.connection_lost(ErrorCode.HEARTBEAT)
+        state = _AFTER_ERROR.get(self.dictionary.value(0x1029, 1))
+        if state is not None and self.nmt is Nmt.OPERATIONAL and not self.faults.stay_operational:
+            self._enter(state)
+
+    def _miss_rpdo(self, now_s: float) -> None:
+        """An RPDO is overdue: that matters to an axis that follows the bus. The next one arms it again."""
+        for pdo in self._rpdo_by_id.values():
+            if pdo.deadline_s <= now_s:
+                pdo.deadline_s = _NEVER
+        self._rpdo_due_s = min((pdo.deadline_s for pdo in self._rpdo_by_id.values()), default=_NEVER)
+        watches = self.behaviour.rpdo_timer and not self.faults.ignore_missing_set_points
+        if self.firmware.follows_the_bus and watches:
+            self.emergency.occur(ErrorCode.RPDO_TIMEOUT)
+            self.firmware.connection_lost(ErrorCode.RPDO_TIMEOUT)
+
+
+def _check_sync_id(value: int) -> None:
+    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make it a producer, which it is not
+        raise SdoAbortError(Abort.RANGE)
+
+
+def _check_consumer(value: int) -> None:
+    if value >> 23:
+        raise SdoAbortError(Abort.RANGE)

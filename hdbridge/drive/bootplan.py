@@ -1,0 +1,153 @@
+"""The boot-up's writes fitted to a drive: objects that its EDS lacks or fixes are left to it. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from hdbridge.drive import objects
+from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
+from hdbridge.drive.layout import cyclic_mode, layouts
+from hdbridge.drive.nameplate import mode_advice
+from hdbridge.drive.writes import PlannedWrite, permitted, rows
+from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
+    from hdbridge.axis import AxisConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """An object that is left to the drive, why, and what follows."""
+
+    index: int
+    sub: int
+    reason: str
+    """For example: which drive.eds lacks."""
+    consequence: str
+    field: str = ""
+    """Field of the axis file that would have decided its value."""
+
+    def __str__(self) -> str:
+        """``605Dh:00, which drive.eds lacks: how a halt brakes``."""
+        return f"{self.index:04X}h:{self.sub:02X}, {self.reason}: {self.consequence}"
+
+
+def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWrite]:
+    """All writes of a boot-up in order, for the drive and a load encoder that is a node of its own.
+
+    ``od`` is the drive's object dictionary, by default that of the axis's own EDS. Objects that are left to
+    the drive are not in the list, and PDOs that are not used are disabled. Raises `InputError` with the line
+    of the axis file if a value cannot be expressed in its object, or the EDS does not permit it, lacks what
+    the control cycle or the axis file needs, or says that the drive does not have the mode.
+    """
+    return _sorted(axis, od)[0]
+
+
+def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[Left]:
+    """The objects that `plan` leaves to the drive, and those that the control cycle does without."""
+    od = dictionary_of(axis) if od is None else od
+    if od is None:
+        return []
+    return [*_sorted(axis, od)[1], *_not_read(axis, od)]
+
+
+def sent_along(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[str]:
+    """The objects that the master sends only because they are in a fixed mapping of the drive."""
+    own = {(each.index, each.sub) for each in (objects.CONTROLWORD, objects.MODE, cyclic_mode(axis).target)}
+    od = dictionary_of(axis) if od is None else od
+    found = []
+    for layout in layouts(axis, od).rpdos:
+        for entry in layout.codec.entries:
+            variable = find(od, entry.index, entry.sub) if od is not None else None
+            if variable is not None and (entry.index, entry.sub) not in own:
+                value = held(variable) or 0
+                found.append(f"{entry.index:04X}h:{entry.sub:02X} = {value} in RPDO{layout.number}")
+    return found
+
+
+def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[Left]]:
+    """The rows that are for the boot-up, and those that are left to the drive."""
+    od = dictionary_of(axis) if od is None else od
+    pdos = layouts(axis, od)
+    if od is not None:
+        _check_mode(axis, od)
+    planned: list[PlannedWrite] = []
+    left: dict[tuple[int, int], Left] = {}
+    for row in rows(axis, od, pdos):
+        reason = _left_because(axis, od, row) if od is not None else None
+        if reason is None:
+            planned.append(row)
+        else:
+            left[row.index, row.sub] = Left(row.index, row.sub, reason, row.without, row.field)
+    watchdogs = [(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub)]
+    watchdogs += [(objects.RPDO_COMMUNICATION + each.number - 1, 5) for each in pdos.rpdos]
+    if left.keys() >= set(watchdogs):
+        for key in watchdogs:
+            left[key] = replace(left[key], consequence="nothing stops the axis when its master dies")
+    return planned, list(left.values())
+
+
+def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> str | None:
+    """Why the drive keeps a value of its own; None if the boot-up sees to it. `InputError` if it must not."""
+    if row.node_id != axis.drive.node_id or not (row.without or row.exact):
+        return None
+    variable, eds = find(od, row.index, row.sub), axis.drive.eds
+    if variable is None:
+        return f"which {eds} lacks"
+    kind = integer_type(variable)
+    if kind is None:
+        return f"which is no integer in {eds}"
+    found = held(variable)
+    if not is_writable(variable):
+        if found is None or row.holds(found):
+            return None
+        reason = f"which is read-only in {eds} ({found})"
+        if row.exact:
+            raise InputError(
+                f"{axis.where(row.field)}: {_of(row)}, {reason}; write that value, or change the drive"
+            )
+        return reason
+    low, high = permitted(variable, kind)
+    if low <= row.value <= high or row.kept:  # of an identifier, the limits mean other bits
+        return None
+    if row.exact or axis.states(row.field):
+        raise InputError(f"{axis.where(row.field)}: {_of(row)}; {eds} permits {low} to {high}")
+    return f"for which {eds} permits {low} to {high}, not {row.value}"
+
+
+def _of(row: PlannedWrite) -> str:
+    return f"gives {row.value} for object {row.index:04X}h:{row.sub:02X}"
+
+
+def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
+    """`InputError` if the default of 6502h, where the EDS gives one, says that the mode is missing."""
+    variable = find(od, objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub)
+    modes = held(variable) if variable is not None else None
+    if modes and not modes & cyclic_mode(axis).mode.supported_bit:
+        raise InputError(
+            f"{axis.where('drive.mode')}: {axis.drive.mode} is not among the modes of {axis.drive.eds} "
+            f"(6502h is {modes:08X}h); {mode_advice(modes)}"
+        )
+
+
+def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
+    """What the control cycle and the boot-up would read, and the drive does not have."""
+    absent = layouts(axis, od).absent
+    for address, consequence in (
+        (objects.POSITION_DEMAND, "the last target sent stands in for it"),
+        (objects.TORQUE_ACTUAL, "torque is neither recorded nor checked"),
+        (objects.SUPPORTED_MODES, "the drive is found to have a mode, or not, when it is set"),
+        (objects.ERROR_CODE, "only emergency messages explain a fault"),
+    ):
+        variable = find(od, address.index, address.sub)
+        if variable is None:
+            reason = f"which {axis.drive.eds} lacks"
+        elif address in absent:
+            reason = f"which no TPDO of {axis.drive.eds} can carry"
+        else:
+            continue
+        yield Left(address.index, address.sub, reason, consequence)

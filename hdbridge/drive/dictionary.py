@@ -1,0 +1,72 @@
+"""A drive's object dictionary as its EDS describes it: its objects, their types, and what they hold."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from hdbridge.drive.objects import IntegerType
+from hdbridge.files.edsfile import read_eds, shared_eds
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hdbridge.axis import AxisConfig
+
+INTEGER_TYPES: Final = {
+    datatypes.INTEGER8: IntegerType.INT8,
+    datatypes.INTEGER16: IntegerType.INT16,
+    datatypes.INTEGER24: IntegerType.INT24,
+    datatypes.INTEGER32: IntegerType.INT32,
+    datatypes.INTEGER64: IntegerType.INT64,
+    datatypes.UNSIGNED8: IntegerType.UINT8,
+    datatypes.UNSIGNED16: IntegerType.UINT16,
+    datatypes.UNSIGNED24: IntegerType.UINT24,
+    datatypes.UNSIGNED32: IntegerType.UINT32,
+    datatypes.UNSIGNED64: IntegerType.UINT64,
+}
+"""By the number that the EDS has for them (CiA 301, table 44)."""
+_TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}
+
+
+def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
+    """The object dictionary of an EDS file; `InputError` if it cannot be read."""
+    return read_eds(path, node_id).dictionary
+
+
+def dictionary_of(axis: AxisConfig) -> ObjectDictionary | None:
+    """The dictionary of the axis's drive, not to be changed; None if the axis was not read from a file."""
+    return shared_eds(axis.eds_path, axis.drive.node_id).dictionary if axis.is_from_file else None
+
+
+def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:
+    """An object that the EDS lists.
+
+    canopen's own look-up invents members of an array from its first one.
+    """
+    entry = od.get(index)
+    if isinstance(entry, ODVariable):
+        return entry if sub == 0 else None
+    return entry.subindices.get(sub) if entry is not None else None
+
+
+def integer_type(variable: ODVariable) -> IntegerType | None:
+    """Integer type of an object; None if it is not an integer."""
+    return _TYPES.get(variable.data_type or 0)
+
+
+def is_writable(variable: ODVariable) -> bool:
+    """The EDS permits writing the object."""
+    return "w" in variable.access_type
+
+
+def is_readable(variable: ODVariable) -> bool:
+    """The EDS permits reading the object."""
+    return "r" in variable.access_type or variable.access_type == "const"
+
+
+def held(variable: ODVariable) -> int | None:
+    """What the object holds by the EDS: its value in a DCF, else its default. None if neither is given."""
+    value = variable.value if variable.value is not None else variable.default
+    return value if isinstance(value, int) else None

@@ -1,0 +1,418 @@
+"""EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
+
+canopen reads a well-formed file in UTF-8. Here any file is decoded, and its names, numbers and compact
+descriptions are brought into the one form that canopen takes. A value that cannot be read is reported with
+line, section and key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple, Never
+
+from canopen.objectdictionary import ObjectDictionary, datatypes
+from canopen.objectdictionary.eds import import_eds
+
+from hdbridge.errors import InputError
+
+MAX_BYTES: Final = 16 << 20
+_MOST_OBJECTS: Final = 100_000
+_SHOWN: Final = 40
+_DOS_END: Final = "\x1a"
+_NUMBER: Final = re.compile(r"([+-]?)(0[xX][0-9a-fA-F]{1,32}|[0-9]{1,40})")
+_NODE_ID: Final = re.compile(r"\+?\$NODEID\+?")
+_OBJECT: Final = re.compile(r"([0-9A-F]{4})(?:SUB([0-9A-F]{1,2}))?")
+_TRUTH: Final = {"TRUE": 1, "YES": 1, "FALSE": 0, "NO": 0, "": 0}
+_ACCESS: Final = ("ro", "wo", "rw", "rwr", "rww", "const")
+_DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD = 2, 5, 6, 7, 8, 9
+_OBJECT_TYPES: Final = (0, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD)
+_LAST_STANDARD_TYPE: Final = 0x1B
+_INTEGERS: Final = frozenset(datatypes.INTEGER_TYPES) | {datatypes.BOOLEAN}
+_BITS: Final = {
+    datatypes.INTEGER8: 8, datatypes.INTEGER16: 16, datatypes.INTEGER24: 24, datatypes.INTEGER32: 32,
+    datatypes.INTEGER40: 40, datatypes.INTEGER48: 48, datatypes.INTEGER56: 56, datatypes.INTEGER64: 64,
+}  # fmt: skip
+"""Signed types: a file may give their values in two's complement."""
+_VALUES: Final = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
+_LARGEST_COMPACT: Final = 254
+_PDOS: Final = 512
+_COMPACT_PDO: Final = (
+    ("COB-ID", 0x0007), ("Transmission type", 0x0005), ("Inhibit time", 0x0006), ("Reserved", 0x0005),
+    ("Event timer", 0x0006), ("SYNC start value", 0x0005),
+)  # fmt: skip
+"""Sub-indices 1 to 6 of a PDO's communication parameter: bits 0 to 5 of CompactPDO."""
+_COMPACT_ENTRIES: Final = 64
+
+
+class Eds(NamedTuple):
+    """An EDS or DCF file."""
+
+    dictionary: ObjectDictionary
+    unread: tuple[str, ...]
+    """Values that could not be read and count as not given: one line each, with line, section and key."""
+
+
+def read_eds(path: Path | str, node_id: int) -> Eds:
+    """Read an EDS or DCF file for a node; `InputError` in one line if it cannot be read."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; expected an EDS file")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; expected the drive's EDS file"
+        ) from error
+    return _Reader(path, decode(data)).read(node_id)
+
+
+def shared_eds(path: Path | str, node_id: int) -> Eds:
+    """As `read_eds`, read once for each state of the file: not to be changed."""
+    path = Path(path)
+    try:
+        modified_ns = path.stat().st_mtime_ns
+    except OSError:
+        modified_ns = 0  # `read_eds` reports it
+    return _read_as_of(modified_ns, path, node_id)
+
+
+@lru_cache(maxsize=8)
+def _read_as_of(_: int, path: Path, node_id: int) -> Eds:
+    return read_eds(path, node_id)
+
+
+def decode(data: bytes) -> str:
+    """Text of a file in UTF-8, UTF-16 (with or without byte order mark) or Windows-1252."""
+    for mark, encoding in (
+        (b"\xef\xbb\xbf", "utf-8"),
+        (b"\xff\xfe", "utf-16-le"),
+        (b"\xfe\xff", "utf-16-be"),
+    ):
+        if data.startswith(mark):
+            return data[len(mark) :].decode(encoding, errors="replace")
+    head = data[:400]
+    if len(head) > 1 and head[1::2].count(0) > len(head) // 4:
+        return data.decode("utf-16-le", errors="replace")
+    if len(head) > 1 and head[::2].count(0) > len(head) // 4:
+        return data.decode("utf-16-be", errors="replace")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("windows-1252", errors="replace")
+
+
+class _Key(NamedTuple):
+    value: str
+    line: int
+
+
+class _Section:
+    """A section: its name as written, its line, and its keys in capitals."""
+
+    def __init__(self, name: str, line: int) -> None:
+        self.name, self.line = name, line
+        self.keys: dict[str, _Key] = {}
+
+    def get(self, key: str) -> str:
+        """Value of a key, empty if there is none."""
+        found = self.keys.get(key.upper())
+        return found.value if found is not None else ""
+
+
+class _Reader:
+    """One file on its way to canopen."""
+
+    def __init__(self, path: Path, text: str) -> None:
+        self._path = path
+        self._unread: list[str] = []
+        self._sections: dict[str, _Section] = {}
+        self._split(text)
+
+    def read(self, node_id: int) -> Eds:
+        objects = self._objects()
+        if not objects and "DEVICEINFO" not in self._sections:
+            raise InputError(
+                f"{self._path}: cannot be read as an EDS: it has neither a section [DeviceInfo] nor an "
+                "object; expected the drive's EDS file"
+            )
+        written: list[str] = []
+        self._write_device(written)
+        for index in sorted(objects):
+            self._write_object(written, index, objects[index])
+        try:
+            dictionary = import_eds(io.StringIO("\n".join(written)), node_id)  # type: ignore[no-untyped-call]
+        except Exception as error:  # canopen lets KeyError, ValueError, configparser.Error and others through
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(
+                f"{self._path}: cannot be read as an EDS: {reason[:200]}; expected the drive's EDS file"
+            ) from error
+        return Eds(dictionary, tuple(self._unread))
+
+    # -- lines --------------------------------------------------------------------------------------------
+
+    def _split(self, text: str) -> None:
+        """Sections and keys by line. Of two keys with one name the first holds, as in Windows itself."""
+        section = None
+        end = text.find(_DOS_END)
+        for number, raw in enumerate(re.split(r"\r\n|\n|\r", text[:end] if end >= 0 else text), start=1):
+            line = raw.replace("\x00", "").strip("\ufeff \t\v\f")
+            if not line or line[0] in ";#":
+                continue
+            if line[0] == "[":
+                name = line[1:].partition("]")[0].strip()
+                section = self._sections.setdefault(name.upper(), _Section(name, number))
+            elif section is not None:
+                key, equals, value = line.partition("=")
+                if equals:
+                    value = re.split(r"\s;|^;", value, maxsplit=1)[0]
+                    section.keys.setdefault(key.strip().upper(), _Key(value.strip(), number))
+                elif _OBJECT.fullmatch(section.name.upper()):
+                    self._refuse(section, number, "", line, "a key, '=' and a value")
+
+    def _refuse(self, section: _Section, line: int, key: str, found: str, expected: str) -> Never:
+        raise InputError(
+            self._place(section, line, key)
+            + f"found {_shown(found) if found else 'nothing'}; expected {expected}"
+        )
+
+    def _place(self, section: _Section, line: int, key: str) -> str:
+        return f"{self._path}:{line}: [{_printable(section.name)}]{' ' + key if key else ''}: "
+
+    # -- values -------------------------------------------------------------------------------------------
+
+    def _number(self, section: _Section, key: str, default: int | None = None) -> int:
+        """A number that an object cannot do without; ``default`` if the key is absent or empty."""
+        text, line = section.keys.get(key.upper(), _Key("", section.line))
+        value = _integer(text)
+        if value is None and text == "" and default is not None:
+            return default
+        if value is None:
+            self._refuse(section, line, key, text, "a number, such as 0x0007")
+        return value
+
+    def _value(self, section: _Section, key: str, data_type: int) -> str | None:
+        """A value as canopen reads it; None if there is none, or none that can be read."""
+        text = section.get(key)
+        if text == "" or data_type not in _INTEGERS:
+            return text or None
+        plain = text.replace(" ", "").upper()
+        if "$NODEID" in plain:
+            offset = _integer(_NODE_ID.sub("", plain) or "0")
+            if offset is not None:
+                return f"$NODEID+0x{offset:X}" if offset >= 0 else None
+        else:
+            value = _TRUTH.get(plain) if data_type == datatypes.BOOLEAN else None
+            value = _integer(plain) if value is None else value
+            if value is not None:
+                bits = _BITS.get(data_type)
+                return str(value - (1 << bits) if bits and 1 << bits - 1 <= value < 1 << bits else value)
+        self._note(section, key, text, "a number")
+        return None
+
+    def _note(self, section: _Section, key: str, text: str, expected: str) -> None:
+        place = self._place(section, section.keys[key.upper()].line, key)
+        self._unread.append(f"{place}{_shown(text)} is not {expected} and counts as not given")
+
+    # -- objects ------------------------------------------------------------------------------------------
+
+    def _objects(self) -> dict[int, dict[int | None, _Section]]:
+        """The sections of each object: None is the object itself, the others are its sub-indices."""
+        objects: dict[int, dict[int | None, _Section]] = {}
+        for name, section in self._sections.items():
+            match = _OBJECT.fullmatch(name)
+            if match is not None and int(match[1], 16) >= 0x1000:
+                sub = None if match[2] is None else int(match[2], 16)
+                objects.setdefault(int(match[1], 16), {})[sub] = section
+        self._add_compact_pdos(objects)
+        if sum(map(len, objects.values())) > _MOST_OBJECTS:
+            raise InputError(
+                f"{self._path}: describes more than {_MOST_OBJECTS} objects; expected an EDS file"
+            )
+        return objects
+
+    def _write_device(self, written: list[str]) -> None:
+        device = self._sections.get("DEVICEINFO")
+        written.append("[DeviceInfo]")
+        if device is None:
+            return
+        for key in ("VendorName", "ProductName", "OrderCode"):
+            if text := device.get(key):
+                written.append(f"{key}={text}")
+        for key in ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO"):
+            if (value := self._device_number(key)) is not None:
+                written.append(f"{key}={value}")
+
+    def _device_number(self, key: str) -> int | None:
+        device = self._sections.get("DEVICEINFO")
+        text = device.get(key) if device is not None else ""
+        value = _integer(text)
+        if device is not None and value is None and text:
+            self._note(device, key, text, "a number")
+        return value
+
+    def _write_object(self, written: list[str], index: int, parts: Mapping[int | None, _Section]) -> None:
+        members = {sub: section for sub, section in parts.items() if sub is not None}
+        section = parts.get(None)
+        if section is None:  # its members describe it well enough
+            section = _Section(f"{index:04X}", next(iter(members.values())).line)
+        kind = self._number(section, "ObjectType", _RECORD if members else _VAR)
+        if kind not in _OBJECT_TYPES:
+            line = section.keys["OBJECTTYPE"].line
+            self._refuse(section, line, "ObjectType", section.get("ObjectType"), "2, 5, 6, 7, 8 or 9")
+        if kind in (0, _DEFTYPE, _DEFSTRUCT):
+            return
+        compact = self._number(section, "CompactSubObj", 0)
+        if kind in (_VAR, _DOMAIN) and not (members or compact):
+            self._write_variable(written, f"{index:04X}", section, kind)
+            return
+        if compact:
+            members = {**dict(self._spelt_out(index, section, compact)), **members}
+        name = section.get("ParameterName") or f"{index:04X}"
+        kind = _ARRAY if kind == _ARRAY else _RECORD
+        written += [f"[{index:04X}]", f"ParameterName={name}", f"ObjectType=0x{kind:X}"]
+        for sub in sorted(members):
+            self._write_variable(written, f"{index:04X}sub{sub:X}", members[sub], _VAR)
+
+    def _write_variable(self, written: list[str], name: str, section: _Section, kind: int) -> None:
+        kind = self._number(section, "ObjectType", kind)
+        data_type = self._number(section, "DataType", datatypes.DOMAIN if kind == _DOMAIN else None)
+        if data_type > _LAST_STANDARD_TYPE:
+            data_type = self._own_type(data_type)
+        access = section.get("AccessType").lower() or "rw"
+        if access not in _ACCESS:
+            line = section.keys["ACCESSTYPE"].line
+            self._refuse(section, line, "AccessType", section.get("AccessType"), ", ".join(_ACCESS))
+        written += [
+            f"[{name}]",
+            f"ParameterName={section.get('ParameterName') or name}",
+            f"ObjectType=0x{_DOMAIN if kind == _DOMAIN else _VAR:X}",
+            f"DataType=0x{data_type:04X}",
+            f"AccessType={access}",
+            f"PDOMapping={self._truth(section, 'PDOMapping')}",
+        ]
+        values = {key: self._value(section, key, data_type) for key in _VALUES}
+        if not _bounds(values["LowLimit"], values["HighLimit"]):
+            values["LowLimit"] = values["HighLimit"] = None
+        written += [f"{key}={value}" for key, value in values.items() if value is not None]
+
+    def _truth(self, section: _Section, key: str) -> int:
+        text = section.get(key)
+        value = _TRUTH.get(text.upper())
+        value = _integer(text) if value is None else value
+        if value is None:
+            self._refuse(section, section.keys[key.upper()].line, key, text, "0 or 1")
+        return int(value != 0)
+
+    def _own_type(self, number: int) -> int:
+        """The type behind a type of the file's own, as CANFestival writes them; bytes if there is none."""
+        section = self._sections.get(f"{number:X}SUB1")
+        value = _integer(section.get("DefaultValue")) if section is not None else None
+        return value if value is not None and 0 < value <= _LAST_STANDARD_TYPE else datatypes.DOMAIN
+
+    def _spelt_out(self, index: int, section: _Section, count: int) -> Iterator[tuple[int, _Section]]:
+        """The members of an object that CompactSubObj describes in one."""
+        if not 0 < count <= _LARGEST_COMPACT:
+            line = section.keys["COMPACTSUBOBJ"].line
+            found = section.get("CompactSubObj")
+            self._refuse(section, line, "CompactSubObj", found, f"a number from 0 to {_LARGEST_COMPACT}")
+        names = self._sections.get(f"{index:04X}NAME", section)
+        values = self._sections.get(f"{index:04X}VALUE", section)
+        yield (
+            0,
+            _made(
+                "Number of entries",
+                section,
+                {"DataType": "5", "AccessType": "ro", "DefaultValue": str(count)},
+            ),
+        )
+        for sub in range(1, count + 1):
+            member = _Section(section.name, section.line)
+            member.keys = {key: each for key, each in section.keys.items() if key != "OBJECTTYPE"}
+            name = names.get(str(sub)) or f"{section.get('ParameterName')}{sub}"
+            member.keys["PARAMETERNAME"] = _Key(name, section.line)
+            if own := values.keys.get(str(sub)):
+                member.keys["DEFAULTVALUE"] = own
+            yield sub, member
+
+    def _add_compact_pdos(self, objects: dict[int, dict[int | None, _Section]]) -> None:
+        """The PDOs that CompactPDO describes: as many as the device has beyond those with sections."""
+        mask = self._device_number("CompactPDO") or 0
+        if not mask & 0x3F:
+            return
+        device = self._sections["DEVICEINFO"]
+        for key, base, first in (("NrOfRXPDO", 0x1400, 0x200), ("NrOfTXPDO", 0x1800, 0x180)):
+            left = min(self._device_number(key) or 0, _PDOS)
+            left -= sum(base + n in objects or base + 0x200 + n in objects for n in range(_PDOS))
+            for number in range(_PDOS):
+                if base + number not in objects and base + 0x200 + number not in objects:
+                    if left <= 0:
+                        break
+                    left -= 1
+                cob_id = f"$NODEID+{first + number * 0x100}" if number < 4 else str(1 << 31)
+                objects.setdefault(base + number, dict(_compact_parameter(device, mask, cob_id)))
+                objects.setdefault(base + 0x200 + number, dict(_compact_mapping(device)))
+
+
+def _compact_parameter(device: _Section, mask: int, cob_id: str) -> Iterator[tuple[int, _Section]]:
+    subs = [sub for sub in range(1, 7) if mask >> sub - 1 & 1]
+    yield (
+        0,
+        _made(
+            "Highest sub-index",
+            device,
+            {"DataType": "5", "AccessType": "const", "DefaultValue": str(subs[-1])},
+        ),
+    )
+    for sub in subs:
+        name, data_type = _COMPACT_PDO[sub - 1]
+        given = {"DefaultValue": cob_id} if sub == 1 else {}
+        yield sub, _made(name, device, {"DataType": str(data_type), "AccessType": "rw", **given})
+
+
+def _compact_mapping(device: _Section) -> Iterator[tuple[int, _Section]]:
+    yield (
+        0,
+        _made("Number of mapped objects", device, {"DataType": "5", "AccessType": "rw", "DefaultValue": "0"}),
+    )
+    for sub in range(1, _COMPACT_ENTRIES + 1):
+        yield (
+            sub,
+            _made(f"Mapped object {sub}", device, {"DataType": "7", "AccessType": "rw", "DefaultValue": "0"}),
+        )
+
+
+def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
+    """A section that the file describes in another one."""
+    section = _Section(of.name, of.line)
+    section.keys = {
+        key.upper(): _Key(value, of.line) for key, value in (("ParameterName", name), *keys.items())
+    }
+    return section
+
+
+def _integer(text: str) -> int | None:
+    """A decimal (leading zeros or not) or hexadecimal number; None if it is neither."""
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        return None
+    value = int(match[2], 16 if match[2][:2] in ("0x", "0X") else 10)
+    return -value if match[1] == "-" else value
+
+
+def _bounds(low: str | None, high: str | None) -> bool:
+    """Limits that leave no choice, such as 0 and 0, mean that there are none."""
+    least, greatest = _integer(low or ""), _integer(high or "")
+    return least is None or greatest is None or least < greatest
+
+
+def _shown(text: str) -> str:
+    text = _printable(text)
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+
+
+def _printable(text: Iterable[str]) -> str:
+    return "".join(each if each.isprintable() else "?" for each in text)

@@ -1,0 +1,192 @@
+"""Shared by the tests of the simulated drive: a motor without physics, a master of raw frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from hdbridge.device.node import DriveNode
+from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
+
+EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
+PERIOD_S = 0.004
+
+
+class IdealMotor:
+    """Follows the demand at once, unless it is ``stuck``; coasts with constant friction."""
+
+    friction_counts_s2 = 50_000.0
+
+    def __init__(self, counts: int = 0) -> None:
+        self.dt_s = 0.0005
+        self.torque_limit_permille = 1000.0
+        self.position = float(counts)
+        self.velocity_counts_s = 0.0
+        self.torque_permille = 0
+        self.temperature_c = 23.4
+        self.load_torque_nm = -1.25
+        self.stuck = False
+        self.elapsed_s = 0.0
+        self.powered = False
+        self.braked = False
+
+    @property
+    def motor_counts(self) -> int:
+        return round(self.position)
+
+    @property
+    def load_counts(self) -> int:
+        return round(self.position * 7.2)
+
+    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+        self.elapsed_s += substeps * self.dt_s
+        self.powered = True
+        if not self.stuck:
+            self.position = end_counts
+            self.velocity_counts_s = (end_counts - start_counts) / (substeps * self.dt_s)
+
+    def coast(self, substeps: int, braked: bool) -> None:
+        self.elapsed_s += substeps * self.dt_s
+        self.powered = False
+        self.braked = braked
+        for _ in range(substeps):
+            slower = max(0.0, abs(self.velocity_counts_s) - self.friction_counts_s2 * self.dt_s)
+            self.velocity_counts_s = slower if self.velocity_counts_s > 0.0 else -slower
+            self.position += self.velocity_counts_s * self.dt_s
+
+
+class RawMaster:
+    """Writes and reads frames as bytes; knows nothing of the package's master."""
+
+    def __init__(self, bus: LockstepBus, clock: VirtualClock, node: DriveNode, motor: IdealMotor) -> None:
+        self.bus, self.clock, self.node, self.motor = bus, clock, node, motor
+        self.seen: list[tuple[int, bytes]] = []
+
+    # frames
+
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def take(self) -> list[tuple[int, bytes]]:
+        """All frames that have come, without waiting."""
+        frames = []
+        while (message := self.bus.recv(0)) is not None:
+            frames.append((message.arbitration_id, bytes(message.data)))
+        self.seen += frames
+        return frames
+
+    def wait(self, seconds: float) -> list[tuple[int, bytes]]:
+        self.clock.sleep_until(self.clock.now() + seconds)
+        return self.take()
+
+    def emergencies(self) -> list[int]:
+        """Codes of all EMCY frames so far."""
+        self.take()
+        return [data[0] | data[1] << 8 for can_id, data in self.seen if can_id == 0x081]
+
+    def nmt(self, command: int, node_id: int = 1) -> None:
+        self.send(0x000, bytes([command, node_id]))
+
+    # SDO
+
+    def request(self, data: bytes) -> bytes:
+        """One SDO request of eight bytes and its answer."""
+        self.take()
+        self.send(0x601, data)
+        answers = [data for can_id, data in self.take() if can_id == 0x581]
+        assert len(answers) == 1
+        return answers[0]
+
+    def write(self, index: int, sub: int, value: int, size: int) -> int:
+        """Expedited download; the abort code, 0 for success."""
+        raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
+        answer = self.request(struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
+        assert answer[1:4] == struct.pack("<HB", index, sub)
+        if answer[0] == 0x80:
+            return struct.unpack_from("<I", answer, 4)[0]
+        assert answer[0] == 0x60
+        return 0
+
+    def put(self, index: int, sub: int, value: int, size: int) -> None:
+        abort = self.write(index, sub, value, size)
+        assert abort == 0, f"{index:04X}h:{sub:02X} := {value} aborted with {abort:08X}h"
+
+    def read(self, index: int, sub: int = 0) -> int:
+        """Expedited upload of a signed number as wide as the object; see ``unsigned``."""
+        answer = self.request(struct.pack("<BHBI", 0x40, index, sub, 0))
+        assert answer[0] & 0xE3 == 0x43, answer.hex()
+        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=True)
+
+    def abort_of_read(self, index: int, sub: int = 0) -> int:
+        answer = self.request(struct.pack("<BHBI", 0x40, index, sub, 0))
+        return struct.unpack_from("<I", answer, 4)[0] if answer[0] == 0x80 else 0
+
+    @property
+    def statusword(self) -> int:
+        return self.read(0x6041) & 0xFFFF
+
+    @property
+    def state(self) -> str:
+        """The power state, decoded as CiA 402 tabulates the statusword."""
+        word = self.statusword
+        if word & 0x4F in (0x00, 0x40, 0x0F, 0x08):
+            return {0x00: "not ready", 0x40: "disabled", 0x0F: "reaction", 0x08: "fault"}[word & 0x4F]
+        return {0x21: "ready", 0x23: "switched on", 0x27: "enabled", 0x07: "quick stop"}[word & 0x6F]
+
+    def control(self, word: int) -> None:
+        self.put(0x6040, 0, word, 2)
+
+    def enable(self, mode: int | None = None) -> None:
+        """To OPERATION ENABLED over SDO."""
+        if mode is not None:
+            self.put(0x6060, 0, mode, 1)
+        for word in (0x06, 0x07, 0x0F):
+            self.control(word)
+        assert self.state == "enabled"
+
+    # PDO
+
+    def cycle(
+        self, word: int = 0x0F, target: int | None = None, period_s: float = PERIOD_S
+    ) -> tuple[int, ...]:
+        """SYNC, both TPDOs, RPDO, one period of time: (status, actual, torque, load, demand)."""
+        self.take()
+        self.send(0x080)
+        frames = [frame for frame in self.take() if frame[0] in (0x181, 0x281)]
+        assert [can_id for can_id, _ in frames] == [0x181, 0x281]
+        feedback = struct.unpack("<Hih", frames[0][1]) + struct.unpack("<ii", frames[1][1])
+        self.send(0x201, struct.pack("<Hi", word, feedback[1] if target is None else target))
+        self.clock.sleep_until(self.clock.now() + period_s)
+        return feedback
+
+    def enable_csp(self) -> None:
+        """Start the node, and enable it in CSP over PDOs alone but for the mode."""
+        self.put(0x6060, 0, 8, 1)
+        self.nmt(1)
+        for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
+            feedback = self.cycle(word)
+        feedback = self.cycle()
+        assert feedback[0] & 0x6F == 0x27
+
+    def cruise(self, counts_per_cycle: int, cycles: int, start: int | None = None) -> int:
+        """Move the CSP target evenly; the last target."""
+        target = self.read(0x6064) if start is None else start
+        for _ in range(cycles):
+            target += counts_per_cycle
+            self.cycle(0x0F, target)
+        return target
+
+
+@pytest.fixture
+def motor() -> IdealMotor:
+    return IdealMotor()
+
+
+@pytest.fixture
+def master(motor: IdealMotor) -> Iterator[RawMaster]:
+    with lockstep_bench(motor, EDS) as (bus, clock, node):
+        yield RawMaster(bus, clock, node, motor)

@@ -1,0 +1,396 @@
+"""Operating modes: CSP, PP and HM as a master sees them, and what holds for all of them."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+REACHED, LIMIT, BIT_12, BIT_13, REFERENCED = 0x0400, 0x0800, 0x1000, 0x2000, 0x4000
+
+
+def set_point(master, target: int, bits: int = 0) -> None:
+    """The handshake of profile position mode, up to the withdrawn request."""
+    master.put(0x607A, 0, target, 4)
+    master.control(0x1F | bits)
+    assert master.statusword & BIT_12
+    master.control(0x0F | bits)
+
+
+def test_mode_is_displayed_and_others_are_refused(master):
+    for mode in (1, 6, 7, 8, 0):
+        master.put(0x6060, 0, mode, 1)
+        assert master.read(0x6061) == mode
+    assert master.write(0x6060, 0, 3, 1) == 0x06090030
+    assert master.read(0x6061) == 0
+
+
+# interpolated position
+
+
+@pytest.fixture
+def ip(master):
+    """A cycle in IP: ``ip(word, target)``; the node is started and RPDO1 carries 6040h and 60C1h:01."""
+    for index, sub, value, size in (
+        (0x1400, 1, 0x80000201, 4), (0x1600, 0, 0, 1), (0x1600, 2, 0x60C10120, 4), (0x1600, 0, 2, 1),
+        (0x1400, 1, 0x201, 4), (0x6060, 0, 7, 1),
+    ):  # fmt: skip
+        master.put(index, sub, value, size)
+    master.nmt(1)
+    for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F):
+        master.cycle(word)
+    return master.cycle
+
+
+def test_ip_holds_its_position_until_interpolation_is_enabled(ip, master, motor):
+    for _ in range(3):
+        feedback = ip(0x0F, 500)
+    assert (master.state, motor.motor_counts, feedback[0] & 0x1000) == ("enabled", 0, 0)
+    for _ in range(3):
+        feedback = ip(0x1F, 500)
+    assert (motor.motor_counts, feedback[0] & 0x1000) == (500, 0x1000)
+    for _ in range(3):
+        feedback = ip(0x0F, 900)
+    assert (motor.motor_counts, feedback[0] & 0x1000) == (500, 0)
+
+
+def test_ip_begins_where_the_axis_stands_whatever_was_in_its_record(ip, master, motor):
+    for word in (0x07, 0x07, 0x0F, 0x0F):
+        ip(word, 12_345)
+    assert motor.motor_counts == 0
+    assert master.read(0x60C1, 1) == 12_345  # of the RPDO; interpolation is not enabled
+
+
+def test_ip_knows_linear_interpolation_only(master):
+    assert master.write(0x60C0, 0, -1, 2) == 0x06090030
+    master.put(0x60C0, 0, 0, 2)
+
+
+def test_a_lost_master_stops_an_axis_in_ip(ip, master):
+    master.put(0x6007, 0, 3, 2)
+    ip(0x1F, 10)
+    ip(0x1F, 20)
+    master.nmt(0x80)
+    assert master.state in ("quick stop", "disabled")
+
+
+# cyclic synchronous position
+
+
+def test_csp_interpolates_evenly_over_the_period(master, motor):
+    seen = []
+    follow = motor.follow
+    motor.follow = lambda start, end, substeps: (
+        seen.append((start, end, substeps)),
+        follow(start, end, substeps),
+    )
+    master.enable_csp()
+    seen.clear()
+    for target in (10, 30, 60, 60):
+        status = master.cycle(0x0F, target)[0]
+    master.cycle(0x0F, 60)
+    assert seen == [(0.0, 0.0, 8), (0.0, 10.0, 8), (10.0, 30.0, 8), (30.0, 60.0, 8), (60.0, 60.0, 8)]
+    assert status & BIT_12
+
+
+def test_csp_never_exceeds_the_motors_speed(master, motor):
+    master.put(0x6080, 0, 60, 4)  # 8000 counts/s, 32 per period
+    master.put(0x6065, 0, 0xFFFFFFFF, 4)
+    master.enable_csp()
+    master.cycle(0x0F, 100)
+    rows = [master.cycle(0x0F, 100) for _ in range(6)]
+    assert [row[1] for row in rows] == [0, 32, 64, 96, 100, 100]
+    assert [bool(row[0] & LIMIT) for row in rows] == [False, True, True, True, False, False]
+
+
+def test_csp_adds_the_position_offset(master):
+    master.enable_csp()
+    master.put(0x60B0, 0, 7, 4)
+    for _ in range(3):
+        row = master.cycle(0x0F, 100)
+    assert row[1] == 107
+
+
+@pytest.mark.parametrize("target", [150, -150])
+def test_targets_stay_within_the_software_limits(master, target):
+    master.put(0x607D, 1, -100, 4)
+    master.put(0x607D, 2, 100, 4)
+    master.enable_csp()
+    for _ in range(4):
+        row = master.cycle(0x0F, target)
+    assert abs(row[1]) == 100
+    assert row[0] & LIMIT
+    for _ in range(3):
+        row = master.cycle(0x0F, 0)
+    assert row[1] == 0
+    assert not row[0] & LIMIT
+
+
+def test_an_axis_beyond_a_limit_may_stay_and_come_back_but_go_no_further(master, motor):
+    motor.position = 500.0
+    master.put(0x607D, 1, -100, 4)
+    master.put(0x607D, 2, 100, 4)
+    master.enable_csp()
+    assert motor.position == 500.0
+    for target, reached in ((600, 500), (450, 450), (480, 450), (50, 50), (200, 100)):
+        for _ in range(4):
+            row = master.cycle(0x0F, target)
+        assert row[1] == reached
+
+
+def test_positions_wrap_around_int32(master, motor):
+    motor.position = float(2**31 - 10)
+    master.wait(0.01)
+    master.enable_csp()
+    position = 2**31 - 10
+    for _ in range(5):
+        position += 5
+        row = master.cycle(0x0F, (position + 2**31) % 2**32 - 2**31)
+    for _ in range(2):
+        row = master.cycle(0x0F, (position + 2**31) % 2**32 - 2**31)
+    assert motor.position == position == 2**31 + 15
+    assert row[1] == row[4] == -(2**31) + 15
+    assert row[3] == (round(position * 7.2) + 2**31) % 2**32 - 2**31
+
+
+@pytest.mark.parametrize("home", [0, 1000])
+def test_polarity_reverses_position_and_velocity(master, motor, home):
+    master.put(0x607E, 0, 0xC0, 1)
+    master.put(0x607C, 0, home, 4)
+    master.enable(6)
+    master.control(0x1F)
+    master.control(0x00)
+    master.enable_csp()
+    target = master.cruise(40, 10, home)
+    assert motor.velocity_counts_s == -10_000.0
+    assert master.read(0x606C) == master.read(0x606B) == 10_000
+    for _ in range(2):
+        row = master.cycle(0x0F, target)
+    assert row[1] == row[4] == target == home + 400
+    assert motor.position == -400.0
+    assert master.read(0x6063) == -400
+
+
+def test_a_mode_change_in_motion_brakes_first(master, motor):
+    master.put(0x6084, 0, 50_000, 4)
+    master.enable_csp()
+    master.cruise(40, 10)
+    start = motor.position
+    master.put(0x6060, 0, 1, 1)
+    master.wait(0.3)
+    assert motor.velocity_counts_s == 0.0
+    assert motor.position - start == pytest.approx(1000.0, abs=1.0)
+    assert master.state == "enabled"
+
+
+def test_halt_in_csp_stops_and_ignores_targets(master, motor):
+    master.put(0x6084, 0, 50_000, 4)
+    master.enable_csp()
+    target = master.cruise(40, 10)
+    for _ in range(60):
+        status = master.cycle(0x10F, target)[0]
+    assert motor.velocity_counts_s == 0.0
+    assert status & REACHED
+    assert not status & BIT_12
+    held = motor.position
+    master.cycle(0x10F, target + 5000)
+    master.cycle(0x10F, target + 5000)
+    assert motor.position == held
+
+
+def test_the_torque_limit_reaches_the_loops(master, motor):
+    master.put(0x6072, 0, 500, 2)
+    assert motor.torque_limit_permille == 500
+    master.enable()
+    motor.torque_permille = -500
+    assert master.statusword & LIMIT
+    assert master.read(0x6077) == -500
+    motor.torque_permille = -499
+    assert not master.statusword & LIMIT
+    master.nmt(129)
+    assert motor.torque_limit_permille == 1000
+
+
+# profile position
+
+
+def test_pp_moves_on_a_trapezoid(master, motor):
+    for index, value in ((0x6081, 10_000), (0x6083, 50_000), (0x6084, 100_000)):
+        master.put(index, 0, value, 4)
+    master.enable(1)
+    assert master.statusword & REACHED
+    set_point(master, 8000)
+    assert not master.statusword & REACHED
+    master.wait(0.1)
+    assert master.read(0x606C) == pytest.approx(5000, abs=2 * 50_000 * 0.004)
+    master.wait(0.3)
+    assert master.read(0x606C) == pytest.approx(10_000, rel=1e-6)
+    duration_s = 8000 / 10_000 + 0.5 * (10_000 / 50_000 + 10_000 / 100_000)
+    master.wait(duration_s - 0.4 - 0.012)
+    assert motor.position < 8000
+    master.wait(0.05)
+    assert motor.position == 8000
+    assert master.statusword & REACHED
+
+
+def test_pp_target_reached_needs_the_window_for_its_time(master, motor):
+    master.put(0x6068, 0, 100, 2)
+    master.enable(1)
+    set_point(master, 100)
+    master.wait(0.12)
+    assert motor.position == 100
+    assert not master.statusword & REACHED
+    master.wait(0.15)
+    assert master.statusword & REACHED
+    motor.position = 120.0
+    motor.stuck = True
+    master.wait(0.01)
+    assert not master.statusword & REACHED
+
+
+def test_pp_keeps_one_set_point_waiting(master, motor):
+    master.enable(1)
+    set_point(master, 2000)
+    assert not master.statusword & BIT_12
+    set_point(master, -1000)
+    assert master.statusword & BIT_12  # no room for another
+    master.put(0x607A, 0, 7777, 4)
+    master.control(0x1F)
+    master.control(0x0F)
+    positions = []
+    for _ in range(400):
+        master.wait(0.004)
+        positions.append(motor.position)
+    assert max(positions) == 2000
+    assert positions[-1] == -1000
+    assert not master.statusword & BIT_12
+
+
+def test_pp_change_immediately(master, motor):
+    master.enable(1)
+    set_point(master, 20_000)
+    master.wait(0.2)
+    assert 0 < motor.position < 10_000
+    set_point(master, -1000, 0x20)
+    master.wait(3.0)
+    assert motor.position == -1000
+
+
+def test_pp_relative_to_the_preceding_set_point(master, motor):
+    master.enable(1)
+    set_point(master, 1000, 0x40)
+    master.wait(0.05)
+    set_point(master, 500, 0x40 | 0x20)
+    master.wait(1.0)
+    assert motor.position == 1500
+    set_point(master, -700, 0x40)
+    master.wait(1.0)
+    assert motor.position == 800
+
+
+def test_pp_needs_an_edge(master, motor):
+    master.enable(1)
+    set_point(master, 1000)
+    master.wait(1.0)
+    master.control(0x1F)
+    master.put(0x607A, 0, 3000, 4)
+    master.control(0x3F)
+    master.wait(1.0)
+    assert motor.position == 1000
+
+
+def test_pp_halts_and_goes_on(master, motor):
+    master.put(0x6084, 0, 50_000, 4)
+    master.enable(1)
+    set_point(master, 20_000)
+    master.wait(0.5)
+    start, speed = motor.position, motor.velocity_counts_s
+    master.control(0x10F)
+    master.wait(1.0)
+    assert motor.position - start == pytest.approx(speed**2 / 1e5, rel=1e-3)
+    assert master.statusword & REACHED
+    master.control(0x0F)
+    master.wait(2.0)
+    assert motor.position == 20_000
+
+
+def test_pp_respects_the_software_limits(master, motor):
+    master.put(0x607D, 1, -100, 4)
+    master.put(0x607D, 2, 100, 4)
+    master.enable(1)
+    set_point(master, 500)
+    master.wait(1.0)
+    assert motor.position == 100
+    assert master.statusword & LIMIT
+
+
+def test_pp_is_limited_in_speed(master, motor):
+    master.put(0x6080, 0, 60, 4)
+    master.enable(1)
+    set_point(master, 20_000)
+    speeds = []
+    for _ in range(700):
+        master.wait(0.004)
+        speeds.append(motor.velocity_counts_s)
+    assert max(speeds) == pytest.approx(8000.0)
+    assert motor.position == 20_000
+
+
+# homing
+
+
+@pytest.mark.parametrize("method", [35, 37])
+def test_homing_declares_the_present_position(master, motor, method):
+    motor.position = 4321.0
+    master.put(0x6098, 0, method, 1)
+    master.put(0x607C, 0, -50, 4)
+    master.wait(0.01)
+    master.enable(6)
+    status = master.statusword
+    assert status & (REACHED | BIT_12 | BIT_13 | REFERENCED) == REACHED
+    master.control(0x1F)
+    status = master.statusword
+    assert status & (REACHED | BIT_12 | BIT_13 | REFERENCED) == REACHED | BIT_12 | REFERENCED
+    assert master.read(0x6064) == master.read(0x6062) == master.read(0x607A) == -50
+    master.put(0x6060, 0, 8, 1)
+    master.nmt(1)
+    master.control(0x0F)
+    for _ in range(3):
+        row = master.cycle(0x0F, -40)
+    assert row[1] == -40
+    assert motor.position == 4331.0
+
+
+def test_homing_in_motion_is_an_error(master, motor):
+    master.put(0x6098, 0, 37, 1)
+    master.enable(6)
+    motor.velocity_counts_s = 5000.0
+    master.control(0x1F)
+    status = master.statusword
+    assert status & BIT_13
+    assert not status & (BIT_12 | REFERENCED)
+    assert master.read(0x6064) == 0
+
+
+def test_feedback_objects(master, motor):
+    motor.position = 100.0
+    motor.torque_permille = -12
+    master.wait(0.01)
+    assert master.read(0x60E4, 1) == 720
+    assert master.read(0x6063) == 100
+    assert master.read(0x6077) == -12
+    assert master.read(0x2100) == 234
+    assert master.read(0x2101) == -1250
+    master.enable_csp()
+    target = master.cruise(10, 20)
+    assert master.read(0x60E5, 1) == pytest.approx(7.2 * 2500, rel=0.02)
+    assert master.read(0x60FC) == pytest.approx(target, abs=10)
+
+
+def test_the_units_are_counts(master):
+    resolution = master.read(0x608F, 1) // master.read(0x608F, 2)
+    gear = master.read(0x6091, 1) // master.read(0x6091, 2)
+    feed = master.read(0x6092, 1) // master.read(0x6092, 2)
+    assert (resolution, gear, feed) == (8000, 50, 400_000)
+    assert master.read(0x60E6, 1) == 2_880_000
+    assert struct.pack("<i", master.read(0x6502)) == b"\xe1\0\0\0"

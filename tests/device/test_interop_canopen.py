@@ -1,0 +1,168 @@
+"""The simulated drive driven by canopen's own client, with its notifier thread, in real time.
+
+Nothing here asserts how long anything takes: events are waited for, generously.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import can
+import canopen
+import pytest
+from support.patience import PATIENCE_S, until
+
+from hdbridge.clock import MonotonicClock
+from hdbridge.device.node import DriveNode
+from hdbridge.device.run import run
+from hdbridge.errors import BusError
+
+EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"interop-{uuid4()}"
+
+
+@pytest.fixture
+def drive(channel: str, motor) -> Iterator[DriveNode]:
+    """A drive in a thread of its own."""
+    stop = threading.Event()
+    with can.Bus(interface="virtual", channel=channel, ignore_config=True) as bus:
+        node = DriveNode(bus, motor, EDS, 5, MonotonicClock())
+        thread = threading.Thread(target=run, args=(bus, node, MonotonicClock(), stop.is_set))
+        thread.start()
+        try:
+            yield node
+        finally:
+            stop.set()
+            thread.join()
+
+
+@pytest.fixture
+def network(channel: str) -> Iterator[canopen.Network]:
+    network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.05
+    network.connect(interface="virtual", channel=channel, ignore_config=True)
+    try:
+        yield network
+    finally:
+        network.disconnect()
+
+
+@pytest.fixture
+def remote(network: canopen.Network, drive: DriveNode) -> canopen.RemoteNode:
+    remote = network.add_node(5, str(EDS))
+    remote.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+    return remote
+
+
+def test_boot_up_and_nmt(remote):
+    remote.nmt.state = "RESET"
+    remote.nmt.wait_for_bootup(PATIENCE_S)
+    remote.sdo[0x1017].raw = 20
+    remote.nmt.state = "OPERATIONAL"
+    assert remote.nmt.wait_for_heartbeat(PATIENCE_S) == "OPERATIONAL"
+    remote.nmt.state = "PRE-OPERATIONAL"
+    until(lambda: remote.nmt.wait_for_heartbeat(PATIENCE_S) == "PRE-OPERATIONAL")
+
+
+def test_sdo_numbers_and_strings(remote):
+    assert remote.sdo[0x1018]["Vendor-ID"].raw == 0x4844
+    assert remote.sdo["Manufacturer device name"].raw == "hdbridge simulated CiA-402 servo drive"
+    remote.sdo["Device label"].raw = "axis on the left, behind the pillar"
+    assert remote.sdo["Device label"].raw == "axis on the left, behind the pillar"
+    remote.sdo[0x607D][1].raw = -123456
+    assert remote.sdo[0x607D][1].raw == -123456
+    assert remote.sdo[0x60E4][1].raw == 0
+
+
+@pytest.mark.parametrize(("index", "code"), [(0x5FFF, 0x06020000), (0x6041, 0x06010002)])
+def test_sdo_aborts(remote, index, code):
+    with pytest.raises(canopen.SdoAbortedError) as caught:
+        remote.sdo.download(index, 0, b"\0\0")
+    assert caught.value.code == code
+
+
+def test_emergencies_arrive(remote, drive):
+    codes = []
+    remote.emcy.add_callback(lambda error: codes.append(error.code))
+    drive.faults.raise_error(0x2310)
+    until(lambda: codes == [0x2310])
+    remote.sdo[0x6040].raw = 0x80
+    until(lambda: codes == [0x2310, 0])
+    assert remote.sdo[0x1003][1].raw == 0x2310
+
+
+def test_pdo_configuration_by_canopen(network, remote):
+    remote.tpdo.read()
+    remote.tpdo[1].clear()
+    remote.tpdo[1].add_variable(0x6041)
+    remote.tpdo[1].add_variable(0x60E4, 1)
+    remote.tpdo[1].trans_type = 1
+    remote.tpdo[1].enabled = True
+    remote.tpdo.save()
+    received = []
+    network.subscribe(0x185, lambda can_id, data, timestamp: received.append(bytes(data)))
+    remote.nmt.state = "OPERATIONAL"
+    until(lambda: network.sync.transmit() or bool(received))
+    assert received[0] == b"\x50\x02" + bytes(4)
+
+
+def test_a_profile_move_in_real_time(remote, motor):
+    for index, value in ((0x6081, 100_000), (0x6083, 1_000_000), (0x6084, 1_000_000)):
+        remote.sdo[index].raw = value
+    remote.sdo[0x6060].raw = 1
+    for word in (0x06, 0x07, 0x0F):
+        remote.sdo[0x6040].raw = word
+    remote.sdo[0x607A].raw = 4000
+    remote.sdo[0x6040].raw = 0x1F
+    until(lambda: remote.sdo[0x6041].raw & 0x1400 == 0x1400)
+    assert remote.sdo[0x6064].raw == motor.motor_counts == 4000
+    remote.sdo[0x6040].raw = 0x00
+
+
+class BrokenBus(can.BusABC):
+    """An interface that has gone away."""
+
+    def __init__(self) -> None:
+        super().__init__(channel="gone")
+        self.channel_info = "gone"
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("network is down")
+
+    def _recv_internal(self, timeout: float | None):
+        raise can.CanOperationError("network is down")
+
+
+class SteppedClock:
+    def __init__(self) -> None:
+        self.time_s = 0.0
+
+    def now(self) -> float:
+        return self.time_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        self.time_s = max(self.time_s, deadline_s)
+
+
+def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
+    clock = SteppedClock()
+    with BrokenBus() as bus:
+        node = DriveNode(bus, motor, EDS, 1, clock)
+        with pytest.raises(BusError, match="gone: cannot be read"):
+            run(bus, node, clock, lambda: False)
+    assert motor.elapsed_s > 4.0
+
+
+def test_frames_that_cannot_be_sent_are_dropped(motor):
+    with BrokenBus() as bus:
+        bus.recv = lambda timeout: None
+        node = DriveNode(bus, motor, EDS, 1, SteppedClock())
+        node.poll(0.0)
+        assert node.lost_frames == 1

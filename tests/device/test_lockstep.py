@@ -1,0 +1,209 @@
+"""The lockstep bus and the virtual clock: time passes only in waiting, and always the same way."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import can
+import pytest
+
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import (
+    LockstepBus,
+    SimulatedAxis,
+    VirtualClock,
+    lockstep_bench,
+    nameplate_of,
+    simulated_bench,
+    simulated_benches,
+)
+from hdbridge.sim.truth import Truth
+
+ROOT = Path(__file__).parents[2]
+EDS = ROOT / "eds" / "hdbridge-402.eds"
+ARTICLE = ROOT / "profiles" / "article"
+
+
+def message(can_id: int, data: bytes = b"", **flags) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False, **flags)
+
+
+def test_time_stands_still_but_for_waiting(master):
+    before = master.clock.now()
+    master.put(0x607A, 0, 5, 4)
+    master.bus.recv(0)
+    assert master.clock.now() == before
+    assert master.bus.recv(0.25) is None
+    assert master.clock.now() == before + 0.25
+    master.clock.sleep_until(before + 1.0)
+    assert master.clock.now() == before + 1.0
+    master.clock.sleep_until(before)
+    assert master.clock.now() == before + 1.0
+
+
+def test_a_wait_ends_with_the_frame(master):
+    before = master.clock.now()
+    master.put(0x1017, 0, 30, 2)
+    frame = master.bus.recv(1.0)
+    assert frame.arbitration_id == 0x701
+    assert frame.timestamp == master.clock.now() == pytest.approx(before + 0.03)
+
+
+def test_a_wait_for_nobody_ends():
+    clock = VirtualClock(5.0)
+    with LockstepBus("nobody-here", clock) as bus:
+        assert bus.recv(1.0) is None
+        assert clock.now() == 6.0
+        with pytest.raises(can.CanOperationError, match="virtual time"):
+            bus.recv()
+
+
+def test_a_frame_sent_is_answered_before_send_returns(master):
+    master.send(0x601, struct.pack("<BHBI", 0x40, 0x6502, 0, 0))
+    assert master.bus.recv(0).data == bytes.fromhex("43026500e1000000")
+
+
+def test_filters_hold(master):
+    master.bus.set_filters([{"can_id": 0x181, "can_mask": 0x7FF, "extended": False}])
+    master.nmt(1)
+    master.send(0x080)
+    assert [can_id for can_id, _ in master.take()] == [0x181]
+
+
+def test_others_on_the_channel_are_heard_by_master_and_drive(motor):
+    with (
+        lockstep_bench(motor, EDS, channel="shared-channel") as (bus, _, _),
+        can.Bus(interface="virtual", channel="shared-channel", ignore_config=True) as other,
+    ):
+        other.send(message(0x000, b"\x01\x01"))
+        other.send(message(0x080))
+        got = []
+        while (frame := bus.recv(0)) is not None:
+            got.append(frame.arbitration_id)
+        assert got == [0x000, 0x080, 0x181, 0x281]
+        assert other.recv(0).arbitration_id == 0x181
+
+
+def test_every_kind_of_frame_passes_unchanged(motor):
+    with (
+        lockstep_bench(motor, EDS, channel="kinds") as (bus, _, _),
+        can.Bus(interface="virtual", channel="kinds", ignore_config=True) as other,
+    ):
+        frames = [
+            message(0x123, b"\x01\x02"),
+            message(0x124, is_remote_frame=True, dlc=4),
+            can.Message(arbitration_id=0x18FF0001, data=b"abc", is_extended_id=True),
+            message(0x125, bytes(12), is_fd=True),
+        ]
+        for frame in frames:
+            bus.send(frame)
+            assert other.recv(0).equals(
+                frame, timestamp_delta=None, check_channel=False, check_direction=False
+            )
+
+
+def test_further_nodes_run_too(motor):
+    class Beacon:
+        def __init__(self) -> None:
+            self.bus = can.Bus(interface="virtual", channel="beacon", ignore_config=True)
+            self.due_s = 0.5
+
+        def poll(self, now_s: float) -> None:
+            while now_s >= self.due_s:
+                self.bus.send(message(0x1F0, struct.pack("<d", self.due_s)))
+                self.due_s += 0.5
+
+        def next_event_s(self) -> float:
+            return self.due_s
+
+    beacon = Beacon()
+    with beacon.bus, lockstep_bench(motor, EDS, channel="beacon", others=[beacon]) as (bus, clock, _):
+        assert struct.unpack("<d", bus.recv(10.0).data) == (0.5,)
+        clock.sleep_until(2.2)
+        assert [struct.unpack("<d", bus.recv(0).data)[0] for _ in range(3)] == [1.0, 1.5, 2.0]
+
+
+def run_and_record(seed: int) -> list[tuple[float, int, bytes]]:
+    """Half a second of the article's axis in CSP, all frames with their virtual times."""
+    frames = []
+    with simulated_bench(ARTICLE, EDS, seed=seed) as (bus, clock, _):
+        bus.send(message(0x601, bytes.fromhex("2f60600008000000")))
+        bus.send(message(0x000, b"\x01\x01"))
+        words = [0x06, 0x06, 0x07, 0x07] + [0x0F] * 121
+        for k, word in enumerate(words):
+            clock.sleep_until(0.004 * (k + 1))
+            bus.send(message(0x080))
+            while (frame := bus.recv(0)) is not None:
+                frames.append((frame.timestamp, frame.arbitration_id, bytes(frame.data)))
+            bus.send(message(0x201, struct.pack("<Hi", word, 20 * max(0, k - 6))))
+    return frames
+
+
+def test_the_same_seed_gives_the_same_frames():
+    first = run_and_record(7)
+    assert len(first) > 250
+    assert first == run_and_record(7)
+
+
+def test_the_physical_axis_follows_over_the_bus():
+    _, _, data = [frame for frame in run_and_record(1) if frame[1] == 0x181][-1]
+    status, actual, _ = struct.unpack("<Hih", data)
+    assert status & 0x6F == 0x27
+    assert actual == pytest.approx(20 * 115, abs=60)
+
+
+def test_the_nameplate_is_that_of_the_axis():
+    truth = Truth.load(ARTICLE)
+    plate = nameplate_of(truth, serial=9)
+    assert plate.serial == 9
+    assert plate.motor_counts_per_turn == truth.motor.encoder.counts_per_turn
+    assert plate.load_counts_per_turn == truth.load_.encoder.counts_per_turn
+    assert plate.gear_motor_turns == truth.gear.ratio * plate.gear_load_turns
+    with simulated_bench(truth, EDS, node_id=3) as (bus, _, node):
+        assert node.node_id == 3
+        bus.send(message(0x603, bytes.fromhex("4091600100000000")))
+        assert bus.recv(0).data[4:] == struct.pack("<I", plate.gear_motor_turns)
+
+
+def test_two_benches_do_not_meet(motor):
+    with (
+        lockstep_bench(motor, EDS) as (bus_a, _, node_a),
+        lockstep_bench(type(motor)(), EDS) as (bus_b, _, _),
+    ):
+        bus_a.send(message(0x000, b"\x01\x00"))
+        bus_b.send(message(0x080))
+        assert bus_b.recv(0) is None
+        assert node_a.nmt == 5
+
+
+def run_several(node_ids: list[int]) -> dict[int, list[bytes]]:
+    """Two hundred SYNCs for several axes on one bus: each one's TPDO1, by its node id."""
+    frames: dict[int, list[bytes]] = {node_id: [] for node_id in node_ids}
+    axes = [SimulatedAxis(ARTICLE, EDS, node_id, seed=node_id) for node_id in node_ids]
+    with simulated_benches(axes) as (bus, clock, nodes):
+        assert [node.node_id for node in nodes] == node_ids
+        bus.send(message(0x000, b"\x01\x00"))
+        for k in range(200):
+            clock.sleep_until(k * 0.004)
+            bus.send(message(0x080))
+            while (frame := bus.recv(0)) is not None:
+                if 0x180 <= frame.arbitration_id < 0x200:
+                    frames[frame.arbitration_id - 0x180].append(bytes(frame.data))
+            for node_id in node_ids:
+                word = 0x0006 if k < 3 else 0x0007 if k < 5 else 0x000F
+                bus.send(message(0x200 + node_id, struct.pack("<Hi", word, 20 * max(0, k - 6))))
+    return frames
+
+
+def test_several_axes_share_a_bus_and_do_not_disturb_each_other():
+    together = run_several([1, 2, 5])
+    assert all(len(frames) == 200 for frames in together.values())
+    for node_id in (1, 2, 5):
+        assert together[node_id] == run_several([node_id])[node_id]
+
+
+def test_two_simulated_drives_cannot_be_one_node():
+    twice = [SimulatedAxis(ARTICLE, EDS, 4), SimulatedAxis(ARTICLE, EDS, 4)]
+    with pytest.raises(InputError, match="node 4"), simulated_benches(twice):
+        pass

@@ -1,0 +1,210 @@
+"""The EDS: read without a complaint, complete in itself, and true of the node."""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+from configparser import RawConfigParser
+from contextlib import contextmanager
+from pathlib import Path
+
+import canopen
+import pytest
+from canopen.objectdictionary import ODVariable
+
+from hdbridge.device.dictionary import Dictionary
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import lockstep_bench
+from tests.device.conftest import RawMaster
+
+EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
+
+
+@pytest.fixture(scope="module")
+def sections() -> RawConfigParser:
+    parser = RawConfigParser()
+    parser.optionxform = str
+    parser.read(EDS)
+    return parser
+
+
+@pytest.fixture(scope="module")
+def declared() -> canopen.ObjectDictionary:
+    return canopen.import_od(str(EDS), 5)
+
+
+def variables(declared):
+    for item in declared.values():
+        yield from [item] if isinstance(item, ODVariable) else item.values()
+
+
+def test_canopen_reads_it_without_a_complaint(caplog):
+    with caplog.at_level(logging.DEBUG):
+        canopen.import_od(str(EDS), 1)
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+def test_the_lists_name_every_object_once(sections):
+    listed = []
+    for name in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+        count = int(sections[name]["SupportedObjects"])
+        assert set(sections[name]) == {"SupportedObjects", *(str(k) for k in range(1, count + 1))}
+        listed += [int(sections[name][str(k)], 16) for k in range(1, count + 1)]
+    described = [int(name, 16) for name in sections.sections() if len(name) == 4]
+    assert sorted(listed) == sorted(described)
+
+
+def test_sub_numbers_are_right(sections):
+    for name in sections.sections():
+        if len(name) == 4 and "SubNumber" in sections[name]:
+            subs = [other for other in sections.sections() if other.startswith(name + "sub")]
+            assert int(sections[name]["SubNumber"]) == len(subs), name
+
+
+def test_defaults_lie_within_their_limits(declared):
+    for variable in variables(declared):
+        if isinstance(variable.default, int):
+            assert variable.min is None or variable.default >= variable.min, variable.name
+            assert variable.max is None or variable.default <= variable.max, variable.name
+
+
+def test_default_mappings_fit_and_name_mappable_objects(declared):
+    for base in (0x1600, 0x1A00):
+        for number in range(4):
+            mapping = declared[base + number]
+            words = [mapping[sub].default for sub in range(1, mapping[0].default + 1)]
+            assert sum(word & 0xFF for word in words) <= 64
+            for word in words:
+                item = declared[word >> 16]
+                variable = item if isinstance(item, ODVariable) else item[word >> 8 & 0xFF]
+                assert variable.pdo_mappable
+                assert len(variable) == word & 0xFF
+
+
+def test_the_load_encoder_is_a_mappable_int32(declared):
+    variable = declared[0x60E4][1]
+    assert (variable.data_type, variable.pdo_mappable, variable.access_type) == (0x04, True, "ro")
+
+
+def test_identifiers_follow_the_node_id(declared):
+    assert declared[0x1400][1].default == 0x205
+    assert declared[0x1801][1].default == 0x285
+    assert declared[0x1014].default == 0x085
+
+
+def test_every_declared_object_answers_on_the_bus(master, declared):
+    """Each readable object can be uploaded; numbers that the EDS fixes are what it says."""
+    for variable in variables(declared):
+        head = variable.index.to_bytes(2, "little") + bytes([variable.subindex])
+        answer = master.request(b"\x40" + head + bytes(4))
+        assert answer[0] >> 5 == 2, variable.name
+        if variable.access_type == "const" and isinstance(variable.default, int) and answer[0] & 2:
+            size = 4 - (answer[0] >> 2 & 3)
+            assert answer[4 : 4 + size] == variable.encode_raw(variable.default), variable.name
+
+
+@pytest.mark.parametrize(
+    "content", [None, b"", b"[1000]\n", b"\xff\xfe\x00", b"[1000]\nParameterName=x\nDataType=zz\n"]
+)
+def test_what_is_no_eds_is_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "bad.eds"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"bad\.eds") as caught:
+        Dictionary(path, 1)
+    assert "\n" not in str(caught.value)
+
+
+NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
+
+
+@pytest.fixture
+def bench(tmp_path, motor):
+    """A master of raw frames, and a drive with an edited EDS: ``bench(edit)`` is a context manager."""
+
+    @contextmanager
+    def make(*edits):
+        text = EDS.read_text()
+        for pattern, new in edits:
+            text, count = re.subn(pattern, new, text)
+            assert count, pattern
+        path = tmp_path / "own.eds"
+        path.write_text(text)
+        with lockstep_bench(motor, path) as (bus, clock, node):
+            yield RawMaster(bus, clock, node, motor)
+
+    return make
+
+
+def test_what_the_eds_lacks_is_not_on_the_bus_and_the_drive_works_without_it(bench, motor):
+    with bench((r"\[6085\][^[]*", ""), (r"\[60C2(sub\d)?\][^[]*", ""), (r"\[607Dsub2\][^[]*", "")) as master:
+        assert master.abort_of_read(0x6085) == NO_OBJECT
+        assert master.write(0x60C2, 1, 4, 1) == NO_OBJECT
+        assert master.abort_of_read(0x607D, 2) == NO_SUBINDEX
+        master.enable_csp()
+        target = master.cruise(40, 25)
+        master.cycle(0x0F, target)
+        assert motor.motor_counts == target  # its period is that of SYNC
+        for _ in range(3):
+            master.cycle(0x02, target)
+        assert master.state == "disabled"
+
+
+def test_an_object_removed_from_a_drive_is_gone(master):
+    master.node.dictionary.remove(0x6085, 0)
+    assert master.abort_of_read(0x6085) == NO_OBJECT
+    assert (0x6085, 0) not in master.node.dictionary
+
+
+def test_objects_have_the_type_that_the_eds_gives_them(bench, motor):
+    with bench((r"(\[6064\][^[]*DataType=)0x0004", r"\g<1>0x0003")) as master:
+        motor.position = 40_000.0
+        master.wait(0.1)
+        assert master.read(0x6064) == 40_000 - 65_536
+
+
+def test_a_number_that_is_a_text_by_the_eds_cannot_be_simulated(bench):
+    with (
+        pytest.raises(InputError, match=r"own\.eds: 6064h:00 .* data type 0009h"),
+        bench((r"(\[6064\][^[]*DataType=)0x0004", r"\g<1>0x0009")),
+    ):
+        pass
+
+
+def test_a_fixed_mapping_with_a_gap_in_it(bench, motor):
+    words = "ro\nDefaultValue=3", "ro\nDefaultValue=0x00050008", "ro\nDefaultValue=0x60400010"
+    fixed = [(rf"(\[1600sub{sub}\][^[]*AccessType=).*\n.*", rf"\g<1>{new}") for sub, new in enumerate(words)]
+    with bench(*fixed, (r"(\[1600sub3\][^[]*DefaultValue=).*", r"\g<1>0x607A0020")) as master:
+        assert master.write(0x1600, 0, 0, 1) == READ_ONLY
+        master.nmt(1)
+        master.send(0x201, struct.pack("<BHi", 0xFF, 0x06, 77))
+        master.send(0x080)
+        assert (master.state, master.read(0x607A)) == ("ready", 77)
+
+
+def test_a_default_mapping_of_an_object_that_is_not_there_is_no_pdo(bench):
+    with bench((r"\[6062\][^[]*", "")) as master:
+        assert (master.read(0x1A01, 0), master.read(0x1A00, 0)) == (0, 3)
+        master.nmt(1)
+        master.take()
+        master.send(0x080)
+        assert [can_id for can_id, _ in master.take()] == [0x181]
+
+
+def test_there_are_as_many_pdos_as_the_eds_describes(bench):
+    with bench((r"\[(1[8A])03(sub\d)?\]", r"[\g<1>04\g<2>]"), (r"\[1[46]0[23](sub\d)?\][^[]*", "")) as master:
+        assert master.abort_of_read(0x1803, 1) == NO_OBJECT
+        assert master.abort_of_read(0x1402, 1) == NO_OBJECT
+        for step in (
+            (0x1804, 1, 0x80000481, 4),
+            (0x1A04, 1, 0x60410010, 4),
+            (0x1A04, 0, 1, 1),
+            (0x1804, 2, 1, 1),
+        ):
+            master.put(*step)
+        master.put(0x1804, 1, 0x481, 4)
+        master.nmt(1)
+        master.take()
+        master.send(0x080)
+        assert 0x481 in [can_id for can_id, _ in master.take()]

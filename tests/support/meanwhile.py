@@ -1,0 +1,29 @@
+"""What another process does to a file just before this one opens it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_hooks: list[Callable[[str, Path], None]] = []
+
+
+def _audit(event: str, arguments: tuple[object, ...]) -> None:
+    if _hooks and event in ("open", "os.scandir") and isinstance(arguments[0], str):
+        for each in tuple(_hooks):
+            each(event, Path(arguments[0]))
+
+
+sys.addaudithook(_audit)  # it cannot be removed; without hooks it does nothing
+
+
+@contextmanager
+def before_each(hook: Callable[[str, Path], None]) -> Iterator[None]:
+    """Call ``hook`` before any file is opened, and before any folder is listed."""
+    _hooks.append(hook)
+    try:
+        yield
+    finally:
+        _hooks.remove(hook)
