@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Run a command with the SocketCAN interface vcan0 up, on this machine's kernel or in user-mode-linux.
 #
-#   tools/socketcan.sh [--timeout SECONDS] [--uml] [--check] COMMAND [ARGUMENT...]
+#   tools/socketcan.sh [--timeout SECONDS] [--uml] [--realtime] [--slowed N] [--check] COMMAND [ARGUMENT...]
 #
 # The command runs in the present folder with the present environment; its standard output, standard error and
 # exit status are passed through; its standard input is empty. In this order:
@@ -13,8 +13,10 @@
 #      compiler, tools/uml/*.c are put under it: without them, it does not boot on processors with AMX. And
 #      tools/uml/guest/populate.c is put under the command: Python takes three quarters of the time to load with it.
 #
-#   --timeout SECONDS   end everything after that long (default 600); exit status 124
+#   --timeout SECONDS   end everything after that long (default 3600); exit status 124
 #   --uml               use user-mode-linux even where the kernel has vcan
+#   --realtime          give user-mode-linux real-time priority (SCHED_RR, as root): a system call then costs 16 us
+#                       instead of 25 to 70, but two at once leave a small machine nothing for anything else
 #   --slowed N          tests of function: in user-mode-linux (taken where it can be had, even where the kernel has
 #                       vcan) time passes N times as slowly while anything computes, and idle time is skipped, so
 #                       that what else this machine does is nothing to the command; see tools/uml/guest_clock.c
@@ -31,7 +33,7 @@ readonly unavailable=69 broken=70 timed_out=124
 readonly packages=(user-mode-linux kmod iproute2 can-utils)
 readonly boot_limit_s=120 # it takes 2 s
 locks=${SOCKETCAN_LOCKS:-/tmp/socketcan-$(id -u)} && readonly locks
-limit_s=600 force_uml=no check_only=no slowed=''
+limit_s=3600 force_uml=no check_only=no realtime=no slowed=''
 
 say() { echo "socketcan: $*" >&2; }
 
@@ -40,6 +42,7 @@ while [ $# -gt 0 ]; do
         --timeout) limit_s=${2:?--timeout needs seconds}; shift 2 ;;
         --timeout=*) limit_s=${1#*=}; shift ;;
         --uml) force_uml=yes; shift ;;
+        --realtime) realtime=yes; shift ;;
         --slowed) slowed=${2:?--slowed needs a number}; shift 2 ;;
         --check) check_only=yes; shift ;;
         --) shift; break ;;
@@ -127,8 +130,8 @@ run_uml() {
     : >"$work/stdout" >"$work/stderr"
     # A kernel's command line cannot hold a path with spaces.
     cp "$here/uml/init.sh" "$work/init.sh"
-    # user-mode-linux and its processes hand over to each other at each system call. On one processor, before the
-    # machine's other work, a system call costs 16 us; spread over two processors or waiting in line, 25 to 70.
+    # user-mode-linux and its processes hand over to each other at each system call, which is cheapest on one
+    # processor.
     local first=() processors
     mapfile -t processors < <(taskset -pc $$ | sed 's/.*: *//' | tr ',' '\n' |
         while IFS=- read -r from to; do seq "$from" "${to:-$from}"; done)
@@ -136,7 +139,7 @@ run_uml() {
         take_processor "${processors[@]}"
         first=(taskset -c "$processor")
     fi
-    chrt --rr 1 true 2>/dev/null && first+=(chrt --rr 1)
+    [ $realtime = yes ] && chrt --rr 1 true 2>/dev/null && first+=(chrt --rr 1)
     local preload
     preload=$(compile_preload)
     compile_for_guest

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from hdbridge.errors import HdbridgeError
+from hdbridge.errors import DriveError, HdbridgeError
 
 P = TypeVar("P")
 Figure = float | int | str | bool | None
@@ -33,6 +33,8 @@ class Verdict:
     do; the likeliest first."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
     """The same for machines, units in the names."""
+    error: type[HdbridgeError] = DriveError
+    """Kind of the failure; it decides the exit status."""
 
 
 def passed(measured: str, **figures: Figure) -> Verdict:
@@ -123,4 +125,4 @@ def _run(check: Check[P], subject: P) -> Verdict:
         return check.run(subject)
     except HdbridgeError as error:
         notes = tuple(getattr(error, "__notes__", ()))
-        return failed(str(error), *notes)
+        return replace(failed(str(error), *notes), error=type(error))

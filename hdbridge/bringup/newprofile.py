@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hdbridge.bringup.match import axis_lines
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.files.atomic import write_folder
 from hdbridge.files.bundled import bundled_profile
 
 if TYPE_CHECKING:
@@ -43,20 +42,13 @@ def copy_bundled(source: str, folder: Path) -> list[Path]:
     """The files of a bundled profile in a new folder, the axis named after it; what was written."""
     name = _axis_name(folder)
     origin = bundled_profile(source)
-    _make_new(folder)
-    written = []
-    for each in FILES:
-        if (origin / each).is_file():
-            shutil.copyfile(origin / each, folder / each)
-            written.append(folder / each)
-    _rename(folder / "axis.yaml", r"(?m)^name: .*$", f"name: {name}")
-    if (folder / "model.yaml").is_file():  # bound to the axis by its name: the copy's model is the copy's
-        _rename(folder / "model.yaml", r"(?m)^  axis: .*$", f"  axis: {name}")
-    return written
-
-
-def _rename(file: Path, line: str, written: str) -> None:
-    write_atomically(file, re.sub(line, written, file.read_text(encoding="utf-8"), count=1))
+    # A model is bound to the axis by its name: the copy's model is the copy's.
+    own = {"axis.yaml": (rb"(?m)^name: .*$", "name: "), "model.yaml": (rb"(?m)^  axis: .*$", "  axis: ")}
+    files = {each: (origin / each).read_bytes() for each in FILES if (origin / each).is_file()}
+    for each, (line, key) in own.items():
+        if each in files:
+            files[each] = re.sub(line, f"{key}{name}".encode(), files[each], count=1)
+    return write_folder(folder, files)
 
 
 def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) -> list[Path]:
@@ -64,13 +56,10 @@ def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) ->
     text = axis_text(_axis_name(folder), bus, node, eds.name if eds else "FILE.eds")
     if eds is not None and not eds.is_file():
         raise InputError(f"{eds}: there is no such file; expected the EDS file of the drive")
-    _make_new(folder)
-    written = [folder / "axis.yaml"]
+    files = {"axis.yaml": text.encode()}
     if eds is not None:
-        shutil.copyfile(eds, folder / eds.name)
-        written.append(folder / eds.name)
-    write_atomically(written[0], text)
-    return written
+        files[eds.name] = eds.read_bytes()
+    return write_folder(folder, files)
 
 
 def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
@@ -119,9 +108,3 @@ def _axis_name(folder: Path) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
         raise InputError(f"{folder}: {name!r} is no name of an axis; expected letters, digits, '.', '_', '-'")
     return name
-
-
-def _make_new(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: is there already; expected a new folder, nothing was written")
-    make_folder(folder)

@@ -102,7 +102,7 @@ class _LoadedToRun(TyperGroup):
 @cache
 def _built(name: str) -> Any:
     """The command with its options; once, where a process runs it more often."""
-    return get_group(load(name)).commands[name]
+    return usage.strict(get_group(load(name)).commands[name])
 
 
 app = typer.Typer(

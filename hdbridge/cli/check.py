@@ -12,7 +12,7 @@ from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
+    from hdbridge.axis import AxisConfig, BusConfig
     from hdbridge.daemon.machine import Machine
 
 CheckedArgument = Annotated[
@@ -38,12 +38,15 @@ def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOp
     path = machine_file(profile)
     if path is None:
         files = Profile.find(profile)
-        reports = [_Report(AxisConfig.load(files.axis), model or _existing(files.model))]
+        axis = AxisConfig.load(files.axis)
+        _check_bus(axis.bus, axis.where("bus"))
+        reports = [_Report(axis, model or _existing(files.model))]
         document: dict[str, Any] = {"schema": "hdbridge.check/1", **reports[0].document()}
     elif model is not None:
         raise InputError("--model goes with one axis: a machine's axes have their models in their profiles")
     else:
         machine = Machine.load(path)
+        _check_bus(machine.bus, f"{path}: bus")
         reports = [_Report(axis.config, _existing(axis.profile.model)) for axis in machine.axes]
         facts = _of_machine(machine)
         document = {"schema": "hdbridge.check/1", **facts, "axes": [each.document() for each in reports]}
@@ -52,6 +55,15 @@ def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOp
     for report in reports:
         report.print()
     console.print("all right")
+
+
+def _check_bus(bus: BusConfig, where: str) -> None:
+    """Refuses an interface that python-can does not know; a channel may be that of another computer."""
+    from hdbridge.drive.link import absent_interface, check_interface
+
+    check_interface(bus.interface, f"{where}.interface")
+    if absent := absent_interface(bus):
+        notes.print(f"note: {where}.channel: {absent}", markup=False, soft_wrap=True)
 
 
 def _existing(path: Path) -> Path | None:

@@ -79,8 +79,8 @@ def doctor(
     Each line is one check. Where one fails, the line of the axis file to change stands under it, or what to
     do.
 
-    Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed. This is no safety
-    function: an emergency stop stays in hardware.
+    Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed; 2 when the first
+    failure is a file, 3 when it is the bus. This is no safety function: an emergency stop stays in hardware.
     """
     from hdbridge.bringup.checks import run_checks
     from hdbridge.bringup.context import BringUpContext
@@ -119,7 +119,7 @@ def doctor(
     )
     if failures:
         first = failures[0]
-        raise DriveError(
+        raise first.verdict.error(
             f"{files.axis}: {len(failures)} of {len(rows)} checks failed, first '{first.check.title}'; "
             "the lines under each say what to change"
         )

@@ -79,23 +79,22 @@ def home(
     the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
     """
     from hdbridge.drive.drive import Drive
+    from hdbridge.drive.modes import Homing
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
+    highest_deg_s = axis.limits.velocity_deg_s
+    towards_switch_deg_s = switch_velocity_deg_s or TOWARDS_SWITCH * highest_deg_s
+    towards_zero_deg_s = zero_velocity_deg_s or TOWARDS_ZERO * highest_deg_s
+    wanted = (method, towards_switch_deg_s, towards_zero_deg_s, acceleration_deg_s2, offset_deg, timeout_s)
+    Homing.checked(axis, *wanted)  # refused before anything is connected
     with (
         connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
         Drive(bus, axis, clock, force=force) as drive,
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
-        at = drive.home(
-            method,
-            switch_velocity_deg_s or TOWARDS_SWITCH * axis.limits.velocity_deg_s,
-            zero_velocity_deg_s or TOWARDS_ZERO * axis.limits.velocity_deg_s,
-            acceleration_deg_s2,
-            offset_deg,
-            timeout_s,
-        )
+        at = drive.home(*wanted)
     load_by_motor_deg = at.motor_deg / axis.gear.ratio
     write_json(
         json_file,

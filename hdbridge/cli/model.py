@@ -14,6 +14,7 @@ from rich.table import Table
 from hdbridge.cli.options import JsonOption, ProfileArgument, console, print_table, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
+from hdbridge.files.yamlfile import read_yaml
 from hdbridge.model import TransmissionModel
 from hdbridge.model.difference import Difference, diff
 from hdbridge.model.store import ACTIVE, MODELS, PENDING, Store, Version
@@ -145,7 +146,12 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    return Profile.find(profile).axis.parent
+    """Where the models of an axis lie; InputError unless there is an axis file, of whatever content."""
+    axis = Profile.find(profile).axis
+    data = read_yaml(axis).data
+    if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):
+        raise InputError(f"{axis}: is no axis file; expected 'schema: hdbridge.axis/1' in it")
+    return axis.parent
 
 
 def _now() -> datetime:

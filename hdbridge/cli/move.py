@@ -22,6 +22,7 @@ from hdbridge.cli.options import (
     TruthOption,
     console,
     load_axis,
+    note_clamped,
     notes,
     print_table,
     progress_bar,
@@ -84,13 +85,17 @@ def move(
     ends the command in good order. Then power is off: what hangs on the axis needs a brake.
     """
     from hdbridge.cli.booted import booted
-    from hdbridge.control.bench import Bench, compensation_for
+    from hdbridge.control.bench import Bench, axis_view, compensation_for
+    from hdbridge.procedures.rehearsal import rehearse
     from hdbridge.procedures.waypoints import Hold, WayPoints
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
+    if not relative:  # refused before anything is connected
+        rehearse(WayPoints(tuple(angles_deg)), axis_view(axis), angles_deg[0])
     chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
     compensation = compensation_for(axis, chosen)  # refused before anything is connected
+    note_clamped(axis.limits, velocity_deg_s=velocity_deg_s)
     with booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         if simulate and hold_s is None:
             hold_s = 0.0  # nobody sees a simulated axis stand

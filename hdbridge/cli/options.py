@@ -106,9 +106,14 @@ def load_axis(
 ) -> AxisConfig:
     """The axis file, with the bus replaced where options say so."""
     from hdbridge.axis import AxisConfig
+    from hdbridge.drive.link import check_interface
 
     check_bus_options(interface, channel, simulate=simulate)
     axis = AxisConfig.load(profile.axis)
+    if not simulate:
+        check_interface(
+            interface or axis.bus.interface, "--interface" if interface else axis.where("bus.interface")
+        )
     changes = {
         name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
     }
@@ -157,6 +162,23 @@ def simulated_by(profile: Profile, truth: Path | None) -> Path:
     if plant == profile.twin:
         notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
     return plant
+
+
+def note_clamped(limits: Any, **wanted: float | None) -> None:
+    """Reports each wanted velocity or acceleration that is above the axis's limit, which is used instead.
+
+    ``limits`` has the attributes that are named: ``velocity_deg_s``, ``acceleration_deg_s2``.
+    """
+    for name, value in wanted.items():
+        limit = getattr(limits, name)
+        if value is not None and abs(value) > limit:
+            kind, unit = ("velocity", "deg/s") if name == "velocity_deg_s" else ("acceleration", "deg/s2")
+            notes.print(
+                f"{kind}: {abs(value):g} {unit} is above the axis's limit; {limit:g} {unit} is used "
+                f"(limits.{name})",
+                markup=False,
+                soft_wrap=True,
+            )
 
 
 class _TimeColumn(ProgressColumn):

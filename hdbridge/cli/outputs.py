@@ -9,13 +9,15 @@ from __future__ import annotations
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from typer.models import OptionInfo
 
 from hdbridge.cli.options import console, notes
+from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind, Output, check_outputs, failures_deferred
 
 STANDARD_OUTPUT = Path("/dev/stdout")
@@ -27,7 +29,8 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     Where a result goes to the standard output, what is printed for a person goes to the standard error. A
     result that cannot be written after all (a full disk) ends the command when everything is printed.
     """
-    declared = dict(_declared(command))
+    options = dict(_options(command))
+    declared = {name: (option, kind) for name, (option, kind) in options.items() if kind is not None}
 
     @functools.wraps(command)
     def checked(**values: Any) -> Any:
@@ -39,13 +42,15 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
             for name, (option, kind) in declared.items()
             if values[name] is not None
         ]
+        _check_truths(values.get("truth"))
         check_outputs(outputs, _inputs(value for name, value in values.items() if name not in declared))
         before = console.stderr
         console.stderr = before or any(each.path == STANDARD_OUTPUT for each in outputs)
         try:
             with failures_deferred() as failed:
                 try:
-                    done = command(**values)
+                    with _naming(options):
+                        done = command(**values)
                 except BaseException:
                     for each in failed:
                         notes.print(str(each), markup=False, soft_wrap=True)
@@ -61,14 +66,34 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-def _declared(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind]]]:
-    """By parameter: the option that a person types, and what it writes."""
+def _check_truths(given: Path | list[Path] | None) -> None:
+    """Read what the simulated axes are like: a wrong file is refused before folders are made for results."""
+    if given:
+        from hdbridge.sim.truth import Truth
+
+        for each in given if isinstance(given, list) else [given]:
+            Truth.load(each)
+
+
+@contextmanager
+def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
+    """A complaint of the library about a parameter names the option that a person has typed."""
+    try:
+        yield
+    except InputError as problem:
+        name, colon, rest = str(problem).partition(": ")
+        if not colon or name not in options:
+            raise
+        raise InputError(f"{options[name][0]}: {rest}") from problem
+
+
+def _options(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind | None]]]:
+    """By parameter: the option that a person types, and what it writes; None for one that writes nothing."""
     hints = typing.get_type_hints(command, include_extras=True)
     for name in inspect.signature(command).parameters:
         metadata = getattr(hints[name], "__metadata__", ())
-        for kind in metadata:
-            if isinstance(kind, Kind):
-                yield name, (_option(name, metadata), kind)
+        kinds = (each for each in metadata if isinstance(each, Kind))
+        yield name, (_option(name, metadata), next(kinds, None))
 
 
 def _option(name: str, metadata: tuple[Any, ...]) -> str:

@@ -74,12 +74,15 @@ def run(
     from hdbridge.daemon.hold import hold
     from hdbridge.daemon.logs import LogSettings
     from hdbridge.daemon.machine import Machine
+    from hdbridge.drive.link import check_interface
 
     held = Machine.find(machine)
     changes = {name: given for name, given in (("interface", interface), ("channel", channel)) if given}
     held = held.on_bus(**changes) if changes else held
     simulation = _simulation(held, truth or [], seed, speed) if simulate else None
     if simulation is None:
+        where = "--interface" if interface else f"{held.path}: bus.interface"
+        check_interface(held.bus.interface, where)
         _check_real(held, truth or [], speed)
     log = LogSettings(*eventlog.handed_over())
     raise typer.Exit(hold(held, simulation, force=force, page=port if page else None, log=log))

@@ -81,12 +81,15 @@ def step(
 
     The article's four schemes, and the whole model where it has more than their two parts.
     """
+    from hdbridge.control.bench import axis_view
     from hdbridge.model import TransmissionModel
+    from hdbridge.procedures.rehearsal import rehearse
     from hdbridge.procedures.stepping import Stepping
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
+    rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
     chosen: Path | None = model or files.model
     if scheme and set(scheme) == {Scheme.NONE} and model is None:
         chosen = None  # what compensates nothing needs no model

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import errno
+import math
+import os
 import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import typer
 
+from hdbridge.errors import InputError
+
 UsageError: Any = typer.BadParameter.__mro__[1]
 """What is wrong with a command line. typer has it from click or brings its own; it exports only an heir."""
+_PLACES = ("PROFILE", "MACHINE")
+"""What stands for a path or the name of something that comes with hdbridge."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
@@ -20,6 +30,45 @@ def refusal(error: Any) -> str:
     line = _about_value(error) or _about_line(error)
     path = getattr(context, "command_path", "hdbridge")
     return one_line(f"{line}; see {path} --help")
+
+
+def strict(command: Any) -> Any:
+    """The command, with values refused that typer takes: empty texts, numbers that are none, no paths.
+
+    Before the command runs, and before it is asked what its outputs are. InputError in one line.
+    """
+    for each in getattr(command, "commands", {}).values():
+        strict(each)
+    for each in command.params:
+        each.process_value = partial(_checked, each, each.process_value)
+    return command
+
+
+def _checked(param: Any, convert: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
+    """What ``convert`` makes of the value of an option or argument."""
+    given = list(value) if isinstance(value, list | tuple) else [value]
+    if "" in given and param.default != "":
+        raise _wrong(param, context, "", "a text that is not empty")
+    converted = convert(context, value)
+    for each in converted if isinstance(converted, list | tuple) else [converted]:
+        if isinstance(each, float) and not math.isfinite(each):
+            limits = getattr(param, "type", param)
+            limits = _range(getattr(limits, "min", None), getattr(limits, "max", None))
+            raise _wrong(param, context, each, f"a number{limits}")
+        if isinstance(each, Path) or (isinstance(each, str) and param.metavar in _PLACES):
+            try:
+                os.stat(each)  # noqa: PTH116 - asked for its errors
+            except OSError as problem:
+                if problem.errno not in {errno.ENOENT, errno.ENOTDIR, errno.EACCES}:
+                    raise _wrong(param, context, each, f"a path ({problem.strerror})") from None
+    return converted
+
+
+def _wrong(param: Any, context: Any, found: object, expected: str) -> InputError:
+    from hdbridge.files.expectation import one_line
+
+    line = f"{_name(param)}: found {str(found)!r}; expected {expected}"
+    return InputError(one_line(f"{line}; see {getattr(context, 'command_path', 'hdbridge')} --help"))
 
 
 def asks_for_help(error: Any) -> bool:

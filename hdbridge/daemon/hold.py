@@ -9,7 +9,7 @@ import sys
 from contextlib import ExitStack
 
 from hdbridge.daemon.api.sockets import file_of, tcp_socket, unix_socket
-from hdbridge.daemon.keeper import Keeper
+from hdbridge.daemon.keeper import SIMULATED, Keeper, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Memory
@@ -57,7 +57,8 @@ def hold(
             machine, memory.fd, os.getpid(), simulation=simulation, force=force, socket=path,
             socket_file=file_of(path), page_token=token, log=log,
         )  # fmt: skip
-        return Keeper(start, memory, listeners, Notifier.of_environment()).run()
+        times = Times() if simulation is None else SIMULATED
+        return Keeper(start, memory, listeners, Notifier.of_environment(), times=times).run()
 
 
 def _tell_page(listener: socket.socket, token: str | None) -> None:

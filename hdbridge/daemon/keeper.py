@@ -67,6 +67,10 @@ class Times:
     """For the service to end after that."""
 
 
+SIMULATED: Final = Times(begin_s=600.0, stop_s=300.0, service_stop_s=120.0)
+"""With simulated drives a computer that is busy ends nothing."""
+
+
 class Keeper:
     """The two processes of one machine, from their start to their end."""
 

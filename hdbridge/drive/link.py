@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 import can
@@ -22,7 +23,8 @@ import can
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.drive.interfacelock import interface_lock
-from hdbridge.errors import BusError
+from hdbridge.errors import BusError, InputError
+from hdbridge.files.expectation import nearest
 
 _log = logging.getLogger(__name__)
 _GONE: Final = frozenset(
@@ -36,6 +38,9 @@ _PACKAGES: Final = {
     **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "pyserial")),
 }
 """What python-can does not install by itself: module and package."""
+_NETWORK: Final = Path("/sys/class/net")
+_ARPHRD_CAN: Final = 280
+"""Of linux/if_arp.h: the type of a CAN interface."""
 _PROCESS: Final = uuid.uuid4().hex[:12]
 _ERROR_FRAME_BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""
@@ -231,6 +236,29 @@ def _errno(error: BaseException | None) -> int | None:
     return None
 
 
+def check_interface(interface: str, where: str) -> None:
+    """InputError if python-can has no such interface; ``where`` is the key or the option that names it."""
+    if interface not in can.VALID_INTERFACES:
+        known = sorted(can.VALID_INTERFACES)
+        close = nearest(interface, known)
+        hint = f"; did you mean '{close}'?" if close else ""
+        raise InputError(
+            f"{where}: python-can has no interface {interface!r}; expected one of {', '.join(known)}{hint}"
+        )
+
+
+def absent_interface(settings: BusSettings) -> str | None:
+    """In words, that this computer has no network interface of a SocketCAN channel's name; None if it has."""
+    channel = str(settings.channel)
+    if settings.interface != "socketcan" or (_NETWORK / channel).exists():
+        return None
+    types = ((each.name, each / "type") for each in sorted(_NETWORK.glob("*")))
+    there = [name for name, kind in types if kind.exists() and int(kind.read_text()) == _ARPHRD_CAN]
+    close = nearest(channel, there)
+    hint = f"; did you mean '{close}'?" if close else f"; its CAN interfaces: {', '.join(there) or 'none'}"
+    return f"this computer has no network interface {channel!r}{hint}"
+
+
 def _lacking(interface: str) -> str | None:
     """The package to install for an interface of python-can; None where it is there, or none is known of."""
     module, package = _PACKAGES.get(interface, ("", ""))
@@ -253,6 +281,7 @@ def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.Bus
 @contextmanager
 def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
     name = f"{settings.interface}:{settings.channel}"
+    check_interface(settings.interface, f"{name}: bus.interface")
     options: dict[str, Any] = dict(settings.options)
     if settings.bitrate_bps is not None:
         options["bitrate"] = settings.bitrate_bps
@@ -262,14 +291,12 @@ def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
     try:
         bus = can.Bus(interface=settings.interface, channel=settings.channel, ignore_config=True, **options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-        if settings.interface not in can.VALID_INTERFACES:
-            known = ", ".join(sorted(can.VALID_INTERFACES))
-            what = f"python-can has no interface {settings.interface!r}; bus.interface may be one of {known}"
-        elif (package := _lacking(settings.interface)) is not None:
+        if (package := _lacking(settings.interface)) is not None:
             what = f"python-can needs the package {package} for it: python -m pip install {package}"
         else:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            what = f"cannot open it: {reason}; check bus.channel and that the interface is up"
+            what = f"cannot open it: {reason}; "
+            what += absent_interface(settings) or "check bus.channel and that the interface is up"
         raise BusError(f"{name}: {what}") from error
     if bus.channel_info == "unknown":  # python-can's word for it; messages need a name
         bus.channel_info = name

@@ -6,7 +6,6 @@ too long ends with a quick stop.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -37,6 +36,7 @@ FAILED: Final = 0x2000
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
 """Readings of the statusword, `POLL_S` apart at least, after which bits from before a command have gone."""
+_OFFSET_COUNTS: Final = 2**31
 _TIME_MARGIN: Final = 1.5
 _TIME_EXTRA_S: Final = 2.0
 
@@ -124,12 +124,16 @@ class Homing:
     ) -> Homing:
         """`InputError` when a value is not finite or beyond the axis's limits."""
         limits = axis.limits
-        if not math.isfinite(offset_deg):
-            raise InputError(f"a homing offset of {offset_deg!r} deg is not a finite angle; nothing was sent")
+        highest_deg = abs(axis.motor_encoder.degrees(_OFFSET_COUNTS) / axis.gear.ratio)
+        if not abs(offset_deg) < highest_deg:  # false for NaN, too
+            raise InputError(
+                f"offset_deg: found {offset_deg!r}; expected an angle within {highest_deg:.4g} deg, which "
+                "607Ch can hold; nothing was sent"
+            )
         return cls(
             method,
-            _at_most(switch_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
-            _at_most(zero_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s"),
+            _at_most(switch_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s", "switch_"),
+            _at_most(zero_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s", "zero_"),
             _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
             offset_deg,
             timeout_s,
@@ -251,11 +255,12 @@ def _dropped_out(statusword: int) -> bool:
     return decode(statusword) not in (State.OPERATION_ENABLED, State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
-def _at_most(value: float | None, limit: float, name: str) -> float:
+def _at_most(value: float | None, limit: float, name: str, which: str = "") -> float:
     if value is None:
         return limit
     if not 0.0 < value <= limit:
         raise InputError(
-            f"{value!r} is not a {name} above 0 and at most limits.{name}, {limit:g}; nothing was sent"
+            f"{which}{name}: found {value!r}; expected above 0 and at most {limit:g} (limits.{name}); "
+            "nothing was sent"
         )
     return value

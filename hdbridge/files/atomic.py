@@ -10,10 +10,11 @@ import fcntl
 import itertools
 import os
 import re
+import shutil
 import stat
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hdbridge.errors import InputError, OutputError
@@ -148,6 +149,32 @@ def make_folder(path: Path | str) -> Path:
     except OSError as problem:
         raise InputError(f"{path}: cannot write into this folder: {problem.strerror}") from None
     return folder
+
+
+def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+    """A folder with these files, whole or not at all; their paths.
+
+    InputError if there is something already, or no folder can be made there; OutputError if the files cannot
+    be written, as on a full disk. Then nothing is left, and parents that were made for it are removed.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is there already; expected a new folder, nothing was written")
+    made = [each for each in folder.absolute().parents if not each.exists()]
+    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
+    try:
+        make_folder(aside)
+        for name, content in files.items():
+            write_atomically(aside / name, content)
+        aside.rename(folder)
+    except BaseException as problem:
+        shutil.rmtree(aside, ignore_errors=True)
+        for each in made:
+            with suppress(OSError):
+                each.rmdir()
+        if isinstance(problem, OSError):
+            raise OutputError(f"{folder}: cannot be written: {problem.strerror}") from None
+        raise
+    return [folder / name for name in files]
 
 
 def new_folder(path: Path) -> Path:

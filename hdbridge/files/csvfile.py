@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.expectation import nearest, one_line
+from hdbridge.files.regular import open_regular
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
@@ -98,7 +99,7 @@ def _wrong(text: str) -> InputError:
 def _content(path: Path) -> bytes:
     """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
     try:
-        with path.open("rb") as plain:
+        with open_regular(path) as plain:
             content = _bounded(plain)
     except FileNotFoundError:
         raise _wrong(f"{path}: no such file") from None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile
 
 TWIN_NAME: Final = "twin.yaml"
@@ -41,7 +42,10 @@ class Profile:
         ``base`` is the folder that a relative path starts from.
         """
         path = base / text
-        if not path.exists() and Path(text).name == text:
+        if not path.exists():
             path = bundled_profile(text)
-        folder, axis = (path, path / "axis.yaml") if path.is_dir() else (path.parent, path)
-        return cls(axis, folder / "model.yaml", folder / "truth.yaml")
+        if not path.is_dir():
+            return cls(path, path.parent / "model.yaml", path.parent / "truth.yaml")
+        if not (path / "axis.yaml").exists():
+            raise InputError(f"{path}: there is no axis.yaml in this folder; expected the folder of an axis")
+        return cls(path / "axis.yaml", path / "model.yaml", path / "truth.yaml")

@@ -21,6 +21,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.expectation import expected_words, field_at, field_names, nearest
+from hdbridge.files.regular import open_regular
 from hdbridge.files.yamlnodes import FLOAT, INTEGER, OCTAL, FileError, Node, compose
 
 __all__ = [
@@ -43,7 +44,7 @@ def read_yaml(path: Path | str) -> Document:
     """The file as plain data with positions, not yet validated."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             content = file.read(MAXIMUM_BYTES + 1)
     except FileNotFoundError:
         raise FileError(f"{path}: no such file") from None

@@ -27,6 +27,15 @@ class MotionLimits:
     acceleration_deg_s2: float
     jerk_deg_s3: float
 
+    def check(self, load_deg: float) -> None:
+        """InputError for a load angle outside the limits."""
+        if not self.position_min_deg <= load_deg <= self.position_max_deg:
+            raise InputError(
+                f"this would move the load to {load_deg:.6g} deg; the axis file allows "
+                f"{self.position_min_deg:g} to {self.position_max_deg:g} (limits): nothing was moved; choose "
+                "fewer or smaller steps, or another start"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
@@ -100,6 +109,7 @@ class MoveTo:
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Time-optimal within the limits (ruckig)."""
+        limits.check(self.load_deg)
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
         # Ruckig finds nothing where limits and distance meet in a point, as 200 deg/s2, 4000 deg/s3 and

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hdbridge.errors import InputError
 from hdbridge.procedures.moves import AxisView, Move, Path, Procedure, Sample
 
 
@@ -25,18 +24,12 @@ def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.
 
     Every leg's path is made as the bench will make it, so what is refused here never reaches the axis.
     """
-    limits = axis.limits
     duration, legs = 0.0, 0
     lowest = highest = start_deg
     for _, path in legs_of(procedure, axis, start_deg):
         lowest, highest = min(lowest, path.lowest_deg), max(highest, path.highest_deg)
         for edge in (path.lowest_deg, path.highest_deg):
-            if not limits.position_min_deg <= edge <= limits.position_max_deg:
-                raise InputError(
-                    f"this would move the load to {edge:.6g} deg; the axis file "
-                    f"allows {limits.position_min_deg:g} to {limits.position_max_deg:g} (limits): "
-                    "nothing was moved; choose fewer or smaller steps, or another start"
-                )
+            axis.limits.check(edge)
         duration += path.duration_s
         legs += 1
     return Rehearsal(duration, lowest, highest, legs)

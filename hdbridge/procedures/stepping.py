@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from hdbridge.errors import InputError
 from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -51,6 +52,11 @@ class Stepping:
     precondition_deg: float = 2.0
     """Load degrees; more than any hysteresis is wide."""
     settle: Settle = Settle()
+
+    def __post_init__(self) -> None:
+        """InputError for steps of no size."""
+        if self.step_deg == 0.0:
+            raise InputError("step_deg: found 0; expected the size of a step, negative for steps down first")
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
         """Each step a jerk-limited move and a settle."""

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -88,16 +87,3 @@ def calibrated(calibrated_once, tmp_path):
     cell = Cell(tmp_path / "cell")
     shutil.copytree(calibrated_once[0].folder, cell.folder, dirs_exist_ok=True)
     return cell
-
-
-def until(condition, timeout_s: float = 60.0):
-    """Wait for something that another process does."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about"
-        time.sleep(0.01)
-
-
-@pytest.fixture
-def wait_until():
-    return until

@@ -3,6 +3,7 @@
 import signal
 
 import yaml
+from support.patience import until
 
 from hdbridge.records.recording import Recording
 
@@ -18,14 +19,12 @@ validation: {count: 4, cycles: 0}
 """
 
 
-def begun(cell, wait_until, *arguments):
+def begun(cell, *arguments):
     """A calibration whose second task is done: it is in the third, a long one."""
     (cell.folder / "long.yaml").write_text(LONG)
     process = cell.start("calibrate", "axis", "--simulate", "--plan", "long.yaml", "--out", "rec", *arguments)
     about = cell.folder / "rec" / "recording.yaml"
-    wait_until(
-        lambda: process.poll() is not None or (about.exists() and "02-sines.csv.gz" in about.read_text())
-    )
+    until(lambda: process.poll() is not None or (about.exists() and "02-sines.csv.gz" in about.read_text()))
     return process
 
 
@@ -34,10 +33,10 @@ def tasks(cell):
     return {(each["task"], each["complete"], each["session"]) for each in notes["tasks"]}
 
 
-def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell, wait_until):
-    process = begun(cell, wait_until)
+def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell):
+    process = begun(cell)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate()
     assert process.returncode == 130, err
     assert "--resume rec" in err
     assert "Traceback" not in err
@@ -58,10 +57,10 @@ def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell, wait_until):
     assert result["stepping"]["before"]["pooled"]["three_sigma_arcsec"] > 80
 
 
-def test_a_kill_keeps_every_task_that_was_done(cell, wait_until):
-    process = begun(cell, wait_until)
+def test_a_kill_keeps_every_task_that_was_done(cell):
+    process = begun(cell)
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate()
     assert tasks(cell) == {("01-standstill", True, 1), ("02-sines", True, 1)}
     kept = Recording.load(cell.folder / "rec")
     assert kept.segments[-1].kind == "sine"

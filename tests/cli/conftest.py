@@ -29,7 +29,6 @@ def process(tmp_path):
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=120,
             check=False,
         )
 
@@ -50,7 +49,6 @@ def unread(tmp_path):
                 stdout=broken,
                 stderr=subprocess.PIPE,
                 text=True,
-                timeout=120,
                 check=False,
             )
         assert done.returncode == 0, done.stderr

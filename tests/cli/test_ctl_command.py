@@ -5,11 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from support.api import served
 from support.fake_bridge import FakeBridge
+from support.patience import PATIENCE_S, until
 
 from hdbridge import SafetyStop
 from hdbridge.client import messages
@@ -125,7 +125,7 @@ def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machin
     ("line", "status", "words"),
     [
         ("move joint-1 181", 2, "-180 to 180"),
-        ("move joint-1 nan", 2, "target_deg"),
+        ("move joint-1 nan", 2, "ANGLE: found 'nan'; expected a number"),
         ("move joint-2 1", 7, "enable it first"),
         ("move joint-9 1", 2, "joint-1, joint-2"),
         ("move joint-1 1 2 --no-wait", 2, "queue"),
@@ -210,18 +210,15 @@ def test_an_object_is_read(ctl):
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_axis_that_moves(machine, place, number):
-    machine.axes["joint-1"].moving_s = 60.0
+    machine.axes["joint-1"].moving_s = 2 * PATIENCE_S
     command = [sys.executable, "-m", "hdbridge", "ctl", "move", "joint-1", "30"]
     environment = {**os.environ, "HDBRIDGE_SOCKET": str(place.socket)}
     with subprocess.Popen(
         command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as moving:
-        until = time.monotonic() + 60
-        while not machine.moved:
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        until(lambda: machine.moved)
         moving.send_signal(number)
-        _, said = moving.communicate(timeout=60)
+        _, said = moving.communicate()
     assert moving.returncode == 130
     assert "axis 'joint-1' is stopped; it stays enabled" in said
     assert "Traceback" not in said

@@ -33,7 +33,7 @@ def test_doctor_names_the_line_to_change(hdbridge, profile, tmp_path):
 def test_doctor_of_a_broken_file_says_where(hdbridge, profile):
     folder = profile("cycle_ms: 4", "cycle_ms: four")
     done = hdbridge("doctor", folder, "--simulate")
-    assert done.returncode == 4
+    assert done.returncode == 2
     assert f"{folder}/axis.yaml:" in done.stdout
     assert "drive.cycle_ms" in done.stdout
     assert "not possible  the bus" in done.stdout
@@ -48,7 +48,7 @@ def test_doctor_without_motion(hdbridge):
 
 def test_doctor_on_a_real_bus_without_a_drive(hdbridge):
     done = hdbridge("doctor", "article")
-    assert done.returncode == 4
+    assert done.returncode == 2
     assert "bus.interface: found virtual" in done.stdout
 
 

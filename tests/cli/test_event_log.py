@@ -75,7 +75,6 @@ def test_completion_knows_commands_and_their_options():
             env={**os.environ, **asked},
             capture_output=True,
             text=True,
-            timeout=120,
             check=False,
         ).stdout.split()
 

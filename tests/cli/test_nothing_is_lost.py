@@ -33,7 +33,7 @@ def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, nu
     process = started(tmp_path, *LONG, "--record", "kept")
     time.sleep(1.0)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate()
     assert process.returncode == 130, errors
     (kept,) = (tmp_path / "kept").glob("*-stopped.csv.gz")
     scheme = kept.name.removeprefix("stepping-").removesuffix("-stopped.csv.gz")
@@ -46,7 +46,7 @@ def test_without_a_folder_the_loss_is_said(tmp_path):
     process = started(tmp_path, *LONG)
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate()
     assert process.returncode == 130
     assert "not kept: it takes --record FOLDER" in errors
 
@@ -59,7 +59,7 @@ def test_what_the_schemes_before_have_given_is_printed_and_written(tmp_path):
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    printed, errors = process.communicate(timeout=60)
+    printed, errors = process.communicate()
     assert process.returncode == 130, errors
     assert "│ none" in printed
     assert "│ both" not in printed
@@ -77,7 +77,7 @@ def test_what_nohup_ignores_stays_ignored(tmp_path):
     while "booted" not in process.stderr.readline():
         pass
     process.send_signal(signal.SIGHUP)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate()
     assert process.returncode == 0, errors
 
 

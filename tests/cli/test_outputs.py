@@ -121,7 +121,7 @@ def test_a_pipe_is_written_straight_through(hdbridge, tmp_path):
     reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
     reader.start()
     done = hdbridge("check", "article", "--json", "pipe")
-    reader.join(60)
+    reader.join()
     assert done.returncode == 0, done.stderr
     assert json.loads(read[0])["axis"] == "article"
     assert stat.S_ISFIFO(pipe.stat().st_mode)

@@ -111,7 +111,7 @@ def test_a_calibration_that_is_interrupted_is_resumed(tmp_path):
     while not recording.exists() and process.poll() is None:
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=240)
+    _, err = process.communicate()
     assert process.returncode == 130, err
     assert "resume: hdbridge setup arm" in err
     again = run_here(tmp_path, *command)
@@ -161,7 +161,7 @@ def test_nothing_moves_without_a_yes(tmp_path):
         cwd=tmp_path, stdin=child, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     os.write(parent, b"n\n")
-    out, err = process.communicate(timeout=240)
+    out, err = process.communicate()
     os.close(parent)
     os.close(child)
     assert process.returncode == 130

@@ -6,14 +6,14 @@ Nothing here asserts how long anything takes: events are waited for, generously.
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
 import can
 import canopen
 import pytest
+from support.patience import PATIENCE_S, until
 
 from hdbridge.clock import MonotonicClock
 from hdbridge.device.node import DriveNode
@@ -21,15 +21,6 @@ from hdbridge.device.run import run
 from hdbridge.errors import BusError
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
-PATIENCE_S = 20.0
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for it; a test that waits in vain fails here."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "it did not come about"
-        time.sleep(0.005)
 
 
 @pytest.fixture

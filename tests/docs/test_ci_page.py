@@ -22,7 +22,7 @@ NO_CANOPEN = "--ignore=test_with_canopen.py"
 def run(pytester: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     ci_page.write(pytester.path)
     options = [word for each in LEAN for word in each.split()]
-    return pytester.runpytest_subprocess("-q", *options, *arguments, timeout=120)
+    return pytester.runpytest_subprocess("-q", *options, *arguments)
 
 
 def test_the_example_in_lockstep(pytester):

@@ -191,7 +191,7 @@ def test_homing_that_fails(drive: Drive, tiny: Any) -> None:
     with pytest.raises(DriveError, match="homing by method 17 failed"):
         drive.home(17, 2.0, 1.0)
     assert tiny.state == 0x07
-    with pytest.raises(InputError, match="finite"):
+    with pytest.raises(InputError, match="607Ch can hold"):
         drive.home(17, 2.0, 1.0, offset_deg=math.nan)
 
 

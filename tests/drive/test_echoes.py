@@ -125,11 +125,10 @@ def test_master_and_simulated_drive_in_two_processes(multicast: BusConfig, tmp_p
                 [*program, "step", str(folder), "--count", "2", "--scheme", "both"],
                 capture_output=True,
                 text=True,
-                timeout=100,
                 check=False,
             )
         finally:
             drive.send_signal(signal.SIGINT)
-            drive.wait(20)
+            drive.wait()
     assert done.returncode == 0, done.stderr
     assert "quantisation floor" in done.stdout

@@ -15,7 +15,7 @@ from hdbridge.axis import BusConfig
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import MonotonicClock
 from hdbridge.drive import Link, TransmitBufferFull, open_bus
-from hdbridge.errors import BusError
+from hdbridge.errors import BusError, InputError
 
 
 def message(can_id: int = 0x181, data: bytes = b"\x01", **flags: bool) -> can.Message:
@@ -160,7 +160,7 @@ def test_a_link_to_a_closed_bus_says_so() -> None:
 
 def test_opening_an_unknown_interface() -> None:
     with (
-        pytest.raises(BusError, match=r"no interface 'nonsense'.*socketcan") as caught,
+        pytest.raises(InputError, match=r"no interface 'nonsense'.*socketcan") as caught,
         open_bus(BusConfig(interface="nonsense", channel="x")),
     ):
         pass

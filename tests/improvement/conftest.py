@@ -3,7 +3,6 @@
 import json
 import random
 import shutil
-import time
 from pathlib import Path
 
 import pytest
@@ -129,16 +128,3 @@ def improved_once(tmp_path_factory):
 def improved(improved_once, tmp_path):
     """A cell with a recording, `rec/`, and a pending model."""
     return improved_once[0].copy(tmp_path / "copy")
-
-
-@pytest.fixture
-def wait_until():
-    """Wait for something that another process does."""
-
-    def until(condition, timeout_s=60.0):
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < deadline, "it did not come about"
-            time.sleep(0.01)
-
-    return until

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 import yaml
+from support.patience import until
 
 from hdbridge.calibration.validation import Floor, Stepped, Validation
 from hdbridge.improvement import Trial
@@ -21,7 +22,7 @@ def refused(err, *texts):
         assert text in lines[0]
 
 
-def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell, wait_until):
+def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell):
     cell.hide("motor_order")
     # In two parts of half as many samples there is room for a drift of the zero between them.
     axis = cell.axis / "axis.yaml"
@@ -36,9 +37,9 @@ def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell, wait_until):
         text=True,
     )
     about = cell.folder / "rec" / "recording.yaml"
-    wait_until(lambda: process.poll() is not None or (about.exists() and "02-sweep" in about.read_text()))
+    until(lambda: process.poll() is not None or (about.exists() and "02-sweep" in about.read_text()))
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate()
     assert process.returncode == 130, err
     assert "--resume rec" in err
     assert "Traceback" not in err

@@ -11,7 +11,7 @@ from hdbridge import errors
 
 def python(program: str) -> str:
     return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout.strip()
 
 

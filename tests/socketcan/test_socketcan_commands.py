@@ -23,7 +23,6 @@ def test_step_masters_the_simulated_drive_in_another_process(interface, profile,
                     [*step, "--count", "4", "--scheme", "none", "--scheme", "both"],
                     capture_output=True,
                     text=True,
-                    timeout=120,
                     check=False,
                 )
             finally:

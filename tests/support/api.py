@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
 from support.fake_bridge import FakeBridge
+from support.patience import until
 
 TOKEN = "a-token-that-nobody-guesses"
 
@@ -32,13 +32,19 @@ class Served:
     # Without TLS: to load the system's certificates takes longer than most of these tests.
     def over_socket(self, **headers: str) -> httpx.Client:
         transport = httpx.HTTPTransport(uds=str(self.socket), verify=False)
-        return httpx.Client(transport=transport, base_url="http://hdbridge/api/v1", headers=headers)
+        return httpx.Client(
+            transport=transport, base_url="http://hdbridge/api/v1", headers=headers, timeout=None
+        )
 
     def over_tcp(self, token: str | None = TOKEN, **headers: str) -> httpx.Client:
         if token is not None:
             headers["Authorization"] = f"Bearer {token}"
         return httpx.Client(
-            base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=headers, trust_env=False, verify=False
+            base_url=f"http://127.0.0.1:{self.port}/api/v1",
+            headers=headers,
+            trust_env=False,
+            verify=False,
+            timeout=None,
         )
 
 
@@ -52,13 +58,14 @@ def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
     thread = threading.Thread(target=lambda: asyncio.run(server.run()), daemon=True)
     thread.start()
     try:
-        until = time.monotonic() + 60
-        while not server.started:
+
+        def begun() -> bool:
             assert thread.is_alive(), "the server has ended"
-            assert time.monotonic() < until, "the server has not begun"
-            time.sleep(0.005)
+            return server.started
+
+        until(begun, lambda: "the server has not begun")
         yield Served(bridge, path, port, server)
     finally:
         server.stop()
-        thread.join(30)
+        thread.join()
         assert not thread.is_alive(), "the server has not ended"

@@ -20,9 +20,9 @@ from urllib.request import urlopen
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from support.patience import until
+
 FINDER = Path(__file__).parents[2] / "tools" / "chromium.sh"
-PATIENCE_S = 30.0
-"""For what a page does: far more than it needs, on a machine that stalls."""
 
 DROPPED = (
     "Inspected target navigated or closed",
@@ -55,7 +55,7 @@ class Page:
         self._asked += 1
         self._line.send(json.dumps({"id": self._asked, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._line.recv(timeout=PATIENCE_S))
+            message = json.loads(self._line.recv())
             if message.get("id") == self._asked:
                 if message.get("error", {}).get("message") in DROPPED:
                     raise Navigated(message["error"]["message"])
@@ -108,11 +108,10 @@ class Page:
         The page may be on its way to another document meanwhile: Chromium then drops what it was asked,
         which answers nothing, so it is asked again.
         """
-        end = time.monotonic() + PATIENCE_S
-        while not (value := self._settled(condition)):
-            assert time.monotonic() < end, f"never became true: {condition}; complaints: {self.complaints}"
-            time.sleep(0.05)
-        return value
+        return until(
+            lambda: self._settled(condition),
+            lambda: f"never became true: {condition}; complaints: {self.complaints}",
+        )
 
     def text(self, selector: str) -> str:
         """What stands in an element."""
@@ -159,14 +158,15 @@ def browser() -> Iterator[Page]:
 
 def _address(home: Path, process: subprocess.Popen[bytes]) -> str:
     """The WebSocket of the first page: Chromium writes its port into its folder once it listens."""
-    end = time.monotonic() + PATIENCE_S
     port_file = home / "DevToolsActivePort"
-    while time.monotonic() < end:
+
+    def opened() -> str | None:
         assert process.poll() is None, f"Chromium ended with status {process.returncode}"
         if port_file.exists() and (found := re.match(r"(\d+)\n", port_file.read_text())):
-            with urlopen(f"http://127.0.0.1:{found[1]}/json", timeout=PATIENCE_S) as answer:
+            with urlopen(f"http://127.0.0.1:{found[1]}/json", timeout=None) as answer:
                 pages = [each for each in json.load(answer) if each["type"] == "page"]
             if pages:
                 return str(pages[0]["webSocketDebuggerUrl"])
-        time.sleep(0.05)
-    raise AssertionError("Chromium did not open its debugging port")
+        return None
+
+    return str(until(opened, lambda: "Chromium did not open its debugging port"))

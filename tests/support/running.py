@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +16,7 @@ from typing import Any
 
 import httpx
 
-PATIENCE_S = 120.0
-"""For what takes two seconds on a machine that has nothing else to do."""
+from tests.support import patience
 
 
 class Daemon:
@@ -49,7 +47,7 @@ class Daemon:
         self.client = httpx.Client(
             transport=httpx.HTTPTransport(uds=str(self.socket), verify=False),  # loads no certificates
             base_url="http://hdbridge/api/v1",
-            timeout=60.0,
+            timeout=None,
         )
         self._lease: str | None = None
 
@@ -74,13 +72,13 @@ class Daemon:
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
         """Wait for something that is asked for again and again; what it gave."""
-        end, pause_s = time.monotonic() + PATIENCE_S, 0.05
-        while not (found := met()):
-            assert time.monotonic() < end, f"{what}: {self._last_words()}"
-            assert self.process.poll() is None, f"{what}: it ended: {self._last_words()}"
-            time.sleep(pause_s)  # a request takes more of a processor than the daemon does meanwhile
-            pause_s = min(1.2 * pause_s, 0.25)
-        return found
+
+        def still() -> Any:
+            if not (found := met()):
+                assert self.process.poll() is None, f"{what}: it ended: {self._last_words()}"
+            return found
+
+        return patience.until(still, lambda: f"{what}: {self._last_words()}")
 
     def _last_words(self) -> str:
         told = [each for each in self.events if each["event"] != "request"][-20:]
@@ -165,7 +163,7 @@ class Daemon:
 
     def ended(self) -> int:
         """Wait for the end of the keeper; its exit status."""
-        status = self.process.wait(PATIENCE_S)
+        status = self.process.wait()
         self._reader.join()
         return status
 
@@ -174,7 +172,7 @@ class Daemon:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
-                self.process.wait(40.0)
+                self.process.wait(patience.PATIENCE_S)
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()

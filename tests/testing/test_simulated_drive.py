@@ -238,5 +238,5 @@ def test_a_bus_of_the_machine_is_for_one_drive_after_the_other():
         thread.start()
         time.sleep(0.2)
         order.append("first")
-    thread.join(30.0)
+    thread.join()
     assert order == ["first", "second"]

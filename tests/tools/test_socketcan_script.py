@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not IS_COMPLETE, reason="user-mode-linux is not 
 def run_with(tmp_path: Path):
     """Runs a command with programs of one's own (name: shell text) in front of the machine's."""
 
-    def run(**programs: str) -> subprocess.CompletedProcess[str]:
+    def run(*options: str, **programs: str) -> subprocess.CompletedProcess[str]:
         for name, text in programs.items():
             path = tmp_path / name.replace("_", ".")
             path.write_text(f"#!/bin/sh\n{text}\n")
@@ -30,7 +30,7 @@ def run_with(tmp_path: Path):
         locks = {"SOCKETCAN_LOCKS": str(tmp_path / "locks")}  # others on this machine may run it
         environment = dict(os.environ, PATH=f"{tmp_path}:{os.environ['PATH']}") | locks
         return subprocess.run(
-            [SCRIPT, "--uml", "true"], env=environment, capture_output=True, text=True, check=False
+            [SCRIPT, "--uml", *options, "true"], env=environment, capture_output=True, text=True, check=False
         )
 
     return run
@@ -55,6 +55,15 @@ def test_a_compiler_that_fails_is_said_and_the_kernel_tried_as_it_is(run_with) -
     assert done.returncode == UNAVAILABLE
     assert "no such header" in done.stderr
     assert "preload=\n" in done.stderr
+
+
+@pytest.mark.parametrize(("options", "policy"), [((), "SCHED_OTHER"), (("--realtime",), "SCHED_RR")])
+def test_real_time_priority_is_given_on_request_only(run_with, options, policy) -> None:
+    """Two kernels at real-time priority starve everything else on a machine with two processors."""
+    if options and subprocess.run(["chrt", "--rr", "1", "true"], check=False, capture_output=True).returncode:
+        pytest.skip("real-time priority is not permitted here")
+    done = run_with(*options, linux_uml="chrt -p $$; exit 1")
+    assert f"scheduling policy: {policy}" in done.stderr
 
 
 def test_two_at_once_have_a_processor_each(run_with, tmp_path: Path) -> None:

@@ -61,4 +61,4 @@ def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) 
         assert process.stdout.readline() == "replayed\n"
         process.kill()
         # The workers have its standard output too: it ends when the last of them has ended.
-        process.communicate(timeout=30.0)
+        process.communicate()

@@ -18,7 +18,7 @@ from hdbridge.cli.ctl.common import (
     stopping,
     tell,
 )
-from hdbridge.cli.options import JsonOption
+from hdbridge.cli.options import JsonOption, note_clamped
 from hdbridge.errors import InputError
 
 VelocityOption = Annotated[
@@ -131,7 +131,9 @@ def move(
     if not wait and len(angles_deg) > 1:
         raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
     with moving(at, axis, force=force) as moved:
-        before_deg = moved.state().load_target_deg or 0.0
+        state = moved.state()
+        note_clamped(state.limits, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2)
+        before_deg = state.load_target_deg or 0.0
         for given_deg in angles_deg:
             before_deg = before_deg + given_deg if relative else given_deg
             state = moved.move(
@@ -157,6 +159,7 @@ def jog(
 ) -> None:
     """Turn an axis at a speed for a time, then brake to rest. It stops, too, when this command is killed."""
     with moving(at, axis, force=force) as moved:
+        note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)
         tell(moved.rest(), json_file)
 
@@ -192,4 +195,5 @@ def queue(
     limits = {"velocity_deg_s": velocity_deg_s, "acceleration_deg_s2": acceleration_deg_s2}
     points = [given(QueueItem, target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
     with connected(at) as client, client.lease(force=force), stopped_by_signals(client, axis):
+        note_clamped(client.axis(axis).state().limits, **limits)
         tell(client.axis(axis).queue(points), json_file)

@@ -26,6 +26,7 @@ from hdbridge.daemon.recorder.about import About
 from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
+from hdbridge.files.regular import open_regular
 
 T = TypeVar("T")
 SUFFIX: Final = ".mcap"
@@ -82,12 +83,16 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir():
-            found.append(path)
-        elif inside := _inside(path):
+        if path.is_dir():
+            inside = _inside(path)
+            if not inside:
+                raise InputError(f"{path}: no {SUFFIX} file in this folder; expected flight recordings")
             found += sorted(inside, key=lambda each: each.name)
+        elif path.name.endswith((SUFFIX, SUFFIX + PART)):
+            found.append(path)
         else:
-            raise InputError(f"{path}: no {SUFFIX} file in this folder; expected flight recordings")
+            problem = "not a flight recording" if path.exists() else "no such file or folder"
+            raise InputError(f"{path}: {problem}; expected a file that ends in {SUFFIX}, or a folder of them")
     return found
 
 
@@ -228,7 +233,7 @@ def _opened(path: Path) -> tuple[Path, BinaryIO]:
     """The recording under its present name, opened."""
     for place in _places(path):
         try:
-            return place, place.open("rb")
+            return place, open_regular(place)
         except FileNotFoundError:
             continue
         except OSError as problem:

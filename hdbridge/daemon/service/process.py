@@ -29,7 +29,7 @@ from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.recording import Recording
-from hdbridge.daemon.service.timing import RealTiming
+from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
 from hdbridge.daemon.service.watching import Watching
 from hdbridge.daemon.start import Start, begin_child
 from hdbridge.errors import HdbridgeError
@@ -65,10 +65,12 @@ async def serve(start: Start, memory: Memory) -> None:
     told = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
     async with AsyncExitStack() as stack:
-        timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS)
+        simulated = start.simulation is not None
+        clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
+        timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, simulated=start.simulation is not None,
+            machine, memory, timing, simulated=simulated,
             recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
         )  # fmt: skip
         metrics = Metrics()

@@ -18,6 +18,7 @@ import httpx
 import pytest
 from support.api import TOKEN, Served
 from support.fake_bridge import FakeBridge
+from support.patience import until
 
 from hdbridge import Client, DaemonError
 from hdbridge.daemon.api.policy import Policy
@@ -96,14 +97,12 @@ def nginx(daemon_port: int, certificate: Path, folder: Path) -> Iterator[int]:
 
 
 def until_listening(port: int, process: subprocess.Popen[bytes]) -> None:
-    deadline = time.monotonic() + 60
-    while True:
+    def listening() -> bool:
         assert process.poll() is None, "nginx has ended"
-        assert time.monotonic() < deadline, "nginx does not listen"
         with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.02)
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    until(listening, lambda: "nginx does not listen")
 
 
 @contextmanager

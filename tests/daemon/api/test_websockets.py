@@ -3,11 +3,11 @@
 import json
 import logging
 import socket
-import time
 from contextlib import ExitStack
 
 import pytest
 from support.api import TOKEN
+from support.patience import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect, unix_connect
 
@@ -24,25 +24,17 @@ def stream(api, axis="joint-1"):
 
 
 def batch(connection) -> messages.Samples:
-    return messages.Samples.model_validate_json(connection.recv(timeout=30))
+    return messages.Samples.model_validate_json(connection.recv())
 
 
 def told(connection) -> messages.StreamAnswer:
-    return messages.StreamAnswer.model_validate_json(connection.recv(timeout=30))
+    return messages.StreamAnswer.model_validate_json(connection.recv())
 
 
 def read_on(connection) -> None:
     """Until it is closed."""
     while True:
-        connection.recv(timeout=30)
-
-
-def until(condition) -> None:
-    for _ in range(3000):
-        if condition():
-            return
-        time.sleep(0.01)
-    raise AssertionError("it did not come about")
+        connection.recv()
 
 
 def test_samples_come_in_columns_and_what_is_not_a_number_is_null(api):
@@ -204,7 +196,7 @@ def test_points_of_a_stream_are_taken_and_answered(api, lease):
         connection.send(points(0.3, end=True))
         assert told(connection).accepted == 1
         with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(timeout=30)
+            connection.recv()
     assert closed.value.rcvd.code == 1000
     (given,) = api.bridge.streams
     assert [each.position_deg for each in given.points] == [0.0, 0.1, 0.2, 0.3]
@@ -223,7 +215,7 @@ def test_nobody_streams_without_the_lease(api, lease, first):
         assert answer.accepted == 0
         assert answer.problem
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=30)
+            connection.recv()
     assert api.bridge.streams == []
     assert api.bridge.moved == []
 
@@ -251,7 +243,7 @@ def test_a_wrong_point_ends_the_stream_and_says_why(api, lease, wrong):
         connection.send(wrong)
         assert told(connection).problem
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=30)
+            connection.recv()
     (given,) = api.bridge.streams
     until(lambda: given.ended)
     assert given.points == []

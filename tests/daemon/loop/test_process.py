@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
+from support.patience import until
 
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory
@@ -25,17 +26,18 @@ class Running:
         self._events = memory.event_reader()
         self.events: list[Event] = []
 
-    def until(self, done: Callable[[], bool], timeout_s: float = 60.0) -> None:
-        """Wait; generously, since the machine may have other things to do."""
-        end_s = time.monotonic() + timeout_s
-        while not done():
-            assert time.monotonic() < end_s, self.events
-            assert self.process.poll() is None, self.process.returncode
-            time.sleep(0.01)
-            self.events += self._events.read()[0]
+    def until(self, done: Callable[[], bool]) -> None:
+        """Wait; the events read so far are those before ``done`` is asked."""
 
-    def ended(self, timeout_s: float = 60.0) -> int:
-        status = self.process.wait(timeout_s)
+        def still() -> bool:
+            self.events += self._events.read()[0]
+            assert done() or self.process.poll() is None, self.process.returncode
+            return done()
+
+        until(still, lambda: self.events)
+
+    def ended(self) -> int:
+        status = self.process.wait()
         self.events += self._events.read()[0]
         return status
 
@@ -73,7 +75,7 @@ def test_it_turns_tells_who_it_is_and_answers(simulated: Running) -> None:
     reader = simulated.memory.reader()
     simulated.until(lambda: status.loop_count > 50)
     assert status.loop_pid == simulated.process.pid
-    assert 0 < time.monotonic_ns() - status.loop_time_ns < 60e9
+    assert 0 < status.loop_time_ns <= time.monotonic_ns()
     samples, _ = reader.read()
     assert (samples["time_ns"][1:] > samples["time_ns"][:-1]).all()
     id_ = simulated.memory.commands.post(CommandKind.ENABLE, 0)

@@ -2,13 +2,13 @@
 
 import json
 import math
-import time
 from urllib.parse import urlsplit
 
 import pytest
 from support.api import TOKEN, served
-from support.browser import PATIENCE_S, browser
+from support.browser import browser
 from support.fake_bridge import FakeBridge
+from support.patience import until
 
 from hdbridge.client.messages import Event, EventKind
 from hdbridge.daemon.page import page_file, page_files
@@ -53,11 +53,7 @@ def asked(bridge, what):
 
 def eventually(what):
     """The page asks in its own time."""
-    end = time.monotonic() + PATIENCE_S
-    while not (found := what()):
-        assert time.monotonic() < end, "it was never asked"
-        time.sleep(0.02)
-    return found
+    return until(what, lambda: "it was never asked")
 
 
 def take_control(page):

@@ -9,14 +9,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from support.patience import until
 
 PROGRAM = Path(__file__).with_name("standin_keeper.py")
-PATIENCE_S = 120.0
 
 
 class Kept:
@@ -56,10 +55,7 @@ class Kept:
             self.events.append(json.loads(line))
 
     def until(self, met: Callable[[], bool], what: str) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while not met():
-            assert time.monotonic() < end, f"{what}: {self.said} {self.events}"
-            time.sleep(0.02)
+        until(met, lambda: f"{what}: {self.said} {self.events}")
 
     def pids(self, kind: str) -> list[int]:
         """Of all processes of a kind that have begun, oldest first."""
@@ -75,7 +71,7 @@ class Kept:
         self.until(lambda: line in self.told, line)
 
     def until_ended(self) -> int:
-        status = self.process.wait(PATIENCE_S)
+        status = self.process.wait()
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
             own.sendto(b"", self.manager.getsockname())
         for each in self._readers:

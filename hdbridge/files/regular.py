@@ -1,0 +1,26 @@
+"""Files that are read: regular ones, so that no command waits for a writer that never comes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from hdbridge.files.atomic import descriptor_of
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file for reading; OSError if it is a named pipe, a device or a folder.
+
+    Open files of this process (``/dev/stdin``, and ``/dev/fd/3`` of ``<(command)``) may be of any kind.
+    """
+    if descriptor_of(path) is None:
+        mode = os.stat(path).st_mode  # noqa: PTH116 - through links such as those in /proc
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+        if not stat.S_ISREG(mode):
+            kind = "a named pipe" if stat.S_ISFIFO(mode) else "a device or a socket"
+            raise OSError(errno.EINVAL, f"it is {kind}; expected a file", os.fspath(path))
+    return path.open("rb")

@@ -1,0 +1,268 @@
+"""Every command, every argument and option: what cannot be right is refused in one line, and nothing happens.
+
+The commands, their parameters and the ranges of those come from the command line itself.
+"""
+
+import inspect
+import os
+import resource
+import shutil
+import socket
+import subprocess
+import sys
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+
+import command_reference
+import pytest
+from support.command import run_here
+from typer.models import ArgumentInfo
+
+from hdbridge.cli import PANELS, load
+from hdbridge.files.outputs import Kind
+
+PROFILES = Path(__file__).parents[2] / "profiles"
+LONG = "x" * 300
+UNREADABLE = ("", "pipe", "nowhere/at/all", "circle", LONG, "junk", "empty", "/dev/zero", "/dev/null")
+UNWRITABLE = {
+    "file": ("", "circle", LONG, "junk", "axis", "nowhere/at/all", "junk/new"),
+    "folder": ("", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
+}
+RIGHT = {
+    "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "recording",
+    "OBJECT": "6064h", "VALUE": "1", "ANGLE": "1", "AXIS": "joint-1", "SPEED": "1", "JOB": "step-1",
+    "TEXT": "words", "VERSION": "1", "FILE.mcap": "flight.mcap", "FILE.mcap|FOLDER": "flight.mcap",
+    "SCHEME": "both", "KIND": "step", "BEFORE": "active", "AFTER": "active", "MODE": "on",
+    "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out",
+}  # fmt: skip
+"""What a command is given in addition to the wrong value; nothing is ever done with it."""
+NEEDED = {("diagnose", "--model"), ("record", "export", "--out")}
+"""Options that a command cannot do without, except in another use of it."""
+PARENTS_MADE = {("new", "NAME"), ("record", "export", "--out")}
+"""A folder that is not there is right, with its parents."""
+BY_ANOTHER = {("setup", "NAME"), ("setup", "--eds")}
+"""Refused by the command that `setup` prints and runs."""
+PRINTS = {("doctor",)}
+"""Its checks are a list, the file's among them."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a person types for one parameter of a command, and which values cannot be right."""
+
+    name: str
+    option: str
+    typed: str
+    required: bool
+    wrong: tuple[str, ...]
+
+
+def wrong(kind, info, output):
+    """Values that a parameter of this kind cannot have."""
+    if kind in (int, float):
+        beyond = [
+            repr(kind(limit + sign * max(1, abs(limit)))) for limit, sign in ((info.min, -1), (info.max, 1))
+            if limit is not None
+        ]  # fmt: skip
+        return ("", "soon", "nan", "inf", "-inf", "1e400", *beyond, *(("1.5",) if kind is int else ()))
+    if output is not None:
+        return UNWRITABLE["folder" if output is Kind.FOLDER else "file"]
+    if kind is Path or info.metavar in ("PROFILE", "MACHINE"):
+        return UNREADABLE
+    return ("",) if kind is str else ()
+
+
+def parameters(command, callback):
+    hints = typing.get_type_hints(callback, include_extras=True)
+    for name, each in inspect.signature(callback).parameters.items():
+        kind, info, *more = typing.get_args(hints[name])
+        kind, _ = command_reference._plain(kind)
+        known = command_reference._parameter(name, hints[name], each.default)
+        option = "" if isinstance(info, ArgumentInfo) else known.names[0]
+        output = next((each for each in more if isinstance(each, Kind)), None)
+        values = tuple(value for value in wrong(kind, info, output) if value or known.default != "``")
+        if (*command, known.names[0]) in PARENTS_MADE:
+            values = tuple(value for value in values if value != "nowhere/at/all")
+        if (*command, known.names[0]) in BY_ANOTHER:
+            values = ()
+        yield Parameter(name, option, known.names[0], known.required, values)
+
+
+def commands():
+    for panel in PANELS.values():
+        for name in panel:
+            app = load(name)
+            groups = [group.typer_instance for group in app.registered_groups]
+            for each in (app, *groups):
+                for registered in each.registered_commands:
+                    own = registered.name or registered.callback.__name__.replace("_", "-")
+                    words = (own,) if each is app else (name, own)
+                    yield words, tuple(parameters(words, registered.callback))
+
+
+COMMANDS = dict(commands())
+
+
+def line(command, changed, value):
+    """A whole command line with one value changed."""
+    options, arguments = [], []
+    for each in COMMANDS[command]:
+        given = value if each is changed else RIGHT.get(each.typed)
+        if given is None:
+            continue
+        if not each.option:
+            arguments.append(given)
+        elif each is changed or each.required or (*command, each.typed) in NEEDED:
+            options.append(f"{each.option}={given}" if each is changed or given else each.option)
+    named = {each.name for each in COMMANDS[command]}
+    if "simulate" in named and changed.name not in ("interface", "channel"):
+        options.append("--simulate")
+    return [*command, *options, *(["--"] if value in arguments and value.startswith("-") else []), *arguments]
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder in which a person has one of everything."""
+    shutil.copytree(PROFILES / "article", tmp_path / "axis")
+    rows = "".join(f"{number},{number},{number / 50}\n" for number in range(9))
+    (tmp_path / "record.csv").write_text("time_s,motor_position_deg,load_position_deg\n" + rows)
+    (tmp_path / "junk").write_bytes(bytes(range(256)))
+    (tmp_path / "empty").touch()
+    (tmp_path / "circle").symlink_to("circle")
+    os.mkfifo(tmp_path / "pipe")
+    return tmp_path
+
+
+def contents(folder):
+    return {path: path.stat().st_size if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_what_cannot_be_right_is_refused_and_nothing_happens(command, place, monkeypatch):
+    monkeypatch.delenv("HDBRIDGE_SOCKET", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    before, complaints = contents(place), []
+    for parameter in COMMANDS[command]:
+        for value in parameter.wrong:
+            words = line(command, parameter, value)
+            done = run_here(place, *words)
+            said = done.stderr.splitlines()
+            right = (
+                done.returncode == 2
+                and (done.stdout == "" or command in PRINTS)
+                and len(said) == 1
+                and said[0].startswith("hdbridge: ")
+                and (parameter.typed in said[0] or (value and value in said[0]))
+            )
+            if not right:
+                complaints.append((words, done.returncode, done.stdout[:100], said[-2:]))
+            assert contents(place) == before, words
+    assert complaints == []
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("step axis --simulate --step-deg 0", "--step-deg: found 0; expected the size of a step"),
+        (
+            "step axis --simulate --start-deg 1e300",
+            "move the load to 1e+300 deg; the axis file allows -400 to 400",
+        ),
+        ("step axis --simulate --step-deg -1e300", "the axis file allows -400 to 400"),
+        ("move axis 1e300 --simulate", "the axis file allows -400 to 400"),
+        ("move axis 0 401 --simulate", "the axis file allows -400 to 400"),
+        (
+            "home axis --simulate --method 35 --offset 1e300",
+            "--offset: found 1e+300; expected an angle within",
+        ),
+        (
+            "home axis --simulate --method 35 --switch-velocity 21",
+            "--switch-velocity: found 21.0; expected above 0",
+        ),
+        (
+            "home axis --simulate --method 35 --zero-velocity 1e300",
+            "--zero-velocity: found 1e+300; expected above 0",
+        ),
+        ("home axis --simulate --method 35 --acceleration 1e300", "--acceleration: found 1e+300"),
+        ("step axis --interface cann0 --channel can0", "--interface: python-can has no interface 'cann0'"),
+        ("scan --interface cann0 --channel can0", "python-can has no interface 'cann0'"),
+        ("run axis --interface cann0 --channel can0", "--interface: python-can has no interface 'cann0'"),
+        ("record mend empty", "not a flight recording"),
+        ("record mend /dev/null", "not a flight recording"),
+    ],
+)
+def test_what_the_axis_cannot_do_is_refused_before_anything_is_connected(place, words, complaint):
+    before = contents(place)
+    done = run_here(place, *words.split())
+    assert done.returncode == 2, done.stderr
+    assert complaint in done.stderr
+    assert "booted" not in done.stderr
+    assert contents(place) == before
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("name", ["axis.yaml", "model.yaml", "truth.yaml"])
+def test_a_named_pipe_in_place_of_a_file_of_a_profile_is_not_waited_for(place, name):
+    (place / "axis" / name).unlink()
+    os.mkfifo(place / "axis" / name)
+    done = run_here(place, "step", "axis", "--simulate", "--count", 2)
+    assert done.returncode == 2
+    assert f"axis/{name}: cannot be read: it is a named pipe; expected a file" in done.stderr
+
+
+def test_a_record_may_come_from_a_pipe_of_the_shell(place):
+    with (place / "record.csv").open("rb") as file:
+        done = run_here(place, "diagnose", f"/dev/fd/{file.fileno()}", "--model", "axis/model.yaml")
+    assert "named pipe" not in done.stderr
+
+
+def test_check_knows_the_interfaces_of_python_can_and_those_of_this_computer(place):
+    file = place / "axis" / "axis.yaml"
+    text = file.read_text()
+    file.write_text(text.replace("interface: virtual", "interface: socketcna"))
+    done = run_here(place, "check", "axis")
+    assert done.returncode == 2
+    assert "bus.interface: python-can has no interface 'socketcna'" in done.stderr
+    assert "did you mean 'socketcan'?" in done.stderr
+    file.write_text(
+        text.replace("interface: virtual", "interface: socketcan").replace(
+            "channel: hdbridge", "channel: cann0"
+        )
+    )
+    done = run_here(place, "check", "axis")  # at a desk, the interface may be another computer's
+    assert done.returncode == 0
+    assert "bus.channel: this computer has no network interface 'cann0'" in done.stderr
+
+
+def test_a_velocity_above_the_limit_is_reported(place):
+    done = run_here(place, "move", "axis", 0.01, "--simulate", "--velocity", 500)
+    assert done.returncode == 0, done.stderr
+    assert (
+        "velocity: 500 deg/s is above the axis's limit; 20 deg/s is used (limits.velocity_deg_s)"
+        in done.stderr
+    )
+
+
+@pytest.mark.parametrize("name", ["mine", "cells/left/mine"])
+def test_a_new_profile_on_a_full_disk_leaves_nothing(tmp_path, name):
+    done = subprocess.run(
+        [sys.executable, "-B", "-m", "hdbridge", "new", name],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
+    )  # fmt: skip
+    assert done.returncode == 6, done.stderr
+    assert "cannot be written: File too large" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_that_is_taken_is_that_of_the_option(place, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = run_here(place, "run", "axis", "--simulate", "--page", "--port", port)
+    assert done.returncode == 7
+    assert (
+        f"127.0.0.1:{port}: another process listens there; stop it, or give --port another number"
+        in done.stderr
+    )

@@ -1,0 +1,22 @@
+"""How long tests wait for another thread or process: a bound for what hangs, not a measure of speed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+PATIENCE_S: Final = 600.0
+"""A hundred times what the longest wait takes on an idle machine."""
+
+T = TypeVar("T")
+
+
+def until(met: Callable[[], T], why: Callable[[], object] = lambda: "it did not come about") -> T:
+    """Polls until ``met`` returns something true, and returns it; fails with ``why()`` after `PATIENCE_S`."""
+    end_s, pause_s = time.monotonic() + PATIENCE_S, 0.005
+    while not (found := met()):
+        assert time.monotonic() < end_s, why()
+        time.sleep(pause_s)
+        pause_s = min(1.2 * pause_s, 0.25)  # to look may take more of a processor than what is waited for
+    return found
