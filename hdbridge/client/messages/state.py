@@ -62,6 +62,11 @@ class LoadLoopState(Report):
     configured: bool = Field(description="whether the machine file has one for this axis")
     on: bool = False
     correction_arcsec: float = Field(0.0, description="what it adds now")
+    doubt: str | None = Field(
+        None,
+        description="why it does not act: the load encoder is not believed, or the error is beyond its bound",
+        examples=["the load encoder moved by 14.4 arcsec without the motor, of which 5.1 are explained"],
+    )
 
 
 class AdaptationState(Report):

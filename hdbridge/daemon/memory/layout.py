@@ -59,7 +59,7 @@ class SampleFlag(IntFlag):
     UNDERRUN = 64
     """A stream ran out of knots in motion."""
     LOOP_DOUBTED = 128
-    """The load loop does not believe the load encoder; it is out of use until it is switched on again."""
+    """The load loop does not believe the load encoder and adds nothing until it does."""
     CHANNEL0_KNOWN = 256
     CHANNEL1_KNOWN = 512
 
@@ -124,6 +124,8 @@ class EventKind(IntEnum):
     STREAM_REFUSED = 11
     """A knot of the stream was refused and the axis brakes; ``text`` says why."""
     ENDING = 12
+    LOAD_LOOP = 13
+    """The load loop believes the load encoder no longer, and ``text`` says why; or again, without a text."""
 
 
 class Event(NamedTuple):
