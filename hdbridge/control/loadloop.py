@@ -1,21 +1,19 @@
 """A slow loop over the load encoder: takes away what the model leaves of the mean error at rest.
 
-The compensation is feed-forward: a model that has aged leaves an error that nobody sees. While the load encoder
-can be believed, this loop integrates the error (load target less load encoder) and adds to the load target. It
-is slow and bounded so that it can do little harm.
+The compensation is feed-forward: a model that has aged leaves an error that nobody sees. This loop integrates
+the error (load target less load encoder) at rest and adds to the load target. In motion the error is mostly
+delay, and the value is held. The value is bounded and its slew is limited. It fades out, for a reason that
+`LoadLoop.doubt` states, in three cases:
 
-* It integrates at rest only. In motion the error is mostly delay, and the value is held.
-* An error beyond the loop's own bound is not what it is there for: the value is faded out.
-* The load encoder is compared with the motor encoder. Motor encoder and model say how far the load has moved
-  since the axis came to rest. If the load encoder differs by more than this axis can explain, it is in doubt,
-  and the value is faded out until the two agree again.
+    the mean error is beyond the bound     the loop is not meant for it. Over when it is within the bound.
+    the load encoder moved at rest         without the motor. Over when it has moved back.
+    the load encoder does not follow       the motor that the loop moves at rest. Over when it follows.
 
-What an axis can explain is measured in its own units:
-
-    the load moved without the motor     a motor count at the load, and the load encoder's noise
-    the load did not follow the motor    the same, and the slack: what the model may miss of the hysteresis
-
-The noise is measured at rest. Slow drift of the load against the motor is followed.
+The last two compare the load encoder with the load angle by motor encoder and model. What is explained is
+measured in units of the axis: one count of each encoder at the load, the noise of the difference, and for the
+last case the slack, which is what the model may miss of the hysteresis. The noise is measured at rest, and a
+slow drift of the load against the motor is followed. A doubt about the encoder that does not end at the same
+place ends when the two agree again at rests after motion in both directions.
 
 Pure: no clock, no bus.
 """
@@ -29,26 +27,30 @@ from hdbridge.effects import Moment, Start
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 
-_SETTLED_S: Final = 0.3
-"""At rest it only measures for so long: the load settles."""
+SETTLED_S: Final = 0.3
+"""Time at rest before the loop acts, in which the load settles."""
 _AVERAGED_S: Final = 0.05
 """Time constant of the averages at rest."""
 _NOISE_S: Final = 1.0
 """Time constant of the noise estimate."""
 _DRIFT_S: Final = 600.0
 """Time constant with which a drift of the load against the motor is followed at rest."""
-_NOISE_LIMIT: Final = 8.0
-"""Standard deviations of the load encoder that are noise."""
+_AGREED_S: Final = 1.0
+"""Time at rest for which an encoder that has moved back is observed; doubled by each further doubt."""
+_AGREED_MAX_S: Final = 600.0
+_SIGMAS: Final = 8.0
+"""Deviation in standard deviations that is still noise."""
+_SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
+"""Standard deviation of normal readings by their mean absolute deviation."""
 _OUTLIERS: Final = 2
-"""Readings in a row that are no single disturbance."""
+"""Consecutive readings outside of what is explained that count as a move of the load encoder."""
 _AGREEMENT: Final = 1.0 / 3.0
-"""The encoders agree again if they differ by less than this share of the greatest difference in the doubt."""
-_SIGMA_OF_MEAN_STEP: Final = 0.886
-"""Standard deviation of normal readings, by the mean absolute difference of two in a row."""
+"""Share of the greatest disagreement below which the encoders agree again."""
 _MODEL_ERROR: Final = 0.25
 """Share of a hysteresis by which its model may be wrong."""
 _PLACES: Final = 24
-"""Positions at which the width of a hysteresis loop is looked at."""
+"""Positions at which the width of a hysteresis loop is evaluated."""
+_BOTH: Final = frozenset({-1, 1})
 
 
 def loop_width_arcsec(model: TransmissionModel) -> float:
@@ -69,12 +71,13 @@ def loop_width_arcsec(model: TransmissionModel) -> float:
 
 
 class LoadLoop:
-    """One axis's; one call of `step` per control period. Everything is arcsec at the load."""
+    """The loop of one axis; one call of `step` per control period. Everything is arcsec at the load."""
 
     __slots__ = (
-        "_count", "_doubt", "_drift_share", "_gain_step", "_last", "_load", "_maximum", "_motor", "_noise",
-        "_noise_share", "_off", "_outliers", "_reference", "_rest_motor", "_settled", "_share", "_slack",
-        "_slew_step", "_standing", "_stuck_at", "_value",
+        "_agreed", "_agreeing", "_beyond", "_counts", "_difference", "_doubt", "_drift_share", "_error",
+        "_gain_step", "_jumped", "_jumped_most", "_maximum", "_motor", "_noise", "_noise_readings",
+        "_noise_share", "_off", "_outliers", "_patience", "_patience_max", "_patience_min", "_reference",
+        "_rest_motor", "_settled", "_share", "_slack", "_slew_step", "_standing", "_value",
     )  # fmt: skip
 
     def __init__(
@@ -84,21 +87,19 @@ class LoadLoop:
         slew_arcsec_s: float,
         period_s: float,
         *,
-        motor_count_arcsec: float,
-        load_count_arcsec: float,
+        counts_arcsec: float,
     ) -> None:
-        """``gain_1_s``: share of the error that is taken away per second; ``maximum_arcsec``: bound of the value.
+        """``gain_1_s``: share of the error that is taken away per second; ``maximum_arcsec`` bounds it.
 
-        ``motor_count_arcsec`` and ``load_count_arcsec`` are one count of each encoder, at the load. InputError
-        for numbers that are not finite and above 0, and for a gain with which the loop would swing.
+        ``counts_arcsec`` is one count of the motor encoder plus one of the load encoder, both at the load.
+        InputError for numbers that are not finite and above 0, and for a gain that makes the loop swing.
         """
         for name, number in (
             ("gain_1_s", gain_1_s),
             ("maximum_arcsec", maximum_arcsec),
             ("slew_arcsec_s", slew_arcsec_s),
             ("period_s", period_s),
-            ("motor_count_arcsec", motor_count_arcsec),
-            ("load_count_arcsec", load_count_arcsec),
+            ("counts_arcsec", counts_arcsec),
         ):
             if not (math.isfinite(number) and number > 0.0):
                 raise InputError(f"load loop: {name} is {number!r}; expected a finite number above 0")
@@ -110,56 +111,66 @@ class LoadLoop:
         self._gain_step = gain_1_s * period_s
         self._maximum = maximum_arcsec
         self._slew_step = slew_arcsec_s * period_s
-        self._count = motor_count_arcsec
+        self._counts = counts_arcsec
         self._share = min(period_s / _AVERAGED_S, 1.0)
         self._noise_share = min(period_s / _NOISE_S, 1.0)
         self._drift_share = min(period_s / _DRIFT_S, 1.0)
-        self._settled = max(math.ceil(_SETTLED_S / period_s), 1)
-        self._noise = load_count_arcsec
-        """Mean absolute difference of two readings in a row."""
+        self._patience = 0
+        self._patience_min = math.ceil(_AGREED_S / period_s)
+        self._patience_max = math.ceil(_AGREED_MAX_S / period_s)
+        self._settled = max(math.ceil(SETTLED_S / period_s), 1)
         self._slack = maximum_arcsec
         """By how much the load may follow the motor less than the model says."""
         self._value = 0.0
         self._standing = self._outliers = 0
-        """Periods at rest; readings in a row that are off."""
-        self._load = self._motor = 0.0
-        """Averages at rest, of the difference of the encoders and of the load by the motor encoder."""
+        """Periods at rest; consecutive readings outside of what is explained."""
+        self._difference = self._motor = self._error = 0.0
+        """Averages at rest, of load encoder less load by motor encoder, of the latter, and of the error."""
+        self._noise = 0.0
+        """Mean absolute deviation of the difference from its average, at rest, less that of the motor."""
+        self._noise_readings = 0
         self._reference = self._rest_motor = 0.0
-        """The same when the axis came to rest, or before the doubt."""
-        self._last = 0.0
-        """The last difference of the encoders."""
+        """Averages when the axis came to rest; during a doubt about the encoder, those before it."""
         self._doubt = ""
-        self._off = 0.0
-        """Greatest difference from the reference in the doubt."""
-        self._stuck_at: float | None = None
-        """Where the load was by the motor when the load encoder stopped following it; None: it moved alone."""
+        self._beyond = False
+        """Whether the doubt is about the size of the error, not about the encoder."""
+        self._jumped = self._jumped_most = self._off = 0.0
+        """During a doubt about the encoder: sum of its moves at rest, the greatest sum, and the greatest
+        disagreement.
+        """
+        self._agreeing = 0
+        """Readings since that sum has become small."""
+        self._agreed = frozenset[int]()
+        """Directions of motion after which the encoders have agreed again."""
 
     @property
     def value_arcsec(self) -> float:
-        """What it adds to the load target."""
+        """The present addition to the load target."""
         return self._value
 
     @property
     def doubt(self) -> str:
-        """Why it does not believe the load encoder, in words; empty while it does."""
+        """Reason why the loop does not act, in words; empty while it does."""
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """``whole`` knows the hysteresis of the gear, ``predicting`` is the part in `step`'s ``motor``.
+        """``whole`` knows the hysteresis of the gear, ``predicting`` is the part of it in `step`'s ``motor``.
 
-        What is not predicted, and a share of what is, may keep the load from following the motor. If the
-        hysteresis is not known, that is only bounded by the loop's own bound.
+        The load may fail to follow the motor by the hysteresis that is not predicted, and by a share of the
+        hysteresis that is. If the hysteresis is not known, only the loop's own bound limits that.
         """
         width = loop_width_arcsec(whole)
         known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)
         self._slack = width - known if width else self._maximum
+        self._standing = 0
 
     def reset(self, value_arcsec: float = 0.0) -> None:
-        """Begin again without any doubt, at this value, which the load target has in it already."""
+        """Begin again without a doubt, at this value, which the load target already contains."""
         if not math.isfinite(value_arcsec):
             raise InputError(f"load loop: a value of {value_arcsec!r} arcsec; expected a finite number")
         self._value = min(max(value_arcsec, -self._maximum), self._maximum)
-        self._doubt = ""
+        self._doubt, self._beyond = "", False
+        self._patience = 0
         self._standing = 0
 
     def step(self, target: float, load: float | None, motor: float, moving: bool) -> float:
@@ -173,85 +184,126 @@ class LoadLoop:
             return self._fade()
         if moving:
             self._standing = 0
-            return self._fade() if self._doubt else self._value
-        self._standing += 1
-        difference = load - motor
-        if self._standing <= self._settled:
-            self._settle(difference, motor)
-        elif not self._believed(difference, motor):
-            return self._fade() if self._doubt else self._value
-        error = target - load
-        if self._doubt or abs(error) > self._maximum:
+        else:
+            self._standing += 1
+            if self._standing <= self._settled:
+                self._settle(target - load, load - motor, motor)
+            else:
+                self._observe(target - load, load - motor, motor)
+        if self._doubt:
             return self._fade()
-        if self._standing > self._settled:
-            step = min(max(self._gain_step * error, -self._slew_step), self._slew_step)
+        if self._standing > self._settled and not self._outliers:
+            step = min(max(self._gain_step * (target - load), -self._slew_step), self._slew_step)
             self._value = min(max(self._value + step, -self._maximum), self._maximum)
         return self._value
 
-    def _settle(self, difference: float, motor: float) -> None:
-        """The axis has just come to rest: an average of what came last, without what was still settling."""
-        share = max(self._share, 1.0 / self._standing)
-        self._load += share * (difference - self._load)
-        self._motor += share * (motor - self._motor)
-        self._last = difference
+    # ---------------------------------------------------------------- at rest
+
+    def _settle(self, error: float, difference: float, motor: float) -> None:
+        """One of the first readings at rest: an average that forgets those in which the load was settling."""
+        self._outliers = 0
+        self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
         if self._standing < self._settled:
             return
-        if self._doubt:
-            self._standing = 0
-            if not self._agree():
-                return
-            self._doubt = ""
-        self._reference, self._rest_motor = self._load, self._motor
+        if self._doubt and not self._beyond:
+            self._compare()
+        if not self._doubt or self._beyond:
+            self._reference, self._rest_motor = self._difference, self._motor
+        if self._beyond and abs(self._error) <= self._maximum:
+            self._end()
 
-    def _agree(self) -> bool:
-        """Whether the encoders agree again, after the doubt."""
-        off = abs(self._load - self._reference)
-        self._off = max(self._off, off)
-        if self._stuck_at is not None and abs(self._motor - self._stuck_at) <= 4.0 * self._stuck_limit():
-            return False  # an encoder that stands still agrees with a motor that has come back
-        return off <= min(_AGREEMENT * self._off, self._maximum)
-
-    def _limit(self) -> float:
-        return self._count + _NOISE_LIMIT * _SIGMA_OF_MEAN_STEP * self._noise
-
-    def _stuck_limit(self) -> float:
-        return self._limit() + self._slack
-
-    def _believed(self, difference: float, motor: float) -> bool:
-        """Whether a reading at rest is believed; keeps averages and noise, and begins the doubt."""
-        limit = self._limit()
-        change = min(abs(difference - self._last), limit)
-        self._noise += self._noise_share * (change - self._noise)
-        self._last = difference
-        off = abs(difference - self._load)
-        explained = limit + 2.0 * abs(motor - self._motor)
-        if off > explained:
+    def _observe(self, error: float, difference: float, motor: float) -> None:
+        """A reading at rest, after the load has settled."""
+        deviation = difference - self._difference
+        explained = self._explained() + 2.0 * abs(motor - self._motor)
+        if abs(deviation) > explained:
             self._outliers += 1
-            if self._outliers >= _OUTLIERS:
-                self._begin_doubt(
-                    f"the load encoder moved by {off:.1f} arcsec without the motor, of which "
-                    f"{explained:.1f} are explained", self._load, None,
-                )  # fmt: skip
-            return False
+            if self._outliers == _OUTLIERS:
+                self._jump(deviation, explained)
+            return
         self._outliers = 0
-        self._load += self._share * (difference - self._load)
-        self._motor += self._share * (motor - self._motor)
+        self._average(error, difference, motor, self._share)
+        if self._doubt and not self._beyond:
+            back = abs(self._jumped) <= max(self._explained(), _AGREEMENT * self._jumped_most)
+            self._agreeing = self._agreeing + 1 if back else 0
+            if self._agreeing >= self._patience:
+                self._end()
+            return
+        self._reference += self._drift_share * (self._difference - self._reference)
+        self._rest_motor += self._drift_share * (self._motor - self._rest_motor)
         moved = self._motor - self._rest_motor
-        missing = math.copysign(1.0, moved) * (self._reference - self._load)
-        if min(missing, abs(moved)) > self._stuck_limit():
-            self._begin_doubt(
-                f"the load encoder did not follow the motor by {missing:.1f} arcsec, of which "
-                f"{self._stuck_limit():.1f} are explained", self._reference, self._motor,
+        missing = math.copysign(1.0, moved) * (self._reference - self._difference)
+        explained = self._explained() + self._slack
+        if min(missing, abs(moved)) > explained:
+            self._suspect(
+                f"the load encoder lags the motor by {missing:.1f} arcsec at rest; count, noise and "
+                f"hysteresis of this axis explain {explained:.1f}", self._difference - self._reference,
             )  # fmt: skip
-            return False
-        self._reference += self._drift_share * (self._load - self._reference)
-        self._rest_motor += self._drift_share * moved
-        return True
+        elif not self._doubt and abs(self._error) > self._maximum:
+            self._beyond = True
+            self._doubt = (
+                f"the mean error at rest is {self._error:.1f} arcsec; the loop adds at most {self._maximum:g}"
+            )
+        elif self._beyond and abs(self._error) < self._maximum - self._explained():
+            self._end()
 
-    def _begin_doubt(self, words: str, reference: float, stuck_at: float | None) -> None:
-        self._doubt, self._reference, self._stuck_at = words, reference, stuck_at
-        self._off = 0.0
-        self._standing = self._outliers = 0
+    def _average(self, error: float, difference: float, motor: float, share: float) -> None:
+        deviation, moved = difference - self._difference, motor - self._motor
+        self._difference += share * deviation
+        self._motor += share * moved
+        self._error += share * (error - self._error)
+        if self._standing > self._settled or (self._standing > 1 and self._noise_readings < self._settled):
+            self._noise_readings += 1
+            noise_share = max(self._noise_share, 1.0 / self._noise_readings)
+            self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
+
+    def _explained(self) -> float:
+        """Difference of the encoders at rest that this axis explains without any motion of the load."""
+        return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
+
+    # ---------------------------------------------------------------- doubt about the encoder
+
+    def _jump(self, size: float, explained: float) -> None:
+        """The load encoder has moved at rest; the averages go with it."""
+        self._outliers = 0
+        self._difference += size
+        self._error -= size
+        if self._doubt and not self._beyond:
+            self._jumped += size
+            self._jumped_most = max(self._jumped_most, abs(self._jumped))
+            self._agreeing = 0
+            return
+        self._suspect(
+            f"the load encoder moved by {size:.1f} arcsec without the motor; count and noise of this axis "
+            f"explain {explained:.1f}", size,
+        )  # fmt: skip
+
+    def _suspect(self, words: str, size: float) -> None:
+        self._doubt, self._beyond = words, False
+        self._jumped, self._agreed, self._agreeing = size, frozenset(), 0
+        self._off = self._jumped_most = abs(size)
+        self._patience = min(max(2 * self._patience, self._patience_min), self._patience_max)
+
+    def _compare(self) -> None:
+        """At rest after a motion in doubt: whether the encoders have agreed after both directions."""
+        off = abs(self._difference - self._reference)
+        self._off = max(self._off, off)
+        tolerance = max(self._explained(), min(_AGREEMENT * self._off, self._maximum))
+        if off > tolerance:
+            self._agreed = frozenset()
+        moved = self._motor - self._rest_motor
+        # An encoder that stands still agrees at most once in two rests that are farther apart.
+        if abs(moved) > max(self._explained() + self._slack, 3.0 * tolerance):
+            self._rest_motor = self._motor
+            if off <= tolerance:
+                self._agreed |= {1 if moved > 0.0 else -1}
+                if self._agreed == _BOTH:
+                    self._end()
+
+    def _end(self) -> None:
+        """The doubt is over: the loop continues from the value that it has faded to."""
+        self._doubt, self._beyond = "", False
+        self._reference, self._rest_motor = self._difference, self._motor
 
     def _fade(self) -> float:
         value, step = self._value, self._slew_step

@@ -163,7 +163,7 @@ class Follower:
 
     @property
     def loop_doubt(self) -> str:
-        """Why the load loop does not believe the load encoder, in words; empty while it does."""
+        """Reason why the load loop does not act, in words; empty while it may."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
@@ -199,13 +199,13 @@ def _load_loop(setup: AxisSetup) -> LoadLoop | None:
     if settings is None:
         return None
     config = setup.config
+    motor_count_deg = abs(config.motor_encoder.degrees(1)) / config.gear.ratio
     loop = LoadLoop(
         settings.gain_1_s,
         settings.maximum_arcsec,
         settings.slew_arcsec_s,
         config.drive.cycle_s,
-        motor_count_arcsec=ARCSEC_PER_DEG * abs(config.motor_encoder.degrees(1)) / config.gear.ratio,
-        load_count_arcsec=ARCSEC_PER_DEG * abs(config.load_encoder.degrees(1)),
+        counts_arcsec=ARCSEC_PER_DEG * (motor_count_deg + abs(config.load_encoder.degrees(1))),
     )
     loop.use_models(setup.compensation.model, setup.compensation.model)
     return loop
