@@ -150,6 +150,8 @@ def concerns(state: AxisState) -> Iterator[str]:
         yield f"axis '{state.name}' stopped: {state.fault}"
     if state.adaptation.frozen is not None:
         yield f"axis '{state.name}' does not adapt: {state.adaptation.frozen}"
+    if state.load_loop.doubt is not None:
+        yield f"axis '{state.name}' has no load loop at present: {state.load_loop.doubt}"
     for each in state.advice:
         yield f"axis '{state.name}': {each}"
 

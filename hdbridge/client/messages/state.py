@@ -64,8 +64,8 @@ class LoadLoopState(Report):
     correction_arcsec: float = Field(0.0, description="what it adds now")
     doubt: str | None = Field(
         None,
-        description="why it does not act: the load encoder is not believed, or the error is beyond its bound",
-        examples=["the load encoder moved by 14.4 arcsec without the motor, of which 5.1 are explained"],
+        description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
+        examples=["the mean error at rest is 46.3 arcsec; the loop adds at most 20"],
     )
 
 

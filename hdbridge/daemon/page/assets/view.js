@@ -118,10 +118,16 @@ export function axis(state) {
   rows.push(
     ["compensation", state.compensating ? `${state.scheme}${state.changing ? ", changing" : ""}${state.limited ? ", at its limit" : ""}` : "off"],
     ["hysteresis state", state.memory_known ? "known" : "not known until the axis has turned far enough"],
-    ["load-side loop", state.load_loop.on ? `on, ${number(state.load_loop.correction_arcsec, 1)} arcsec` : "off"],
+    ["load-side loop", loadLoop(state.load_loop)],
     ["adaptation", adaptation(state.adaptation)],
   );
   facts(at("model"), rows);
+}
+
+function loadLoop(loop) {
+  if (!loop.on) return "off";
+  const doubt = loop.doubt === null ? "" : `; does not act: ${loop.doubt}`;
+  return `on, ${number(loop.correction_arcsec, 1)} arcsec${doubt}`;
 }
 
 export function events(news) {
