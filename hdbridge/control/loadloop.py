@@ -5,9 +5,9 @@ the error (load target less load encoder) at rest and adds to the load target. I
 delay, and the value is held. The value is bounded and its slew is limited. It fades out, for a reason that
 `LoadLoop.doubt` states, in three cases:
 
-    the mean error is beyond the bound     the loop is not meant for it. Over when it is within the bound.
-    the load encoder moved at rest         without the motor. Over when it has moved back.
-    the load encoder does not follow       the motor that the loop moves at rest. Over when it follows.
+    the error is too large             the bound is less than half of it. Over when it is smaller.
+    the load encoder moved at rest     without the motor. Over when it has moved back.
+    the load encoder does not follow   the motor that the loop moves at rest. Over when it follows.
 
 The last two compare the load encoder with the load angle by motor encoder and model. What is explained is
 measured in units of the axis: one count of each encoder at the load, the noise of the difference, and for the
@@ -42,6 +42,8 @@ _SIGMAS: Final = 8.0
 """Deviation in standard deviations that is still noise."""
 _SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
 """Standard deviation of normal readings by their mean absolute deviation."""
+_LEAST_SHARE: Final = 0.5
+"""Share of the error that the bound has to be."""
 _OUTLIERS: Final = 2
 """Consecutive readings outside of what is explained that count as a move of the load encoder."""
 _AGREEMENT: Final = 1.0 / 3.0
@@ -75,7 +77,7 @@ class LoadLoop:
 
     __slots__ = (
         "_agreed", "_agreeing", "_beyond", "_counts", "_difference", "_doubt", "_drift_share", "_error",
-        "_gain_step", "_jumped", "_jumped_most", "_maximum", "_motor", "_noise", "_noise_readings",
+        "_gain_step", "_jumped", "_jumped_most", "_maximum", "_most", "_motor", "_noise", "_noise_readings",
         "_noise_share", "_off", "_outliers", "_patience", "_patience_max", "_patience_min", "_reference",
         "_rest_motor", "_settled", "_share", "_slack", "_slew_step", "_standing", "_value",
     )  # fmt: skip
@@ -110,6 +112,7 @@ class LoadLoop:
             )
         self._gain_step = gain_1_s * period_s
         self._maximum = maximum_arcsec
+        self._most = maximum_arcsec / _LEAST_SHARE
         self._slew_step = slew_arcsec_s * period_s
         self._counts = counts_arcsec
         self._share = min(period_s / _AVERAGED_S, 1.0)
@@ -186,10 +189,12 @@ class LoadLoop:
             self._standing = 0
         else:
             self._standing += 1
+            # The error without this loop.
+            error = target + self._value - load
             if self._standing <= self._settled:
-                self._settle(target - load, load - motor, motor)
+                self._settle(error, load - motor, motor)
             else:
-                self._observe(target - load, load - motor, motor)
+                self._observe(error, load - motor, motor)
         if self._doubt:
             return self._fade()
         if self._standing > self._settled and not self._outliers:
@@ -209,7 +214,7 @@ class LoadLoop:
             self._compare()
         if not self._doubt or self._beyond:
             self._reference, self._rest_motor = self._difference, self._motor
-        if self._beyond and abs(self._error) <= self._maximum:
+        if self._beyond and abs(self._error) <= self._most:
             self._end()
 
     def _observe(self, error: float, difference: float, motor: float) -> None:
@@ -239,12 +244,13 @@ class LoadLoop:
                 f"the load encoder lags the motor by {missing:.1f} arcsec at rest; count, noise and "
                 f"hysteresis of this axis explain {explained:.1f}", self._difference - self._reference,
             )  # fmt: skip
-        elif not self._doubt and abs(self._error) > self._maximum:
+        elif not self._doubt and abs(self._error) > self._most:
             self._beyond = True
             self._doubt = (
-                f"the mean error at rest is {self._error:.1f} arcsec; the loop adds at most {self._maximum:g}"
+                f"the mean error at rest is {self._error:.1f} arcsec without the loop, which adds at most "
+                f"{self._maximum:g}"
             )
-        elif self._beyond and abs(self._error) < self._maximum - self._explained():
+        elif self._beyond and abs(self._error) < self._most - self._explained():
             self._end()
 
     def _average(self, error: float, difference: float, motor: float, share: float) -> None:

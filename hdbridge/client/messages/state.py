@@ -65,7 +65,7 @@ class LoadLoopState(Report):
     doubt: str | None = Field(
         None,
         description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
-        examples=["the mean error at rest is 46.3 arcsec; the loop adds at most 20"],
+        examples=["the mean error at rest is 46.3 arcsec without the loop, which adds at most 20"],
     )
 
 
