@@ -126,6 +126,18 @@ def test_with_the_settings_of_the_documentation_nothing_is_doubted(axis, without
     assert np.abs(left).mean() < 0.6 * np.abs(without).mean()
 
 
+@pytest.mark.parametrize("sigma_arcsec", [1.0, 5.0])
+def test_a_noisy_encoder_is_not_in_doubt(axis, without, sigma_arcsec):
+    random = np.random.default_rng(1)
+    left, looped = at_rest(
+        axis,
+        loop_of(axis, gain=0.5, maximum=20.0, slew=20.0),
+        lambda encoder_deg: encoder_deg + random.normal(0.0, sigma_arcsec / 3600.0),
+    )
+    assert looped.doubts == []
+    assert np.abs(left).mean() < 0.6 * np.abs(without).mean()
+
+
 def test_a_frozen_encoder_does_no_harm(axis, without):
     shown = []
 
