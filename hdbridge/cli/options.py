@@ -151,8 +151,8 @@ def model_file(text: str) -> Path:
     if not files.model.is_file():
         raise InputError(
             f"{files.folder}: there is no model.yaml; make one: hdbridge calibrate {files.folder}, and "
-            f"commit it: hdbridge model commit {files.folder}; or fit one to a record: hdbridge fit RECORD --axis "
-            f"{files.folder} --out model.yaml, and pass --model model.yaml"
+            f"commit it: hdbridge model commit {files.folder}; or fit one to a record: hdbridge fit RECORD "
+            f"--axis {files.folder} --out model.yaml, and pass --model model.yaml"
         )
     return files.model
 
