@@ -103,7 +103,7 @@ UnwrapOption = Annotated[
     typer.Option(
         "--unwrap",
         metavar="CHANNEL=PERIOD,...",
-        help="Counters that begin anew, with the period in the column's unit: motor=65536.",
+        help="Counters that wrap, with their period in the column's unit: motor=65536.",
     ),
 ]
 JsonOption = Annotated[
@@ -137,7 +137,7 @@ def load_recordings(
 
 
 def model_file(text: str) -> Path:
-    """The model file that an option names, by itself or by the profile whose active model it is.
+    """Model file that an option names, directly or through the profile whose active model it is.
 
     InputError if there is neither, and if the profile has no model yet.
     """

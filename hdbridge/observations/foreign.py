@@ -138,9 +138,9 @@ def _check_wrapped(path: Path, record: Record) -> None:
 
 
 def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
-    """What begins anew by such a period, in words."""
+    """Name of a counter or an angle with this period."""
     if abs(period * abs(unit.factor) - DEG_PER_TURN) < 1e-6 * DEG_PER_TURN:
-        return "an angle that begins anew after a turn"
+        return "an angle that wraps after a turn"
     counts = period if unit.name == "counts" else period / (count_of(angle / unit.factor) or period)
     return f"a counter of {counts:.10g} counts that wraps" if counts > 1.0 else "a counter that wraps"
 
@@ -173,7 +173,7 @@ def _check_speed(path: Path, record: Record) -> None:
         unit = origin.units["time"].name
         finer = {"s": "ms", "ms": "us", "us": "ns"}.get(unit, "ms")
         raise InputError(
-            f"{path}: time_s goes on by {period_s:g} s from sample to sample, too slow to see a motor turn; "
+            f"{path}: time_s advances by {period_s:g} s per sample, too slow to see a motor turn; "
             f"the column '{origin.columns['time']}' looks like {finer}: pass "
             f"{option('--units', {'time': finer})}, or {option('--units', {'time': unit})} if it is in "
             f"{unit}"

@@ -121,10 +121,9 @@ _CLOCK_PERIODS: Final = sorted(
     for step in range(4)
     for period in (2**16, 2**24, 2**31, 2**32, 60, 3600, 86400, 1e9)
 )
-"""Values at which clocks begin anew, in the units in which they count."""
+"""Values at which clocks wrap, in the units in which they count."""
 _UNIT = re.compile(r"(-?)(\d*\.?\d*(?:[eE][+-]?\d+)?)\s*([^\d\s:.+-][^:]*?)(?::(.+))?$")
 _IN_NAME = re.compile(r"[\[(]([^\])]+)[\])]\s*$|(?:[_ ./-]|\bin )([^\W\d_]+|[°%\"'‰µμ]\w*)\s*$")
-_WORD, _HUMP = re.compile(r"[^\W\d_]+"), re.compile(r"(?<=[a-z])(?=[A-Z])")
 _HINTS: Final[Mapping[str, frozenset[str]]] = {
     "time": frozenset({"time", "timestamp", "timestamps", "zeit", "clock", "ts", "t"}),
     "motor": frozenset({"motor", "mot", "input", "drive", "antrieb", "m"}),
@@ -213,7 +212,7 @@ class CsvColumns:
     """The column's name, or its number (1 is the first), or `ROW`; of others the record's own column."""
     units: Mapping[str, Unit] = field(default_factory=dict)
     unwrap: Mapping[str, float] = field(default_factory=dict)
-    """The period of a counter that begins anew, in the column's unit."""
+    """The period of a counter that wraps, in the column's unit."""
 
     @classmethod
     def of(
@@ -280,14 +279,14 @@ class Origin:
         return f"{self.file.path}:{self.file.line_of_row(row)}"
 
     def clock_cure(self, time_s: FloatArray) -> str:
-        """What to pass for a clock that begins anew by a period that clocks have; empty if it does not."""
+        """The option for a clock that wraps at a usual period; empty if it does not."""
         raw = time_s / self.units["time"].factor
         steps = np.diff(raw)
         ahead = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
         lost = ahead - steps[steps < 0.0]
         for period in _CLOCK_PERIODS:
             if np.all(np.abs(lost - period) < 2.0 * ahead) and ahead < 0.1 * period:
-                return f"for a clock that begins anew pass {option('--unwrap', {'time': f'{period:.12g}'})}"
+                return f"for a clock that wraps pass {option('--unwrap', {'time': f'{period:.12g}'})}"
         return ""
 
     def exchanged(self) -> str:
@@ -457,7 +456,7 @@ def _with_per(units: Mapping[str, str]) -> str:
 
 
 def _unwrapped(values: FloatArray, period: float, *, ordered: bool) -> FloatArray:
-    """Goes on where a counter begins anew; a clock only ever goes forward."""
+    """Unwraps a counter; a clock (``ordered``) only ever goes forward."""
     if ordered:
         begins = np.diff(values, prepend=values[:1]) < 0.0
         clock: FloatArray = values + period * np.cumsum(begins)
@@ -487,11 +486,6 @@ def _unit_in_name(name: str, channel: str) -> str | None:
     """The unit that a column's name ends with."""
     found = _IN_NAME.search(name)
     return _canonical(found[1] or found[2], _units_of(channel)) if found else None
-
-
-def _counted(channel: str) -> str:
-    """What N is in a unit of the channel such as counts:N."""
-    return next((scale.per for scale in _units_of(channel).values() if scale.per), "")
 
 
 def _choices(known: Mapping[str, _Scale]) -> str:

@@ -71,7 +71,7 @@ class Record:
         """Read a CSV file of any program, plain or gzip.
 
         ``columns`` says which column is which channel, ``units`` in which unit, ``unwrap`` by which period a
-        counter begins anew, as the command line does: ``columns="motor=theta_m,time=t"`` or a mapping. What
+        counter wraps, as the command line does: ``columns="motor=theta_m,time=t"`` or a mapping. What
         was assumed is in ``.origin.remarks``.
 
         InputError, with file and line: a required column is missing, a value of a known column is not a
@@ -212,7 +212,7 @@ class Record:
 def concatenate(records: Sequence[Record]) -> Record:
     """Several records as one, in the order given, with one absolute zero.
 
-    A record whose time begins anew is moved in time to follow the one before. Columns that not every one has
+    A record whose time starts again is moved in time to follow the one before. Columns that not every one has
     are left out.
     """
     if not records:

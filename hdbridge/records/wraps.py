@@ -1,4 +1,4 @@
-"""Angles that jump by a constant: a counter that wraps, or an angle of one turn that begins anew.
+"""Angles that jump by a constant: a counter that wraps, or an angle of one turn.
 
 The jump is seen in one angle and not in the other: a record that was put together from several jumps in both.
 Its size is constant: a misread sample is off by anything, and the next one is back.
@@ -34,7 +34,7 @@ _PERIODS: Final = (DEG_PER_TURN, math.tau, 1.0, 21_600.0, 1_296_000.0, *(2.0**bi
 
 
 class Wraps(NamedTuple):
-    """Where an angle begins anew."""
+    """Jumps of an angle that wraps."""
 
     rows: NDArray[np.intp]
     """The first sample after each jump."""
@@ -89,7 +89,7 @@ def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
 
 
 def unwrapped(angle_deg: FloatArray, period_deg: float) -> FloatArray:
-    """The angle, going on where it begins anew, shape (n,); right while no step exceeds half the period."""
+    """The continuous angle, shape (n,); right while no step exceeds half the period."""
     return np.asarray(np.unwrap(angle_deg, period=period_deg))
 
 
