@@ -147,7 +147,12 @@ def model_file(text: str) -> Path:
     try:
         files = Profile.find(text)
     except InputError as problem:
-        raise InputError(f"{text}: there is no such model file, and as a profile: {problem}") from None
+        raise InputError(f"{text}: no such model file, and no such profile: {problem}") from None
+    if not files.axis.is_file():
+        raise InputError(
+            f"{text}: no such model file, and no profile; expected a model file, or a folder "
+            "with an axis.yaml"
+        )
     if not files.model.is_file():
         raise InputError(
             f"{files.folder}: there is no model.yaml; make one: hdbridge calibrate {files.folder}, and "

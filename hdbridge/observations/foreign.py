@@ -131,10 +131,16 @@ def _check_wrapped(path: Path, record: Record) -> None:
         + ("" if unit.name == "deg" else f" {unit.name}")
     )
     raise InputError(
-        f"{origin.place(row) if origin else path}: {name}: {after:.10g} after {before:.10g}, a jump of "
-        f"{size} that the other angle does not make ({len(wraps.rows)} such jumps); expected multi-turn "
+        f"{origin.place(row) if origin else path}: {name}: {_shown(after)} after {_shown(before)}, a jump of "
+        f"{size} that the other angle does not make ({len(wraps.rows)} such jump"
+        f"{'s' * (len(wraps.rows) > 1)}); expected multi-turn "
         f"angles, and this is {_counter(period, unit, angle)}: {_unwrapping(record, channel, found)}"
     )
+
+
+def _shown(value: float) -> str:
+    """A count in full, any other value with six digits."""
+    return f"{value:.12g}" if value == round(value) else f"{value:.6g}"
 
 
 def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
