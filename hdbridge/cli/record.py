@@ -15,6 +15,7 @@ from hdbridge.cli.options import JsonOption, console, notes, print_table, write_
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.daemon.recorder.reading import Flight, Overview
@@ -40,6 +41,7 @@ def register(app: typer.Typer) -> None:
     group.command()(info)
     group.command()(mend)
     group.command()(export)
+    group.command("import")(import_)
     app.add_typer(group, name="record")
 
 
@@ -198,6 +200,48 @@ def export(
     _write(recording, out)
     if model is not None and used is not None:
         write_result(model, used.text)
+    _print_export(recording, out)
+
+
+def import_(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+    ],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="The axis that was on the bus.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER|FILE.csv",
+            help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+        ),
+    ] = None,
+    channel: Annotated[
+        str | None,
+        typer.Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log."),
+    ] = None,
+    all_states: Annotated[
+        bool, typer.Option("--all-states", help="Also where the axis was not enabled.")
+    ] = False,
+) -> None:
+    """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
+
+    The PDO mapping comes from the SDO traffic in the log, else from the axis file. Log from the drive's
+    boot-up on, so that the mapping is in it. Nothing is sent, and nothing is interpolated.
+    """
+    from hdbridge.axis import AxisConfig
+    from hdbridge.control.buslog import import_log
+
+    if out is None:
+        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
+    _check_out(out)
+    axis = AxisConfig.load(Profile.find(profile).axis)
+    recording = import_log(log, axis, channel=channel, all_states=all_states)
+    _write(recording, out)
+    notes.print(f"PDO mapping {recording.notes['mapping']}", markup=False, soft_wrap=True)
+    if recording.record.motor_target_deg is None:
+        notes.print("no command in each cycle: the record has no motor_target_deg")
     _print_export(recording, out)
 
 

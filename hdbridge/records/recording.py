@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -26,6 +26,10 @@ from hdbridge.records.columns import CsvColumns, Said
 from hdbridge.records.record import Record, concatenate, time_shifts_s
 from hdbridge.strictness import Strict
 
+GAP_CYCLES: Final = 5
+"""Within so few missing cycles the motor does not reverse and come back unnoticed."""
+PART_SAMPLES: Final = 50
+"""A shorter part of a recording that is cut at its gaps is left out."""
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
