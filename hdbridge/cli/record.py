@@ -1,4 +1,4 @@
-"""``hdbridge record``: the daemon's flight recordings: look, mend, and make records of them."""
+"""``hdbridge record``: records from the daemon's flight recordings and from bus logs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FlightsArgument = Annotated[
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(
-        help="The daemon's flight recordings: list, mend, and make records for fit and diagnose.",
+        help="Flight recordings of the daemon and bus logs: list, mend, and make records for fit and diagnose.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )
@@ -240,6 +240,8 @@ def import_(
     recording = import_log(log, axis, channel=channel, all_states=all_states)
     _write(recording, out)
     notes.print(f"PDO mapping {recording.notes['mapping']}", markup=False, soft_wrap=True)
+    if cut_off := recording.notes.get("cut_off"):
+        notes.print(f"{log}: {cut_off}; what comes before is imported", markup=False, soft_wrap=True)
     if recording.record.motor_target_deg is None:
         notes.print("no command in each cycle: the record has no motor_target_deg")
     _print_export(recording, out)

@@ -7,6 +7,7 @@ that SYNC. Without SYNC it is a frame that carries both encoders. Nothing is int
 
 from __future__ import annotations
 
+import gzip
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -18,7 +19,6 @@ from typing import Any, Final
 
 import can
 import numpy as np
-from can.io.player import MESSAGE_READERS
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.control.bench import record_of
@@ -35,8 +35,15 @@ from hdbridge.procedures.moves import Sample
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 
-FORMATS: Final = ", ".join(sorted(MESSAGE_READERS))
-"""File names that python-can reads end in one of these, or in one and .gz."""
+READERS: Final[dict[str, Any]] = {
+    ".log": can.CanutilsLogReader,
+    ".asc": can.ASCReader,
+    ".blf": can.BLFReader,
+    ".trc": can.TRCReader,
+    ".mf4": can.MF4Reader,
+}
+"""Readers by the end of the file's name; .gz may follow it."""
+_BINARY: Final = {".blf", ".mf4"}
 FOLLOWED_SHARE: Final = 0.5
 """Share of the samples with motion in which a target moves if it is the command of each cycle."""
 _SINCE_1970_S: Final = 1e9
@@ -56,7 +63,8 @@ def import_log(
     """
     buses: dict[str, _Bus] = {}
     heard: Counter[int] = Counter()
-    for message in _messages(path):
+    cut_off: list[str] = []
+    for message in _messages(path, cut_off):
         name = str(message.channel)
         if channel is not None and name != channel:
             continue
@@ -75,14 +83,24 @@ def import_log(
             f"{path}: node {axis.drive.node_id} is on the channels {', '.join(found)}; choose one: --channel"
         )
     name, bus = next(iter(found.items()))
-    return bus.recording(path, name)
+    recording = bus.recording(path, name)
+    return replace(recording, notes={**recording.notes, "cut_off": cut_off[0]}) if cut_off else recording
 
 
-def _messages(path: Path) -> Iterator[can.Message]:
-    """The data frames with 11-bit identifiers."""
+def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
+    """The data frames with 11-bit identifiers; ``cut_off`` says why there are no more, if the log is damaged."""
+    packed = path.suffix.lower() == ".gz"
+    suffix = (path.with_suffix("") if packed else path).suffix.lower()
+    if suffix not in READERS:
+        raise InputError(
+            f"{path}: the name of a bus log ends in one of {', '.join(READERS)}, or also in .gz (candump -l "
+            "writes .log); rename it"
+        )
     count = 0
+    text: dict[str, Any] = {} if suffix in _BINARY else {"encoding": "utf-8", "errors": "replace"}
+    opened: Any = gzip.open if packed else open
     try:
-        with can.LogReader(path) as reader:
+        with opened(path, "rt" if text else "rb", **text) as file, READERS[suffix](file) as reader:
             for message in reader:
                 count += 1
                 if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
@@ -96,11 +114,14 @@ def _messages(path: Path) -> Iterator[can.Message]:
     except InputError:
         raise
     except Exception as problem:  # each reader of python-can raises what its parsing meets
+        why = str(problem) or type(problem).__name__
+        if count:
+            cut_off.append(one_line(f"damaged after {count} frames: {why}"))
+            return
         raise InputError(
             one_line(
-                f"{path}: cannot be read as a bus log after {count} frames: "
-                f"{str(problem) or type(problem).__name__}; "
-                f"expected a file that ends in one of {FORMATS} (candump: -l or -L, a .log file)"
+                f"{path}: cannot be read as a {suffix} log: {why}; expected what its format says (candump: as "
+                "-l or -L writes it)"
             )
         ) from None
 
