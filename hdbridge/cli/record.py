@@ -33,7 +33,7 @@ FlightsArgument = Annotated[
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(
-        help="Flight recordings of the daemon and bus logs: list, mend, and make records for fit and diagnose.",
+        help="Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )

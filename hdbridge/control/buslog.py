@@ -88,7 +88,7 @@ def import_log(
 
 
 def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
-    """The data frames with 11-bit identifiers; ``cut_off`` says why there are no more, if the log is damaged."""
+    """The data frames with 11-bit identifiers; ``cut_off`` says why a damaged log has no more."""
     packed = path.suffix.lower() == ".gz"
     suffix = (path.with_suffix("") if packed else path).suffix.lower()
     if suffix not in READERS:
@@ -120,8 +120,8 @@ def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
             return
         raise InputError(
             one_line(
-                f"{path}: cannot be read as a {suffix} log: {why}; expected what its format says (candump: as "
-                "-l or -L writes it)"
+                f"{path}: cannot be read as a {suffix} log: {why}; expected what its format says "
+                "(candump: as -l or -L writes it)"
             )
         ) from None
 
