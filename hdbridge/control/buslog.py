@@ -291,7 +291,7 @@ class _Bus:
             self._missing = [
                 f"{index:04X}h:{sub:02X}" for key in encoders - places.keys() for _, index, sub in [key]
             ]
-            self._is_free = any(each is not None and not 1 <= each.every <= 240 for each in carrying)
+            self._is_free = any(each is not None and not 0 <= each.every <= 240 for each in carrying)
             target = cyclic_mode(self._axis).target
             self._targets = {
                 each.can_id: (each.codec, each.codec.positions[target.index, target.sub])

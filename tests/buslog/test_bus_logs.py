@@ -429,3 +429,91 @@ def test_gzip_is_read(tmp_path: Path, logged: Logged) -> None:
     packed = tmp_path / "packed.log.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     check_angles(import_log(packed, AXIS), logged)
+
+
+def synthetic(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """Counts of motor and load of a sweep one way."""
+    motor = np.round(np.linspace(0.0, 3.0 * 8000, count)).astype(int)
+    return motor, np.round(motor * 7.2).astype(int)
+
+
+def write_frames(path: Path, frames: list[tuple[float, int, bytes]]) -> Path:
+    with can.Logger(path) as logger:
+        for time_s, can_id, data in frames:
+            logger.on_message_received(
+                can.Message(timestamp=time_s, arbitration_id=can_id, data=data, is_extended_id=False)
+            )
+    return path
+
+
+def mapping(node: int, number: int, can_id: int, kind: int, *words: int) -> list[tuple[float, int, bytes]]:
+    """The SDO reads of a drive's own PDO mapping."""
+
+    def read(index: int, sub: int, value: int, size: int) -> tuple[float, int, bytes]:
+        command = 0x43 | (4 - size) << 2
+        return 0.0, 0x580 + node, struct.pack("<BHBI", command, index, sub, value)
+
+    return [
+        read(0x1800 + number - 1, 1, 0x4000_0000 | can_id, 4),
+        read(0x1800 + number - 1, 2, kind, 1),
+        read(0x1A00 + number - 1, 0, len(words), 1),
+        *(read(0x1A00 + number - 1, place, word, 4) for place, word in enumerate(words, 1)),
+    ]
+
+
+def check_synthetic(recording: Recording) -> None:
+    motor, load = synthetic()
+    record = recording.record
+    np.testing.assert_allclose(record.motor_position_deg, motor * 360.0 / 8000)
+    np.testing.assert_allclose(record.load_position_deg, load * 360.0 / 2_880_000)
+    np.testing.assert_allclose(np.diff(record.time_s), PERIOD_S, atol=1e-6)
+
+
+def test_event_driven_pdos_are_read_if_one_carries_both_encoders(tmp_path: Path) -> None:
+    frames = mapping(1, 1, 0x181, 255, 0x6064_0020, 0x60E4_0120)
+    for row, (motor, load) in enumerate(zip(*synthetic(), strict=True)):
+        time_s = 1.0 + PERIOD_S * row
+        frames += [(time_s, 0x080, b""), (time_s + 0.001, 0x181, struct.pack("<ii", motor, load))]
+    check_synthetic(import_log(write_frames(tmp_path / "bus.log", frames), AXIS))
+    apart = [
+        *mapping(1, 1, 0x181, 255, 0x6064_0020),
+        *mapping(1, 2, 0x281, 255, 0x60E4_0120),
+        *((time_s, can_id, data[:4]) for time_s, can_id, data in frames[5:]),
+        *((time_s, 0x281, data[4:]) for time_s, can_id, data in frames[5:] if can_id == 0x181),
+    ]
+    with pytest.raises(InputError, match=r"different PDOs \(181h and 281h\) that no SYNC ties together"):
+        import_log(write_frames(tmp_path / "apart.log", apart), AXIS)
+
+
+def test_a_load_encoder_that_is_a_node_of_its_own(tmp_path: Path) -> None:
+    """An absolute encoder of 16 bits whose count wraps, on node 5, with a mapping of its own."""
+    text = (ARTICLE / "axis.yaml").read_text()
+    source = "{index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
+    assert source in text
+    own = "{node: 5, index: 0x6004, subindex: 0, type: uint16, via: tpdo}"
+    (tmp_path / "axis.yaml").write_text(text.replace(source, own))
+    axis = AxisConfig.load(tmp_path / "axis.yaml")
+    frames = mapping(1, 1, 0x181, 1, 0x6064_0020, 0x6041_0010) + mapping(5, 1, 0x1F0, 1, 0x6004_0010)
+    for row, (motor, load) in enumerate(zip(*synthetic(), strict=True)):
+        time_s = 1.0 + PERIOD_S * row
+        frames += [
+            (time_s, 0x080, b""),
+            (time_s + 0.0003, 0x1F0, struct.pack("<H", load % 65536)),
+            (time_s + 0.0005, 0x181, struct.pack("<iH", motor, 0x1237)),
+        ]
+    check_synthetic(import_log(write_frames(tmp_path / "bus.log", frames), axis))
+
+
+def test_a_drive_that_was_not_enabled(tmp_path: Path) -> None:
+    frames = mapping(1, 1, 0x181, 1, 0x6064_0020) + mapping(1, 2, 0x281, 1, 0x60E4_0120, 0x6041_0010)
+    for row, (motor, load) in enumerate(zip(*synthetic(), strict=True)):
+        time_s = 1.0 + PERIOD_S * row
+        frames += [
+            (time_s, 0x080, b""),
+            (time_s + 0.0003, 0x181, struct.pack("<i", motor)),
+            (time_s + 0.0005, 0x281, struct.pack("<iH", load, 0x1231)),
+        ]
+    path = write_frames(tmp_path / "bus.log", frames)
+    with pytest.raises(InputError, match="the drive was never enabled in 200 samples; --all-states"):
+        import_log(path, AXIS)
+    check_synthetic(import_log(path, AXIS, all_states=True))
