@@ -28,6 +28,17 @@ FlightsArgument = Annotated[
     list[Path],
     typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them."),
 ]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER|FILE.csv",
+        help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+    ),
+]
+AllStatesOption = Annotated[
+    bool, typer.Option("--all-states", help="Also samples in which the axis was not enabled.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -142,14 +153,7 @@ def export(
     axis: Annotated[
         str | None, typer.Option("--axis", metavar="NAME", help="Which axis, where there are several.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FOLDER|FILE.csv",
-            help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
-        ),
-    ] = None,
+    out: OutOption = None,
     begin: Annotated[
         str | None,
         typer.Option(
@@ -157,9 +161,7 @@ def export(
         ),
     ] = None,
     end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Up to this time.")] = None,
-    all_states: Annotated[
-        bool, typer.Option("--all-states", help="Also where the axis was not enabled.")
-    ] = False,
+    all_states: AllStatesOption = False,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -177,9 +179,7 @@ def export(
     from hdbridge.daemon.recorder.export import axis_of, exported, last_model
     from hdbridge.daemon.recorder.reading import each_flight, overview, read
 
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
-    _check_out(out)
+    out = _checked_out(out)
     limits = (_time_ns(begin, "--from"), _time_ns(end, "--to"))
 
     def wanted(path: Path) -> Flight | None:
@@ -209,21 +209,12 @@ def import_(
         typer.Argument(metavar="LOG", help="A bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
     ],
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="The axis that was on the bus.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FOLDER|FILE.csv",
-            help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
-        ),
-    ] = None,
+    out: OutOption = None,
     channel: Annotated[
         str | None,
         typer.Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log."),
     ] = None,
-    all_states: Annotated[
-        bool, typer.Option("--all-states", help="Also where the axis was not enabled.")
-    ] = False,
+    all_states: AllStatesOption = False,
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
 
@@ -233,9 +224,7 @@ def import_(
     from hdbridge.axis import AxisConfig
     from hdbridge.control.buslog import import_log
 
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
-    _check_out(out)
+    out = _checked_out(out)
     axis = AxisConfig.load(Profile.find(profile).axis)
     recording = import_log(log, axis, channel=channel, all_states=all_states)
     _write(recording, out)
@@ -279,13 +268,16 @@ def _print_export(recording: Recording, out: Path) -> None:
         )
 
 
-def _check_out(out: Path) -> None:
+def _checked_out(out: Path | None) -> Path:
+    if out is None:
+        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
     if _is_csv(out):
         check_writable(out)
         if out.exists():
             raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
+    return out
 
 
 def _is_csv(path: Path) -> bool:
