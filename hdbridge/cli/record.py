@@ -244,7 +244,7 @@ def _write(recording: Recording, out: Path) -> None:
     if len(parts) > 1:
         raise InputError(
             f"{out}: the record has {len(parts)} parts, between which nothing is known of the axis; expected "
-            "a folder for --out, or a time without gaps by --from and --to"
+            "a folder for --out"
         )
     recording.record.write_csv(out)
 

@@ -415,22 +415,22 @@ def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, 
 
 
 def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
-    """The separator that gives most columns of numbers, and the line of names above them, if there is one."""
+    """The separator that gives most cells of numbers, and the line of names above them, if there is one."""
     best: tuple[int, str, _Line | None] | None = None
     for separator in _SEPARATORS:
         rows = [line for line in head if not line.comment]
         first = next((line for line in rows if _holds_numbers(line, separator)), None)
         if first is None:
             continue
-        count = len(first.cells(separator))
+        count, numbers = len(first.cells(separator)), _numbers(first, separator)
         above = [
             line
             for line in head
             if line.number < first.number and len(line.cells(separator)) in {count, count // 2, count - 1}
         ][-2:]
         words = [line for line in above if not any(map(_is_number, line.cells(separator)))]
-        if best is None or count > best[0]:
-            best = count, separator, words[0] if words else None
+        if best is None or numbers > best[0]:
+            best = numbers, separator, words[0] if words else None
     if best is not None:
         _, separator, header = best
         return separator, header
@@ -439,9 +439,14 @@ def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
 
 
 def _holds_numbers(line: _Line, separator: str) -> bool:
+    values = _numbers(line, separator)
+    return values > 0 and 2 * values >= len(line.cells(separator))
+
+
+def _numbers(line: _Line, separator: str) -> int:
+    """Cells that are numbers or times."""
     cells = line.cells(separator)
-    values = sum(_is_number(cell, separator != ",") or _moment(cell) is not None for cell in cells)
-    return values > 0 and 2 * values >= len(cells)
+    return sum(_is_number(cell, separator != ",") or _moment(cell) is not None for cell in cells)
 
 
 def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequence[int]) -> bool:

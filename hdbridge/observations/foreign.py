@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.observations.cuts import SLOWEST_S, observed
-from hdbridge.records.columns import CHANNELS, Unit, option
+from hdbridge.records.columns import CHANNELS, UNITS, Unit, option
 from hdbridge.records.record import REQUIRED, Record
 from hdbridge.records.wraps import Wraps, count_of, find_wraps, period_in, unwrapped
 from hdbridge.units import DEG_PER_TURN
@@ -19,6 +20,12 @@ LEAST_WHOLE = 10.0
 """Travel beyond which whole numbers are not a chance."""
 SLOWEST_DEG_S = 6.0
 """A motor that is recorded reaches one turn per minute."""
+MOST_COUNTS = 2**32
+"""Counts of the largest counter that wraps within a record."""
+TURNS_SEEN = 4.0
+"""Minimum motor turns in which an error is seen to repeat."""
+REPEATS_SHARE = 0.5
+"""Minimum share of the error's variance that repeats with each turn of the motor."""
 FOLLOWS_SHARE = 0.1
 """Maximum share of its distance from the motor that a command keeps when it is unwrapped."""
 
@@ -39,6 +46,7 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
         for part in observed(record, ratio).record.parts():
             part.check_ratio(ratio)
         _check_speed(path, record)
+        _check_turn(path, record, ratio)
     counts = sum(len(each) for each in records.values())
     if counts and not any(_moves(each) for each in records.values()):
         raise InputError(
@@ -148,7 +156,8 @@ def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
     if abs(period * abs(unit.factor) - DEG_PER_TURN) < 1e-6 * DEG_PER_TURN:
         return "an angle that wraps after a turn"
     counts = period if unit.name == "counts" else period / (count_of(angle / unit.factor) or period)
-    return f"a counter of {counts:.10g} counts that wraps" if counts > 1.0 else "a counter that wraps"
+    plausible = 1.0 < counts <= MOST_COUNTS
+    return f"a counter of {counts:.10g} counts that wraps" if plausible else "a counter that wraps"
 
 
 def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str:
@@ -177,7 +186,10 @@ def _check_speed(path: Path, record: Record) -> None:
     period_s = float(np.median(steps))
     if period_s >= SLOWEST_S:
         unit = origin.units["time"].name
-        finer = {"s": "ms", "ms": "us", "us": "ns"}.get(unit, "ms")
+        seconds = UNITS["s"]
+        per_unit = period_s / abs(origin.units["time"].factor)
+        fast = [each for each in ("ms", "us", "ns") if per_unit * seconds[each].factor < SLOWEST_S]
+        finer = fast[0] if fast else "ns"
         raise InputError(
             f"{path}: time_s advances by {period_s:g} s per sample, too slow to see a motor turn; "
             f"the column '{origin.columns['time']}' looks like {finer}: pass "
@@ -192,4 +204,25 @@ def _check_speed(path: Path, record: Record) -> None:
             f"angles are in radians pass {option('--units', {'motor': 'rad', 'load': 'rad'})}, if the time "
             f"is in milliseconds {option('--units', {'time': 'ms'})}, and "
             f"{option('--units', {'time': 's', 'motor': 'deg'})} if they are degrees and seconds"
+        )
+
+
+def _check_turn(path: Path, record: Record, ratio: float) -> None:
+    """Refuse angles in radians: the error repeats with each turn of the motor, which is 2 pi then."""
+    origin, motor = record.origin, record.motor_position_deg
+    if origin is None or "motor" in origin.stated or float(np.ptp(motor)) < TURNS_SEEN * math.tau:
+        return
+    direction = np.sign(np.gradient(motor))
+    base = np.column_stack([np.ones_like(motor), motor, direction])
+    turns = np.column_stack([f(order * motor) for order in (1, 2) for f in (np.cos, np.sin)])
+    error = record.transmission_error_arcsec(ratio)
+    left, repeating = (
+        float(np.sum((error - columns @ np.linalg.lstsq(columns, error, rcond=None)[0]) ** 2))
+        for columns in (base, np.hstack([base, turns]))
+    )
+    if repeating < (1.0 - REPEATS_SHARE) * left:
+        raise InputError(
+            f"{path}: the load's error repeats every 6.283 of the motor's angle, which is a turn in radians: "
+            f"pass {option('--units', {'motor': 'rad', 'load': 'rad'})}, or "
+            f"{option('--units', {'motor': 'deg'})} if the angles are degrees"
         )

@@ -39,9 +39,11 @@ class Wraps(NamedTuple):
     rows: NDArray[np.intp]
     """The first sample after each jump."""
     period_deg: float
-    """Size of the jumps."""
+    """Size of the jumps, one turn if they are whole turns."""
+    jump_deg: float
+    """Size of the jumps as they are; a whole number of periods."""
     tolerance_deg: float
-    """How far the size may be off."""
+    """How far the sizes may be off."""
 
 
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
@@ -56,19 +58,22 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
     slip = step - _slope(step, other) * other
     alone = np.abs(slip - excess) <= SAME_SHARE * np.abs(excess)
     size = np.where(alone, np.abs(excess), 0.0)
-    jumps = _lasting(np.flatnonzero(size > max(0.5 * float(np.max(size)), LEAST_JUMP_DEG)), excess)
+    large = np.flatnonzero(size > max(0.5 * float(np.max(size)), LEAST_JUMP_DEG))
+    jumps = _lasting(large, excess)
     if not len(jumps):
         return None
     sizes = np.abs(slip[jumps])
+    jump = float(np.mean(sizes))
     turns = np.maximum(np.round(sizes / DEG_PER_TURN), 1.0)
     if np.all(np.abs(sizes / turns - DEG_PER_TURN) < CONSTANT_SHARE * DEG_PER_TURN):
         sizes = sizes / turns
     period = float(np.mean(sizes))
-    calm = float(np.max(np.delete(size, jumps), initial=0.0))
+    calm = float(np.max(np.delete(size, large), initial=0.0))
     if np.any(np.abs(sizes - period) > CONSTANT_SHARE * period) or LEAST_TIMES * calm > period:
         return None
-    noise = float(np.median(np.abs(np.delete(slip, jumps)))) + float(np.std(sizes))
-    wraps = Wraps(jumps + 1, period, 3.0 * noise / math.sqrt(len(jumps)))
+    # An angle wraps at the same place each time, where the gear's error is the same: no mean reduces it.
+    off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
+    wraps = Wraps(jumps + 1, period, jump, off)
     return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
 
 
@@ -76,6 +81,9 @@ def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
     """The period in the unit of the angle's column: the roundest that jumps and counts leave open."""
     scale = abs(unit.factor)
     count = count_of(angle_deg / unit.factor)
+    binary = 2.0 ** round(math.log2(wraps.jump_deg / scale))
+    if unit.name == "counts" and abs(binary * scale - wraps.jump_deg) <= wraps.tolerance_deg:
+        return float(binary)
     if nominal := _nominal(wraps, scale, count):
         return nominal
     period, off = wraps.period_deg / scale, wraps.tolerance_deg / scale
