@@ -21,6 +21,8 @@ LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
 """No gear's error jumps by as much."""
 CONSTANT_SHARE: Final = 0.05
 """Maximum deviation of the jumps of one counter from each other, as a share of their size."""
+NOMINAL_SHARE: Final = 0.02
+"""Maximum deviation of a jump from the period of a counter, as a share."""
 LEAST_TIMES: Final = 3.0
 """A jump is so many times as large as any other change of a step."""
 SAME_SHARE: Final = 0.3
@@ -73,7 +75,7 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
         return None
     # An angle wraps at the same place each time, where the gear's error is the same: no mean reduces it.
     off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
-    wraps = Wraps(jumps + 1, period, jump, off)
+    wraps = Wraps(jumps + 1, period, jump, min(off, NOMINAL_SHARE * period))
     return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
 
 
@@ -130,9 +132,10 @@ def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
 
 
 def count_of(values: FloatArray) -> float:
-    """The largest decimal number that all values differ by multiples of; 0 if they have too many digits."""
+    """The largest decimal number that divides all steps; 0 if that is only the last digit."""
     for decimals in range(10):
         whole = np.round(values * 10.0**decimals)
         if np.all(np.abs(values * 10.0**decimals - whole) < 1e-4) and np.max(np.abs(whole)) < 2.0**53:
-            return float(np.gcd.reduce(np.diff(whole).astype(np.int64))) / 10.0**decimals
+            count = int(np.gcd.reduce(np.diff(whole).astype(np.int64)))
+            return 0.0 if decimals and count == 1 else count / 10.0**decimals
     return 0.0

@@ -346,6 +346,14 @@ def test_a_counter_of_many_turns_is_named_with_its_own_size(tmp_path: Path) -> N
     np.testing.assert_allclose(np.diff(unwrapped.load_position_deg), np.diff(LOAD), atol=1e-5)
 
 
+@pytest.mark.parametrize("jump_deg", [12.08, 47.3, 150.0, 505.0])
+def test_a_single_jump_that_is_no_period_is_no_counter(tmp_path: Path, jump_deg: float) -> None:
+    """A real record has one: the motor's reading slips once. The record is cut there."""
+    path = tmp_path / "bench.csv"
+    path.write_text(text(motor=np.where(np.arange(COUNT) > 100, MOTOR + jump_deg, MOTOR)))
+    check_records({path: Record.read_csv(path)}, RATIO)
+
+
 def test_a_clock_that_wraps_is_named_with_its_period(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     path.write_text(text(time=(TIME * 1000.0 + 65_000.0) % 65_536.0))
