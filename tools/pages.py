@@ -6,7 +6,7 @@ python tools/pages.py docs/tutorial.md --write     and write today's outputs int
 A page is a shell session in a new folder:
 
 * ```` ```sh ```` holds commands, ```` ```console ```` commands after `$ ` with their output. `...` stands for
-  lines of an output that are left out; lines may also be left out before the first and after the last shown one.
+  lines that are left out; lines may also be left out before the first and after the last shown one.
 * ```` ```python ```` holds a program, which runs after the commands above it.
 * ```` ```text ```` after `<!-- output -->` is what the command above it printed.
 * A server (`SERVERS`) starts in the background, as in a terminal of its own.
