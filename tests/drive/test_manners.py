@@ -141,7 +141,7 @@ def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
         (tmp_path / "another.lock").touch()
         found = holders(tmp_path)
     assert list(found) == [os.getpid()]
-    assert re.fullmatch(rf"s\w+can:.* is held by process {os.getpid()}, '.+'", found[os.getpid()])
+    assert re.fullmatch(rf"s\w+can:.* is held by process {os.getpid()} of .+, '.+'", found[os.getpid()])
     assert holders(tmp_path) == {}
 
 

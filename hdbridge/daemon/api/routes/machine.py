@@ -117,7 +117,7 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
         for each in bridge.jobs():
             if each.id == id_:
                 return each
-        raise UnknownError(f"there is no job {id_[:80]!a}; see GET /api/v1/jobs")
+        raise UnknownError(f"there is no job {id_[:80]!a}; GET /api/v1/jobs ('hdbridge ctl jobs') lists them")
 
     @routes.get("/jobs", tags=["Jobs"])
     async def get_jobs() -> list[messages.Job]:
