@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from hdbridge.clock import Clock, MonotonicClock
@@ -280,9 +280,42 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def print_table(table: Table) -> None:
-    """A table at its natural width: a figure cut by a narrow terminal, or a pipe, would be a wrong one."""
-    table.width = Measurement.get(console, console.options.update(width=10_000), table).maximum
-    console.print(table, crop=False)
+    """Prints a table whole; into a pipe or a file always as one table."""
+    for each in fitted(table):
+        console.print(each, crop=False)
+
+
+def fitted(table: Table) -> list[Table]:
+    """The table at its natural width; on a narrow terminal several, each with the first column.
+
+    No figure is cut.
+    """
+    first, *rest = table.columns
+    parts: list[Table] = []
+    widest = console.width if console.is_terminal else 10_000
+    while rest or not parts:
+        count = len(rest)
+        while (width := _natural_width(part := _part(table, [first, *rest[:count]]))) > widest and count > 1:
+            count -= 1
+        part.width = min(width, widest)
+        parts.append(part)
+        rest = rest[count:]
+    return parts
+
+
+def _natural_width(table: Table) -> int:
+    return Measurement.get(console, console.options.update(width=10_000), table).maximum
+
+
+def _part(table: Table, columns: list[Column]) -> Table:
+    """The same rows with these columns only."""
+    part = Table(title=table.title, title_justify=table.title_justify)
+    for each in columns:
+        part.add_column(each.header, justify=each.justify, overflow="fold")
+    cells = zip(*(each.cells for each in columns), strict=True)
+    for row, values in zip(table.rows, cells, strict=True):
+        part.add_row(*values, end_section=row.end_section)
+    return part
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

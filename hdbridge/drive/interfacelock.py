@@ -16,7 +16,8 @@ from hdbridge.files.expectation import one_line
 
 try:
     import fcntl
-except ImportError:  # a system without flock has no lock
+    import pwd
+except ImportError:  # a system without flock has no lock, and no holder to name
     fcntl = None  # type: ignore[assignment]
 
 _SHARED_BY_ALL_USERS: Final = Path("/run/lock")
@@ -41,10 +42,11 @@ def interface_lock(interface: str, channel: object, folder: Path | None = None) 
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             number = _holder(path)
+            end = f"end it with 'kill {number}'" if number else "end it"
             raise BusInUseError(
                 f"{interface}:{channel}: another hdbridge on this machine masters it "
-                f"({process_words(number) if number else 'it'} holds {path}); end that one first "
-                "(--force, in the library shared=True, opens the bus all the same)"
+                f"({process_words(number) if number else 'it'} holds {path}); ask it with 'hdbridge ctl' if "
+                f"it is a daemon, or {end} (--force, in the library shared=True, opens the bus all the same)"
             ) from None
         yield
     finally:
@@ -64,12 +66,27 @@ def holders(folder: Path | None = None) -> dict[int, str]:
 
 
 def process_words(number: int) -> str:
-    """Number and command line of a process."""
+    """Number, user and command line of a process."""
+    user = ""
+    with suppress(OSError):
+        user = f" of {user_name(Path(f'/proc/{number}').stat().st_uid)}"
+    return f"process {number}{user}, '{one_line(command_line(number)[:80])}'"
+
+
+def command_line(number: int) -> str:
+    """The command line of a process; empty if there is no such process."""
     words: list[bytes] = []
     with suppress(OSError):
         words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
-    command = " ".join(each.decode(errors="replace") for each in words if each)
-    return f"process {number}, '{one_line(command[:80])}'"
+    return " ".join(each.decode(errors="replace") for each in words if each)
+
+
+def user_name(uid: int) -> str:
+    """The name of a user of this machine; ``user`` and the number if it has none."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"user {uid}"
 
 
 def _holder(path: Path) -> int:

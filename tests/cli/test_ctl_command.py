@@ -2,6 +2,8 @@
 
 import json
 import os
+import pwd
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +13,7 @@ from support.api import served
 from support.fake_bridge import FakeBridge
 from support.patience import PATIENCE_S, until
 
-from hdbridge import SafetyStop
+from hdbridge import Client, SafetyStop
 from hdbridge.client import messages
 
 
@@ -114,9 +116,8 @@ def test_stops_go_to_all_or_to_those_named_and_need_nobodys_leave(ctl, machine):
 def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machine):
     machine.lease.take("cell controller")
     assert "'cell controller' has the right to move" in ctl("lease")
-    said = ctl("move", "joint-1", 1, status=7)
+    _, said = ctl("move", "joint-1", 1, status=7).splitlines()
     assert "'cell controller'" in said
-    assert len(said.splitlines()) == 1
     assert machine.moved == []
     ctl("move", "joint-1", 1, "--force")
     assert machine.moved == [("joint-1", "move", 1.0, None)]
@@ -145,9 +146,10 @@ def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machin
     ],
 )
 def test_what_is_refused_is_one_line_with_the_exit_status_of_its_kind(ctl, machine, line, status, words):
-    said = ctl(*line.split(), status=status)
+    *named, said = ctl(*line.split(), status=status).splitlines()
     assert words in said
-    assert len(said.splitlines()) == 1
+    assert all(each.startswith("machine 'cell' at ") for each in named)
+    assert len(named) <= 1
     assert machine.moved == []
 
 
@@ -179,6 +181,69 @@ def test_a_job_is_followed_and_its_failure_is_the_commands(ctl, machine, monkeyp
 
     monkeypatch.setattr(machine, "jobs", jobs)
     assert "check the cable" in ctl("job", "joint-1", "step", status=5)
+
+
+def test_a_refusal_names_client_user_and_process_and_its_advice_works(ctl, machine, place):
+    user = pwd.getpwuid(os.getuid()).pw_name
+    with Client(place.socket, name="cell controller") as other, other.lease():
+        said = ctl("move", "joint-1", 1, status=7)
+        assert f"'cell controller ({user}, process {os.getpid()})' holds the right to move" in said
+        assert "take it with 'hdbridge ctl lease --force'" in said
+        ctl("lease", "--force")
+        ctl("move", "joint-1", 1)
+    assert machine.moved == [("joint-1", "move", 1.0, None)]
+
+
+@pytest.mark.parametrize(
+    "line", ["enable joint-1", "stop", "get joint-1 6041h", "lease", "jobs", "mark words"]
+)
+def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monkeypatch, line):
+    done = hdbridge("ctl", *line.split())
+    assert done.stderr == f"machine 'cell' at {place.socket} (from HDBRIDGE_SOCKET)\n"
+    monkeypatch.delenv("HDBRIDGE_SOCKET")
+    assert hdbridge("ctl", *line.split(), "--at", place.socket).stderr == ""
+    (place.socket.parent / "hdbridge").mkdir(exist_ok=True)
+    found = place.socket.parent / "hdbridge" / "cell.sock"
+    found.symlink_to(place.socket)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place.socket.parent))
+    done = hdbridge("ctl", *line.split())
+    found.unlink()
+    assert done.stderr == f"machine 'cell' at {found}\n"
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("line", ["status", "watch --count 1", "jobs"])
+def test_tables_are_whole_at_any_width(ctl, machine, monkeypatch, line, width):
+    shown = (
+        machine.axes["joint-2"]
+        .state()
+        .model_copy(
+            update={
+                "load_target_deg": -1234.5678,
+                "load_position_deg": -1234.5679,
+                "error_arcsec": -98765.43,
+                "correction_arcsec": 12345.67,
+                "queued": 17,
+                "mode": messages.MotionMode.GOTO,
+                "scheme": messages.Scheme.EXTENDED,
+            }
+        )
+    )
+    monkeypatch.setattr(machine.axes["joint-2"], "state", lambda: shown)
+    ctl("job", "joint-1", "step", "--no-wait")
+    for name, value in (("COLUMNS", str(width)), ("FORCE_COLOR", "1"), ("TERM", "xterm")):
+        monkeypatch.setenv(name, value)
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", ctl(*line.split())).replace("\r", "\n").splitlines()
+    rows = [each for each in lines if each[:1] in tuple("┏┃┡│└")]
+    assert rows
+    assert max(map(len, rows)) <= width
+    cells = {cell.strip() for row in rows for cell in re.split("[│┃]", row)}
+    whole = {"step-1", "joint-1", "running", "0 %"} if line == "jobs" else {
+        "joint-2", "-1234.5678", "-1234.5679", "-98765.43", "12345.67", "extended",
+        "disabled, goto, 17 wait", "correction, arcsec",
+    }  # fmt: skip
+    assert whole <= cells
+    assert "…" not in "".join(lines)
 
 
 @pytest.mark.parametrize(

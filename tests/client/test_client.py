@@ -1,6 +1,7 @@
 """The client without asyncio, against the API as it is served."""
 
 import os
+import pwd
 import subprocess
 import sys
 import threading
@@ -11,6 +12,8 @@ from support.api import TOKEN
 
 from hdbridge import Client, DaemonError, InputError, LeaseError, RefusedError, SafetyStop
 from hdbridge.client import messages
+
+USER = pwd.getpwuid(os.getuid()).pw_name
 
 
 def test_one_line_moves_an_axis_and_gives_the_right_to_move_back(api, monkeypatch):
@@ -77,7 +80,7 @@ def test_the_lease_is_held_in_the_block_and_renewed_meanwhile(api):
         with client.lease() as grant:
             time.sleep(1.0)
             assert api.bridge.lease.ended() == ()
-            assert client.lease_state().client == "patience"
+            assert client.lease_state().client == f"patience ({USER}, process {os.getpid()})"
             client.axis("joint-1").move(1)
             with client.lease() as inner:
                 assert inner.token == grant.token

@@ -45,6 +45,9 @@ def test_a_second_client_is_told_who_holds_it_and_for_how_long(lease: Lease, tim
     time.s = 4.0
     with pytest.raises(LeaseError, match=r"'page' holds the right to move; it runs out in 6\.0 s"):
         lease.take("script")
+    lease.doing = lambda: "axis 'a' is in motion (jog)"
+    with pytest.raises(LeaseError, match=r"renewed; axis 'a' is in motion \(jog\); wait, or take it with"):
+        lease.take("script")
 
 
 def test_even_its_own_holder_takes_it_twice_only_by_force(lease: Lease) -> None:
@@ -72,7 +75,7 @@ def test_it_runs_out_and_says_so_once(lease: Lease, time: Time) -> None:
     assert lease.ended() == ()
 
 
-@pytest.mark.parametrize("client", ["", "  ", "x" * 201])
+@pytest.mark.parametrize("client", ["", "  ", "x" * 401])
 def test_a_client_has_a_name(lease: Lease, client: str) -> None:
     with pytest.raises(InputError, match="name"):
         lease.take(client)

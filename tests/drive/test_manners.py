@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import re
 import subprocess
 import sys
@@ -117,7 +118,11 @@ def test_it_listens_once_and_not_on_a_bus_of_its_own() -> None:
 
 def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
     with interface_lock("socketcan", "can0", tmp_path):
-        other = f"socketcan:can0: another hdbridge on this machine masters it .*process {os.getpid()}, '"
+        user, number = pwd.getpwuid(os.getuid()).pw_name, os.getpid()
+        other = (
+            "socketcan:can0: another hdbridge on this machine masters it "
+            f".*process {number} of {user}, '.*end it with 'kill {number}'"
+        )
         with (
             pytest.raises(BusInUseError, match=other),
             interface_lock("socketcan", "can0", tmp_path),
@@ -136,7 +141,7 @@ def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
         (tmp_path / "another.lock").touch()
         found = holders(tmp_path)
     assert list(found) == [os.getpid()]
-    assert re.fullmatch(rf"s\w+can:.* is held by process {os.getpid()}, '.+'", found[os.getpid()])
+    assert re.fullmatch(rf"s\w+can:.* is held by process {os.getpid()} of .+, '.+'", found[os.getpid()])
     assert holders(tmp_path) == {}
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -49,11 +49,25 @@ TakeOption = Annotated[
 ]
 
 
-def connected(at: str | None) -> Client:
-    """The daemon; use it as a context manager."""
+def connected(at: str | None, *, named: bool = True) -> Client:
+    """The daemon; use it as a context manager. ``named`` reports which one it is if no address was given."""
     from hdbridge.client import Client
 
-    return Client(at, name="hdbridge ctl")
+    client = Client(at, name="hdbridge ctl")
+    if named:
+        _name(at, client)
+    return client
+
+
+def _name(at: str | None, client: Client) -> None:
+    """Reports the machine that a command acts on if it was not given with the command."""
+    if at is not None:
+        return
+    place = client.address.socket
+    machine = f"machine at {client.address}" if place is None else f"machine '{place.stem}' at {place}"
+    given = next((each for each in ("HDBRIDGE_SOCKET", "HDBRIDGE_URL") if os.environ.get(each)), None)
+    source = f" (from {given})" if given else ""
+    notes.print(f"{machine}{source}", markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -63,6 +77,7 @@ def stopping(at: str | None) -> Iterator[Client]:
 
     try:
         with Client(at, name="hdbridge ctl", timeout_s=STOP_S) as client:
+            _name(at, client)
             yield client
     except DaemonError as problem:
         if type(problem) is not DaemonError:
@@ -73,15 +88,14 @@ def stopping(at: str | None) -> Iterator[Client]:
 def _who_holds(at: str | None) -> str:
     """The processes that hold an interface, or listen at the daemon's socket, and what to do about them."""
     from hdbridge.client.address import find
+    from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
 
     found = holders()
     with suppress(HdbridgeError, OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as raw:
         raw.settimeout(STOP_S)
         raw.connect(str(find(at).socket))
-        listens, _, _ = struct.unpack("3i", raw.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-        # The service listens; its parent is the keeper, which holds the interface.
-        number = int(Path(f"/proc/{listens}/stat").read_text().rpartition(")")[2].split()[1])
+        number = daemon_of(raw)
         found.setdefault(number, f"the daemon is {process_words(number)}")
     if not found:
         return "no process of this machine holds an interface"

@@ -14,15 +14,15 @@ from rich.live import Live
 from rich.text import Text
 
 from hdbridge.cli.ctl.common import AtOption, TakeOption, axes_table, concerns, connected, document
-from hdbridge.cli.options import JsonOption, console, print_table, write_json
+from hdbridge.cli.options import JsonOption, console, fitted, print_table, write_json
 
 if TYPE_CHECKING:
     from hdbridge.client.messages import Event, LeaseState, MachineState
 
 
 def status(at: AtOption = None, json_file: JsonOption = None) -> None:
-    """Tell how a machine and its axes stand."""
-    with connected(at) as client:
+    """Report the state of a machine and its axes."""
+    with connected(at, named=False) as client:
         state = client.state()
     write_json(json_file, document("ctl-status", state))
     for line in _machine(state):
@@ -44,8 +44,8 @@ def watch(
         bool, typer.Option("--lines", help="A JSON object per line on standard output, in place of a table.")
     ] = False,
 ) -> None:
-    """Show how a machine stands, again and again; it moves nothing."""
-    with connected(at) as client:
+    """Show the state of a machine until Ctrl-C; it moves nothing."""
+    with connected(at, named=False) as client:
         if lines:
             for _ in _looks(count, every_s):
                 print(client.state().model_dump_json(), flush=True)
@@ -53,8 +53,8 @@ def watch(
         with Live(console=console, auto_refresh=False, screen=False) as shown:
             for _ in _looks(count, every_s):
                 state = client.state()
-                words = [Text(line) for line in (*_machine(state), *_concerns(state))]
-                shown.update(Group(words[0], axes_table(state.axes), *words[1:]), refresh=True)
+                words = (Text(line) for line in (*_machine(state), *_concerns(state)))
+                shown.update(Group(*words, *fitted(axes_table(state.axes))), refresh=True)
 
 
 def events(

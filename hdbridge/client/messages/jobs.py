@@ -55,6 +55,7 @@ class Job(Report):
     id: str = Field(examples=["step-3"])
     kind: JobKind
     axis: Name
+    client: str = Field("", description="who began it", examples=["hdbridge ctl (anna, process 4242)"])
     state: JobState
     share: float = Field(0.0, ge=0, le=1, description="how much of it is done, 0 to 1", examples=[0.42])
     text: str = Field("", description="what it is at", examples=["sweep 2 of 3"])

@@ -15,6 +15,7 @@ import struct
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from hdbridge.drive.interfacelock import command_line, process_words
 from hdbridge.errors import DaemonError, InputError
 
 MODE: Final = 0o660
@@ -94,6 +95,15 @@ def peer_of(connected: socket.socket) -> Peer | None:
     return Peer(*_CREDENTIALS.unpack(found))
 
 
+def daemon_of(connected: socket.socket) -> int:
+    """The process number of the daemon at the other end of a Unix socket: its keeper, which has begun it."""
+    peer = peer_of(connected)
+    assert peer is not None
+    if "hdbridge.daemon.service" not in command_line(peer.pid):
+        return peer.pid
+    return int(Path(f"/proc/{peer.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
+
+
 def _group(name: str) -> int:
     try:
         return grp.getgrnam(name).gr_gid
@@ -118,4 +128,8 @@ def _clear(path: Path) -> None:
             return
         except OSError as problem:
             raise InputError(f"{path}: cannot be asked: {problem.strerror or problem}") from None
-    raise DaemonError(f"{path}: another daemon listens there; stop it, or give this one another name")
+        number = daemon_of(probe)
+    raise DaemonError(
+        f"{path}: another daemon listens there ({process_words(number)}); ask it with 'hdbridge ctl', end it "
+        f"with 'kill {number}', or give this one another name"
+    )

@@ -94,6 +94,18 @@ class ServiceBridge:
         self._tasks: set[asyncio.Task[None]] = set()
         self._verifying: set[str] = set()
         self._settling: set[str] = set()
+        self.core.lease.doing = self._doing
+
+    def _doing(self) -> str:
+        """The jobs and motions of the axes at present, in words for a client without the lease."""
+        states = [axis.state() for axis in self.axes.values()]
+        jobs = [reports.job_words(each.job, " --force") for each in states if each.job is not None]
+        moving = [
+            f"axis '{each.name}' is in motion ({each.mode})"
+            for each in states
+            if each.job is None and each.mode != "hold"
+        ]
+        return "; ".join((*jobs, *moving))
 
     @property
     def lease(self) -> Lease:

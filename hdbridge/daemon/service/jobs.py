@@ -99,6 +99,7 @@ class JobBook:
             id=f"{kind.value}-{next(self._numbers)}",
             kind=kind,
             axis=axis.name,
+            client=client.client if (client := self._core.lease.holder) is not None else "",
             state=JobState.RUNNING,
             started=now,
         )

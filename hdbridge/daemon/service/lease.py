@@ -15,7 +15,8 @@ from hmac import compare_digest
 from hdbridge.errors import InputError, LeaseError
 
 TOKEN_BYTES = 16
-LONGEST_NAME = 200
+LONGEST_NAME = 400
+"""A client's own name, and its user and process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,8 @@ class Lease:
         self._client = ""
         self._taken_s = self._heard_s = 0.0
         self._ended: list[str] = []
+        self.doing: Callable[[], str] = lambda: ""
+        """Returns what the machine does at present and how to end it, in words, for refusals."""
 
     @property
     def holder(self) -> Holder | None:
@@ -73,7 +76,7 @@ class Lease:
             left_s = holder.expires_s - self._now()
             raise LeaseError(
                 f"'{holder.client}' holds the right to move; it runs out in {left_s:.1f} s unless it is "
-                "renewed: wait, or take it by force"
+                f"renewed{self._doing()}; wait, or take it with 'hdbridge ctl lease --force'"
             )
         if holder is not None:
             self._end()
@@ -99,7 +102,9 @@ class Lease:
             raise LeaseError("nobody holds the right to move, or it has run out: take the lease first")
         assert self._token is not None
         if not compare_digest(token.encode(), self._token.encode()):
-            raise LeaseError(f"'{holder.client}' holds the right to move: take the lease first")
+            raise LeaseError(
+                f"'{holder.client}' holds the right to move{self._doing()}; take the lease first"
+            )
         self._heard_s = self._now()
 
     def holds(self, token: str) -> bool:
@@ -118,6 +123,10 @@ class Lease:
     def _expire(self) -> None:
         if self._token is not None and self._now() - self._heard_s >= self.timeout_s:
             self._end()
+
+    def _doing(self) -> str:
+        doing = self.doing()
+        return f"; {doing}" if doing else ""
 
     def _end(self) -> None:
         self._token = None

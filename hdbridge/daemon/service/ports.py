@@ -18,6 +18,7 @@ from hdbridge.daemon.service.interface import WayPoint
 from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.daemon.service.power import UNKNOWN, AxisPower
+from hdbridge.daemon.service.reports import job_words
 from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import HdbridgeError, RefusedError
@@ -74,19 +75,28 @@ class ServiceAxis:
         """LeaseError unless the lease is theirs; RefusedError while something has the axis to itself."""
         self.core.lease.check(holder)
         if self.motion.busy(Kind.JOB):
-            raise RefusedError(f"{self.name}: a job is running on this axis; wait for its end, or cancel it")
+            raise self._job_refusal()
         self.check_free()
 
     def check_free(self) -> None:
         """RefusedError while something has the drive to itself."""
         if self._doing:
-            raise RefusedError(f"{self.name}: {self._doing}; wait for its end, or stop it")
+            raise RefusedError(
+                f"{self.name}: {self._doing}; wait for its end, or end it with "
+                f"'hdbridge ctl stop {self.name}'"
+            )
+
+    def _job_refusal(self) -> RefusedError:
+        job = self.state().job
+        words = "a job ends on this axis" if job is None else job_words(job)
+        return RefusedError(f"{self.name}: {words}, or wait for its end")
 
     @asynccontextmanager
     async def _alone(self, doing: str) -> AsyncIterator[None]:
         """Nothing else begins meanwhile; to stop is possible at any time."""
         self.check_free()
-        self._doing = doing
+        holder = self.core.lease.holder
+        self._doing = doing if holder is None else f"{doing} for '{holder.client}'"
         try:
             async with self._drive:
                 yield
@@ -259,7 +269,7 @@ class ServiceAxis:
     async def _use(self, setting: CompensationSetting) -> None:
         """Have the control process compensate by a setting, and wait until it does."""
         if self._job_runs:
-            raise RefusedError(f"{self.name}: a job measures on this axis; wait for its end, or cancel it")
+            raise self._job_refusal()
         log, index = self.core.log, self.link.index
         since = log.newest
         await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))

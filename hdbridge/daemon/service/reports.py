@@ -105,6 +105,15 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
     )
 
 
+def job_words(job: messages.Job, options: str = "") -> str:
+    """A job that runs: how far it is, who began it, and the command that ends it, with these options."""
+    begun = f", begun by '{job.client}'" if job.client else ""
+    return (
+        f"job {job.id} runs on axis '{job.axis}' ({100 * job.share:.0f} % done{begun}); "
+        f"'hdbridge ctl cancel {job.id}{options}' ends it"
+    )
+
+
 def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
     """The model and its age; None where there is none."""
     if not in_use.model.effects:

@@ -31,7 +31,9 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         assert stat.S_IMODE(daemon.socket.parent.stat().st_mode) == 0o700
         second = run_to_its_end(tmp_path, "article", "--simulate")
         assert second.returncode == 7
-        assert "another daemon listens there" in second.stderr
+        keeper = daemon.process.pid
+        assert f"another daemon listens there (process {keeper} of " in second.stderr
+        assert f"end it with 'kill {keeper}'" in second.stderr
 
         page, token = next(each for each in daemon.names() if each.startswith("page: ")).split("#token=")
         state_of = page.removeprefix("page: ") + "api/v1/state"

@@ -9,7 +9,7 @@ from support.service import Service, play, stepped_service, until
 from hdbridge.client.messages import Job, JobKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.jobs import in_own_process
-from hdbridge.errors import InputError, RefusedError
+from hdbridge.errors import InputError, LeaseError, RefusedError
 from hdbridge.model import TransmissionModel, store
 from hdbridge.records.recording import Recording
 
@@ -47,10 +47,14 @@ def test_a_stepping_test_runs_and_is_kept(service: Service) -> None:
             job = await axis.job(token, JobKind.STEP, {"count": 6, "scheme": ["none", "both"]})
             assert job.state == "running"
             assert axis.state().job is not None
-            with pytest.raises(RefusedError, match="a job is running"):
+            words = rf"job {job.id} runs on axis 'axis1' \(\d+ % done, begun by 'test'\)"
+            ended_by = f"'hdbridge ctl cancel {job.id}' ends it"
+            with pytest.raises(RefusedError, match=f"{words}; {ended_by}, or wait for its end"):
                 await axis.move(token, 1.0)
-            with pytest.raises(RefusedError, match="a job is running"):
+            with pytest.raises(RefusedError, match=words):
                 await axis.job(token, JobKind.STEP)
+            with pytest.raises(LeaseError, match=f"'test' holds the right to move; .*{words}.*--force"):
+                bridge.lease.take("another")
             done = await ended(bridge, job)
             assert done.state == "done", done.problem
             assert done.share == 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pwd
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
@@ -21,6 +20,7 @@ from hdbridge.daemon.api.routes.parts import (
     stopped,
 )
 from hdbridge.daemon.service.interface import Bridge
+from hdbridge.drive.interfacelock import user_name
 
 
 def machine_routes(bridge: Bridge) -> APIRouter:
@@ -68,7 +68,7 @@ def _add_lease(routes: APIRouter, bridge: Bridge) -> None:
     @routes.post("/lease", tags=["Lease"], status_code=201, responses=refusals((400, 422, 423)))
     async def take_lease(wanted: messages.LeaseRequest, request: Request) -> messages.LeaseGrant:
         """Take the right to move. It lasts while it is used, or renewed; 423 says who has it."""
-        client = wanted.client.strip() or _who(request)
+        client = _who(request, wanted.client.strip())
         token = bridge.lease.take(client, force=wanted.force)
         return messages.LeaseGrant(token=token, client=client, timeout_s=bridge.lease.timeout_s)
 
@@ -117,7 +117,7 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
         for each in bridge.jobs():
             if each.id == id_:
                 return each
-        raise UnknownError(f"there is no job {id_[:80]!a}; see GET /api/v1/jobs")
+        raise UnknownError(f"there is no job {id_[:80]!a}; GET /api/v1/jobs ('hdbridge ctl jobs') lists them")
 
     @routes.get("/jobs", tags=["Jobs"])
     async def get_jobs() -> list[messages.Job]:
@@ -142,14 +142,10 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
         return await port(bridge, axis).job(holder, wanted.kind, wanted.options)
 
 
-def _who(request: Request) -> str:
-    """Who asks, where it gives no name: over a Unix socket the kernel knows."""
+def _who(request: Request, name: str) -> str:
+    """Who asks: the name that it gives, and its user and process, which the kernel knows of a Unix socket."""
     peer, number = request.client or ("a client", 0)
     if not peer.startswith("uid="):
-        return f"{peer}:{number}"
-    uid = int(peer.removeprefix("uid="))
-    try:
-        user = pwd.getpwuid(uid).pw_name
-    except KeyError:
-        user = f"user {uid}"
-    return f"{user}, process {number}"
+        return name or f"{peer}:{number}"
+    process = f"{user_name(int(peer.removeprefix('uid=')))}, process {number}"
+    return f"{name} ({process})" if name else process
