@@ -13,7 +13,6 @@ from support.patience import until
 from hdbridge.client.messages import Event, EventKind, Job
 from hdbridge.daemon.page import page_file, page_files
 
-
 NOON = "2025-01-31T12:00:00Z"
 
 
