@@ -26,12 +26,10 @@ from hdbridge.drive.nameplate import (
     torque_notes,
 )
 from hdbridge.drive.objects import Address, IntegerType
-from hdbridge.drive.sdo import SdoAbortError
+from hdbridge.drive.sdo import ABSENT, SdoAbortError
 from hdbridge.errors import DriveError, SdoError
 
 REST_S: Final = 1.0
-_ABSENT: Final = (0x0602_0000, 0x0609_0011)
-"""Abort codes: no such object, no such sub-index."""
 
 
 def files(context: BringUpContext) -> Verdict:
@@ -112,7 +110,7 @@ def eds(context: BringUpContext) -> Verdict:
         try:
             drive.sdo.read(index, sub)
         except SdoAbortError as error:
-            if error.code in _ABSENT:  # other codes refuse the access, not the object
+            if error.code in ABSENT:  # other codes refuse the access, not the object
                 wrong.append(str(error).split(";", 1)[0])
         except SdoError as error:
             if "answered" not in str(error):

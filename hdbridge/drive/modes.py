@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from hdbridge.drive import objects
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import HALT_BIT, ProcessImage
+from hdbridge.drive.sdo import ABSENT, SdoAbortError
 from hdbridge.drive.states import HOLD, State, decode
 from hdbridge.drive.writes import motor_rate
 from hdbridge.errors import DriveError, HdbridgeError, InputError
@@ -182,8 +183,10 @@ def run_homing(commander: Commander, homing: Homing) -> None:
         sdo.store(objects.HOMING_SPEED_SWITCH, motor_rate(axis, homing.switch_velocity_deg_s))
         sdo.store(objects.HOMING_SPEED_ZERO, motor_rate(axis, homing.zero_velocity_deg_s))
         _store_if_there(sdo, objects.HOMING_ACCELERATION, motor_rate(axis, homing.acceleration_deg_s2))
-        if offset or sdo.has(objects.HOME_OFFSET.index):
+        if offset:
             sdo.store(objects.HOME_OFFSET, offset)
+        else:
+            _store_if_there(sdo, objects.HOME_OFFSET, 0)
         commander.control(ENABLED)
         before = commander.statusword()
         commander.control(ENABLED | START_HOMING)
@@ -199,8 +202,11 @@ def run_homing(commander: Commander, homing: Homing) -> None:
 
 def _store_if_there(sdo: SdoClient, address: Address, value: int) -> None:
     """Set an object that is optional in CiA 402; a drive without it has a value of its own."""
-    if sdo.has(address.index, address.sub):
+    try:
         sdo.store(address, value)
+    except SdoAbortError as refusal:
+        if refusal.code not in ABSENT:
+            raise
 
 
 def halt(commander: Commander) -> bool:

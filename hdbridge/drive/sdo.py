@@ -52,6 +52,10 @@ _ADVICE: Final = {
 }
 
 
+ABSENT: Final = frozenset({0x0602_0000, 0x0609_0011})
+"""Abort codes of a drive that does not have the object."""
+
+
 class SdoAbortError(SdoError):
     """The node refused with an abort code: it is there, and it means it."""
 
