@@ -26,6 +26,7 @@ from hdbridge.procedures.plan import Plan
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.procedures.stepping import SteppingOutcome
 from hdbridge.records.recording import Recording
+from hdbridge.units import figure
 
 WINDOW_S = 0.06
 """Over which the stepping test takes its mean at rest."""
@@ -136,6 +137,16 @@ class Validation:
     def worse(self) -> tuple[str, ...]:
         """What got worse in one direction, in words."""
         return worse_ways(self.before, self.after)
+
+    @property
+    def summary(self) -> str:
+        """The result in one sentence: 3 sigma before and after, their ratio, and the floor."""
+        before, after = (each.pooled.three_sigma_arcsec for each in (self.before, self.after))
+        ratio = before / after if after <= before else after / before
+        return (
+            f"{before:.1f} to {after:.1f} arcsec (3 sigma), {figure(ratio, 2)} times "
+            f"{'better' if after <= before else 'worse'}; best possible {self.floor.three_sigma_arcsec:.2f}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, which `from_dict` reads back."""

@@ -58,7 +58,7 @@ PANELS: Final = {
     "Day and night": {
         "run": "Hold the drives of a machine, day and night, and take load angles from clients.",
         "ctl": "Ask a daemon that runs: look, move, stop, compensate, run procedures.",
-        "record": "The daemon's flight recordings: list, mend, and make records for fit and diagnose.",
+        "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
         "start of the computer.",
     },

@@ -11,7 +11,20 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import HtmlOption, JsonOption, console, notes, print_table, write_json, write_result
+from hdbridge.cli.options import (
+    ColumnsOption,
+    HtmlOption,
+    JsonOption,
+    UnitsOption,
+    UnwrapOption,
+    console,
+    load_recordings,
+    model_file,
+    notes,
+    print_table,
+    write_json,
+    write_result,
+)
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 
@@ -34,8 +47,16 @@ def run(
         typer.Argument(metavar="RECORD...", help="CSV files or recording folders, in their order."),
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="MODEL.yaml", help="The model that is put to the test.")
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="MODEL.yaml|PROFILE",
+            help="The model that is put to the test, or the profile whose active one is.",
+        ),
     ] = None,
+    columns: ColumnsOption = None,
+    units: UnitsOption = None,
+    unwrap: UnwrapOption = None,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     extend: Annotated[
@@ -64,15 +85,20 @@ def run(
     from hdbridge.diagnose import diagnose
     from hdbridge.diagnose.planned import plan_report
     from hdbridge.model import TransmissionModel
-    from hdbridge.observations.foreign import check_once
     from hdbridge.procedures.plan import Plan
     from hdbridge.records.recording import Recording
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render
 
     if model is None:
-        raise InputError("--model is missing; name the model file that the records are compared with")
-    known = TransmissionModel.load(model)
+        given = shlex.join(map(str, records)) if records else "RECORD"
+        raise InputError(
+            "--model is missing: the records are compared with a model; fit one, hdbridge fit "
+            f"{given} --ratio N --out model.yaml, and pass --model model.yaml, or pass the profile of an "
+            "axis that was calibrated, --model PROFILE"
+        )
+    path = model_file(model)
+    known = TransmissionModel.load(path)
     if plan is not None:
         if records:
             raise InputError("--plan looks at a plan before anything is measured; leave the records out")
@@ -82,9 +108,7 @@ def run(
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
-    loaded = [Recording.load(each) for each in records]
-    check_once(records, [each.record for each in loaded])
-    recordings = dict(zip(records, loaded, strict=True))
+    recordings = load_recordings(records, columns, units, unwrap)
     result = diagnose(
         recordings,
         known,
@@ -92,6 +116,8 @@ def run(
         progress=lambda words: notes.print(f"{words} ..."),
     )
     recording = Recording.joined(list(recordings.values()))
+    options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
+    said = [word for name, texts in options.items() for text in texts or () for word in (name, text)]
     document = result.as_dict()
     # Files first: who reads the tables may have had enough of them (`| head`).
     write_json(json_file, document)
@@ -99,8 +125,8 @@ def run(
         page = diagnosis_page(
             result,
             title=_title(recording, records),
-            provenance=_provenance(recording, records, model),
-            command=shlex.join(["hdbridge", "diagnose", *map(str, records), "--model", str(model)]),
+            provenance=_provenance(recording, records, path),
+            command=shlex.join(["hdbridge", "diagnose", *map(str, records), "--model", model, *said]),
         )
         write_result(html_file, render(page))
     if extend is not None:

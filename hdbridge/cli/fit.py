@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.cli.options import HtmlOption, JsonOption, console, write_json, write_result
+from hdbridge.cli.options import (
+    ColumnsOption,
+    HtmlOption,
+    JsonOption,
+    UnitsOption,
+    UnwrapOption,
+    console,
+    load_recordings,
+    model_file,
+    write_json,
+    write_result,
+)
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
@@ -34,9 +45,16 @@ def command(
         typer.Option("--axis", metavar="PROFILE", help="The axis that was recorded: ratio and binding."),
     ] = None,
     active: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="ACTIVE.yaml", help="Model to compare with, and to fall back on."),
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="MODEL.yaml|PROFILE",
+            help="Model to compare with, and to fall back on.",
+        ),
     ] = None,
+    columns: ColumnsOption = None,
+    units: UnitsOption = None,
+    unwrap: UnwrapOption = None,
     independent_zeros: Annotated[
         bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
     ] = False,
@@ -51,25 +69,23 @@ def command(
 ) -> None:
     """Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.
 
-    A CSV file needs the columns `time_s`, `motor_position_deg`, `load_position_deg` (multi-turn);
-    `motor_target_deg` helps. Nothing is activated: a fit that shall be used goes to a profile by --out.
+    A CSV file needs a time, a motor angle and a load angle (multi-turn); the commanded motor angle helps.
+    They are called `time_s`, `motor_position_deg`, `load_position_deg` and `motor_target_deg`, or as
+    `--columns` and `--units` say. Nothing is activated: a fit that shall be used goes to a profile by --out.
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import fit
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
     from hdbridge.model import TransmissionModel
-    from hdbridge.observations.foreign import check_once
-    from hdbridge.records.recording import Recording
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
-    loaded = [Recording.load(each) for each in records]
-    check_once(records, [each.record for each in loaded])
-    compared = TransmissionModel.load(active) if active else None
+    loaded = load_recordings(records, columns, units, unwrap)
+    compared = TransmissionModel.load(model_file(active)) if active else None
     if compared and config:
         compared.check_bound_to(config)
     found = fit(
-        dict(zip(records, loaded, strict=True)),
+        loaded,
         ratio=ratio,
         axis=config,
         active=compared,

@@ -11,6 +11,7 @@ from rich.markup import escape
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ChannelOption,
+    ColumnsOption,
     ForceOption,
     HtmlOption,
     InterfaceOption,
@@ -19,8 +20,11 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
+    UnitsOption,
+    UnwrapOption,
     console,
     load_axis,
+    load_recordings,
     notes,
     write_json,
     write_result,
@@ -57,6 +61,9 @@ def command(
         bool,
         typer.Option("--independent-zeros", help="The encoders' zeros were lost between the recordings."),
     ] = False,
+    columns: ColumnsOption = None,
+    units: UnitsOption = None,
+    unwrap: UnwrapOption = None,
     auto: Annotated[
         bool,
         typer.Option(
@@ -88,16 +95,13 @@ def command(
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.improvement import Source, improve
     from hdbridge.improvement.trial import trial_s
-    from hdbridge.records.recording import Recording
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
     active = _active(files)
     if given and resume is not None:
         raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
-    recordings = tuple(given or ())
-    for each in recordings:
-        Recording.load(each)  # refused before anything is connected
+    recordings = load_recordings(given or (), columns, units, unwrap)  # refused before anything is connected
     work = Measurement.asked(axis, plan, out, resume)
     trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"
     if recordings:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import can
 
     from hdbridge.axis import AxisConfig
+    from hdbridge.records.recording import Recording
 
 
 class _Console(Console):
@@ -80,6 +81,31 @@ ForceOption = Annotated[
     bool,
     typer.Option("--force", help="Speak even where another master is heard on the bus, or has its lock."),
 ]
+ColumnsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--columns",
+        metavar="CHANNEL=COLUMN,...",
+        help="Columns of a CSV file by name or number: time, motor, load, target, load_torque, motor_torque, "
+        "temperature.",
+    ),
+]
+UnitsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--units",
+        metavar="CHANNEL=UNIT,...",
+        help="Their units, for example motor=counts:65536,load=rad,time=ms; -deg counts the other way.",
+    ),
+]
+UnwrapOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--unwrap",
+        metavar="CHANNEL=PERIOD,...",
+        help="Counters that wrap, with their period in the column's unit: motor=65536.",
+    ),
+]
 JsonOption = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write the result for machines; - is standard output."),
@@ -90,6 +116,50 @@ HtmlOption = Annotated[
     typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
     Kind.PAGE,
 ]
+
+
+def load_recordings(
+    paths: Sequence[Path],
+    columns: list[str] | None = None,
+    units: list[str] | None = None,
+    unwrap: list[str] | None = None,
+) -> dict[Path, Recording]:
+    """Recording folders and CSV files by their path; says what was assumed of files of other programs."""
+    from hdbridge.observations.foreign import check_once
+    from hdbridge.records.recording import Recording
+
+    loaded = [Recording.load(each, columns=columns, units=units, unwrap=unwrap) for each in paths]
+    for each in loaded:
+        if each.record.origin is not None and each.record.origin.remark:
+            notes.print(each.record.origin.remark, markup=False, soft_wrap=True)
+    check_once(paths, [each.record for each in loaded])
+    return dict(zip(paths, loaded, strict=True))
+
+
+def model_file(text: str) -> Path:
+    """Model file that an option names, directly or through the profile whose active model it is.
+
+    InputError if there is neither, and if the profile has no model yet.
+    """
+    path = Path(text)
+    if path.is_file() and path.name != "axis.yaml":
+        return path
+    try:
+        files = Profile.find(text)
+    except InputError as problem:
+        raise InputError(f"{text}: no such model file, and no such profile: {problem}") from None
+    if not files.axis.is_file():
+        raise InputError(
+            f"{text}: no such model file, and no profile; expected a model file, or a folder "
+            "with an axis.yaml"
+        )
+    if not files.model.is_file():
+        raise InputError(
+            f"{files.folder}: there is no model.yaml; make one: hdbridge calibrate {files.folder}, and "
+            f"commit it: hdbridge model commit {files.folder}; or fit one to a record: hdbridge fit RECORD "
+            f"--axis {files.folder} --out model.yaml, and pass --model model.yaml"
+        )
+    return files.model
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:

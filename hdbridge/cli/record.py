@@ -1,4 +1,4 @@
-"""``hdbridge record``: the daemon's flight recordings: look, mend, and make records of them."""
+"""``hdbridge record``: records from the daemon's flight recordings and from bus logs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from hdbridge.cli.options import JsonOption, console, notes, print_table, write_
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
 from hdbridge.files.outputs import Kind
+from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.daemon.recorder.reading import Flight, Overview
@@ -27,12 +28,23 @@ FlightsArgument = Annotated[
     list[Path],
     typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them."),
 ]
+OutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER|FILE.csv",
+        help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+    ),
+]
+AllStatesOption = Annotated[
+    bool, typer.Option("--all-states", help="Also samples in which the axis was not enabled.")
+]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(
-        help="The daemon's flight recordings: list, mend, and make records for fit and diagnose.",
+        help="Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )
@@ -40,6 +52,7 @@ def register(app: typer.Typer) -> None:
     group.command()(info)
     group.command()(mend)
     group.command()(export)
+    group.command("import")(import_)
     app.add_typer(group, name="record")
 
 
@@ -140,14 +153,7 @@ def export(
     axis: Annotated[
         str | None, typer.Option("--axis", metavar="NAME", help="Which axis, where there are several.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FOLDER|FILE.csv",
-            help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
-        ),
-    ] = None,
+    out: OutOption = None,
     begin: Annotated[
         str | None,
         typer.Option(
@@ -155,9 +161,7 @@ def export(
         ),
     ] = None,
     end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Up to this time.")] = None,
-    all_states: Annotated[
-        bool, typer.Option("--all-states", help="Also where the axis was not enabled.")
-    ] = False,
+    all_states: AllStatesOption = False,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -175,9 +179,7 @@ def export(
     from hdbridge.daemon.recorder.export import axis_of, exported, last_model
     from hdbridge.daemon.recorder.reading import each_flight, overview, read
 
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
-    _check_out(out)
+    out = _checked_out(out)
     limits = (_time_ns(begin, "--from"), _time_ns(end, "--to"))
 
     def wanted(path: Path) -> Flight | None:
@@ -201,6 +203,39 @@ def export(
     _print_export(recording, out)
 
 
+def import_(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+    ],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="The axis that was on the bus.")],
+    out: OutOption = None,
+    channel: Annotated[
+        str | None,
+        typer.Option("--channel", metavar="NAME", help="The bus, if the node is on several in the log."),
+    ] = None,
+    all_states: AllStatesOption = False,
+) -> None:
+    """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
+
+    The PDO mapping comes from the SDO traffic in the log, else from the axis file. Log from the drive's
+    boot-up on, so that the mapping is in it. Nothing is sent, and nothing is interpolated.
+    """
+    from hdbridge.axis import AxisConfig
+    from hdbridge.control.buslog import import_log
+
+    out = _checked_out(out)
+    axis = AxisConfig.load(Profile.find(profile).axis)
+    recording = import_log(log, axis, channel=channel, all_states=all_states)
+    _write(recording, out)
+    notes.print(f"PDO mapping {recording.notes['mapping']}", markup=False, soft_wrap=True)
+    if cut_off := recording.notes.get("cut_off"):
+        notes.print(f"{log}: {cut_off}; what comes before is imported", markup=False, soft_wrap=True)
+    if recording.record.motor_target_deg is None:
+        notes.print("no command in each cycle: the record has no motor_target_deg")
+    _print_export(recording, out)
+
+
 def _write(recording: Recording, out: Path) -> None:
     if not _is_csv(out):
         recording.save(out)
@@ -209,7 +244,7 @@ def _write(recording: Recording, out: Path) -> None:
     if len(parts) > 1:
         raise InputError(
             f"{out}: the record has {len(parts)} parts, between which nothing is known of the axis; expected "
-            "a folder for --out, or a time without gaps by --from and --to"
+            "a folder for --out"
         )
     recording.record.write_csv(out)
 
@@ -233,13 +268,16 @@ def _print_export(recording: Recording, out: Path) -> None:
         )
 
 
-def _check_out(out: Path) -> None:
+def _checked_out(out: Path | None) -> Path:
+    if out is None:
+        raise InputError("--out is missing; name a new folder, or a file that ends in .csv or .csv.gz")
     if _is_csv(out):
         check_writable(out)
         if out.exists():
             raise InputError(f"{out}: there is a file already; expected a new one: raw data stay")
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is not an empty folder; expected a new or an empty one")
+    return out
 
 
 def _is_csv(path: Path) -> bool:

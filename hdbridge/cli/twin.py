@@ -10,11 +10,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    ColumnsOption,
     HtmlOption,
     JsonOption,
     ProfileArgument,
     TruthOption,
+    UnitsOption,
+    UnwrapOption,
     console,
+    load_recordings,
     notes,
     print_table,
     progress_bar,
@@ -56,6 +60,9 @@ def command(
         bool,
         typer.Option("--afresh", help="Begin from usual values, whatever the profile says of the plant."),
     ] = False,
+    columns: ColumnsOption = None,
+    units: UnitsOption = None,
+    unwrap: UnwrapOption = None,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -71,7 +78,7 @@ def command(
         raise InputError(
             "--check holds the recordings against the profile's twin: leave out the other options"
         )
-    axis, recording = _loaded(files, recordings)
+    axis, recording = _loaded(files, load_recordings(recordings, columns, units, unwrap))
     if check:
         _check(files, axis, recording, json_file, html_file)
         return
@@ -224,28 +231,27 @@ def _check(
     console.print(found.sentence, markup=False, soft_wrap=True)
 
 
-def _loaded(files: Profile, recordings: list[Path]) -> tuple[AxisConfig, Recording]:
+def _loaded(files: Profile, recordings: dict[Path, Recording]) -> tuple[AxisConfig, Recording]:
     """The axis and all recordings as one; InputError where they are not of one axis, or have no command."""
     from hdbridge.axis import AxisConfig
-    from hdbridge.observations.foreign import check_once
+    from hdbridge.observations.foreign import check_records
     from hdbridge.records.recording import Recording
 
     axis = AxisConfig.load(files.axis)
-    loaded = [Recording.load(each) for each in recordings]
-    check_once(recordings, [each.record for each in loaded])
-    for path, each in zip(recordings, loaded, strict=True):
+    for path, each in recordings.items():
         if each.axis is not None and each.axis != axis.name:
             raise InputError(
                 f"{path}: a recording of axis '{each.axis}', but {axis.path} is of '{axis.name}'; expected "
                 "the recordings of one axis"
             )
         if each.record.motor_target_deg is None:
+            name = "; pass --columns target=COLUMN" if each.record.origin is not None else ""
             raise InputError(
-                f"{path}: no column motor_target_deg; expected the commanded motor angle in each row: what "
-                "the drive was told is what the simulated one is told again"
+                f"{path}: no column motor_target_deg; expected the commanded motor angle in each row, which "
+                f"the simulated drive is given as the real one was{name}"
             )
-        each.record.check_ratio(axis.gear.ratio)
-    return axis, Recording.joined(loaded)
+    check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio)
+    return axis, Recording.joined(list(recordings.values()))
 
 
 def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: bool) -> Translation:

@@ -1,14 +1,19 @@
 """A slow loop over the load encoder: takes away what the model leaves of the mean error at rest.
 
-The compensation is feed-forward: a model that has aged leaves an error that no one sees. Where the load
-encoder can be believed, this integrates the error (load target less load encoder) and adds to the load
-target. It is slow and bounded so that it can do little harm, and gives up what it has where it does harm:
+The compensation is feed-forward: a model that has aged leaves an error that nobody sees. This loop integrates
+the error (load target less load encoder) at rest and adds to the load target. In motion the error is mostly
+delay, and the value is held. The value is bounded and its slew is limited. It fades out, for a reason that
+`LoadLoop.doubt` states, in three cases:
 
-* It integrates at rest only; in motion the error is mostly delay, and the value is held.
-* Where the encoder is not believed it fades out. Whether it can be is for others to say (`None`), but what
-  it sees at rest it judges itself. An error beyond the loop's own bound is none that it is there for. A load
-  does not jump while the axis stands, and a load that does not follow what the loop has added since the axis
-  came to rest is not what the encoder shows: in both cases it stays out until somebody has looked (`reset`).
+    the error is too large             the bound is less than half of it. Over when it is smaller.
+    the load encoder moved at rest     without the motor. Over when it has moved back.
+    the load encoder does not follow   the motor that the loop moves at rest. Over when it follows.
+
+The last two compare the load encoder with the load angle by motor encoder and model. What is explained is
+measured in units of the axis: one count of each encoder at the load, the noise of the difference, and for the
+last case the slack, which is what the model may miss of the hysteresis. The noise is measured at rest, and a
+slow drift of the load against the motor is followed. A doubt about the encoder that does not end at the same
+place ends when the two agree again at rests after motion in both directions.
 
 Pure: no clock, no bus.
 """
@@ -16,36 +21,87 @@ Pure: no clock, no bus.
 from __future__ import annotations
 
 import math
+from typing import Final
 
+from hdbridge.effects import Moment, Start
 from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
 
-_SETTLED_S = 0.3
-"""At rest it looks on for so long before it acts: the load settles."""
-_AVERAGED_S = 0.05
-"""What is measured at rest is averaged over so long."""
-_FOLLOWS = 0.5
-"""Share of what was added by which the error must have changed at least."""
+SETTLED_S: Final = 0.3
+"""Time at rest before the loop acts, in which the load settles."""
+_AVERAGED_S: Final = 0.05
+"""Time constant of the averages at rest."""
+_NOISE_S: Final = 1.0
+"""Time constant of the noise estimate."""
+_DRIFT_S: Final = 600.0
+"""Time constant with which a drift of the load against the motor is followed at rest."""
+_AGREED_S: Final = 1.0
+"""Time at rest for which an encoder that has moved back is observed; doubled by each further doubt."""
+_AGREED_MAX_S: Final = 600.0
+_SIGMAS: Final = 8.0
+"""Deviation in standard deviations that is still noise."""
+_SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
+"""Standard deviation of normal readings by their mean absolute deviation."""
+_LEAST_SHARE: Final = 0.5
+"""Share of the error that the bound has to be."""
+_OUTLIERS: Final = 2
+"""Consecutive readings outside of what is explained that count as a move of the load encoder."""
+_AGREEMENT: Final = 1.0 / 3.0
+"""Share of the greatest disagreement below which the encoders agree again."""
+_MODEL_ERROR: Final = 0.25
+"""Share of a hysteresis by which its model may be wrong."""
+_PLACES: Final = 24
+"""Positions at which the width of a hysteresis loop is evaluated."""
+_BOTH: Final = frozenset({-1, 1})
+
+
+def loop_width_arcsec(model: TransmissionModel) -> float:
+    """Greatest difference of a model's error between the two directions of motion, arcsec at the load.
+
+    0 for a model without memory of its path.
+    """
+    tracker, moment = model.tracker(Start.VIRGIN), Moment()
+    span_deg = 2.0 * tracker.memory_deg
+    if not 0.0 < span_deg < math.inf:
+        return 0.0
+    tracker.advance(-span_deg, moment)
+    places_deg = [span_deg * place / _PLACES for place in range(_PLACES + 1)]
+    forward = [tracker.advance(each, moment) for each in places_deg]
+    tracker.advance(2.0 * span_deg, moment)
+    backward = [tracker.advance(each, moment) for each in reversed(places_deg)]
+    return max(abs(one - other) for one, other in zip(forward, reversed(backward), strict=True))
 
 
 class LoadLoop:
-    """One axis's; one call of `step` per control period."""
+    """The loop of one axis; one call of `step` per control period. Everything is arcsec at the load."""
 
     __slots__ = (
-        "_average", "_begin_arcsec", "_begin_value", "_doubted", "_gain_step", "_jump", "_maximum",
-        "_settled", "_share", "_slew_step", "_standing", "_value",
+        "_agreed", "_agreeing", "_beyond", "_counts", "_difference", "_doubt", "_drift_share", "_error",
+        "_gain_step", "_jumped", "_jumped_most", "_maximum", "_most", "_motor", "_noise", "_noise_readings",
+        "_noise_share", "_off", "_outliers", "_patience", "_patience_max", "_patience_min", "_reference",
+        "_rest_motor", "_settled", "_share", "_slack", "_slew_step", "_standing", "_value",
     )  # fmt: skip
 
-    def __init__(self, gain_1_s: float, maximum_arcsec: float, slew_arcsec_s: float, period_s: float) -> None:
-        """``gain_1_s``: share of the error that is taken away per second; ``maximum_arcsec``: bound of the
-        value, to be well above four times the load encoder's noise.
+    def __init__(
+        self,
+        gain_1_s: float,
+        maximum_arcsec: float,
+        slew_arcsec_s: float,
+        period_s: float,
+        *,
+        counts_arcsec: float,
+    ) -> None:
+        """``gain_1_s``: share of the error that is taken away per second; ``maximum_arcsec`` bounds it.
 
-        InputError for numbers that are not finite and above 0, and a gain so high that it would swing.
+        ``counts_arcsec`` is one count of the motor encoder plus one of the load encoder, both at the load.
+        InputError for numbers that are not finite and above 0, and for a gain that makes the loop swing.
         """
         for name, number in (
             ("gain_1_s", gain_1_s),
             ("maximum_arcsec", maximum_arcsec),
             ("slew_arcsec_s", slew_arcsec_s),
             ("period_s", period_s),
+            ("counts_arcsec", counts_arcsec),
         ):
             if not (math.isfinite(number) and number > 0.0):
                 raise InputError(f"load loop: {name} is {number!r}; expected a finite number above 0")
@@ -56,74 +112,206 @@ class LoadLoop:
             )
         self._gain_step = gain_1_s * period_s
         self._maximum = maximum_arcsec
+        self._most = maximum_arcsec / _LEAST_SHARE
         self._slew_step = slew_arcsec_s * period_s
-        self._jump = 0.25 * maximum_arcsec
-        """How far the error may be from its average at rest, and how far the loop goes without an answer."""
+        self._counts = counts_arcsec
         self._share = min(period_s / _AVERAGED_S, 1.0)
-        self._settled = max(math.ceil(_SETTLED_S / period_s), 1)
-        self._value = self._average = self._begin_arcsec = self._begin_value = 0.0
-        self._standing = 0
-        """Periods that it has stood still."""
-        self._doubted = False
+        self._noise_share = min(period_s / _NOISE_S, 1.0)
+        self._drift_share = min(period_s / _DRIFT_S, 1.0)
+        self._patience = 0
+        self._patience_min = math.ceil(_AGREED_S / period_s)
+        self._patience_max = math.ceil(_AGREED_MAX_S / period_s)
+        self._settled = max(math.ceil(SETTLED_S / period_s), 1)
+        self._slack = maximum_arcsec
+        """By how much the load may follow the motor less than the model says."""
+        self._value = 0.0
+        self._standing = self._outliers = 0
+        """Periods at rest; consecutive readings outside of what is explained."""
+        self._difference = self._motor = self._error = 0.0
+        """Averages at rest, of load encoder less load by motor encoder, of the latter, and of the error."""
+        self._noise = 0.0
+        """Mean absolute deviation of the difference from its average, at rest, less that of the motor."""
+        self._noise_readings = 0
+        self._reference = self._rest_motor = 0.0
+        """Averages when the axis came to rest; during a doubt about the encoder, those before it."""
+        self._doubt = ""
+        self._beyond = False
+        """Whether the doubt is about the size of the error, not about the encoder."""
+        self._jumped = self._jumped_most = self._off = 0.0
+        """During a doubt about the encoder: sum of its moves at rest, the greatest sum, and the greatest
+        disagreement.
+        """
+        self._agreeing = 0
+        """Readings since that sum has become small."""
+        self._agreed = frozenset[int]()
+        """Directions of motion after which the encoders have agreed again."""
 
     @property
     def value_arcsec(self) -> float:
-        """What it adds to the load target."""
+        """The present addition to the load target."""
         return self._value
 
     @property
-    def doubted(self) -> bool:
-        """Whether it has stopped believing what the encoder shows, until `reset`."""
-        return self._doubted
+    def doubt(self) -> str:
+        """Reason why the loop does not act, in words; empty while it does."""
+        return self._doubt
+
+    def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
+        """``whole`` knows the hysteresis of the gear, ``predicting`` is the part of it in `step`'s ``motor``.
+
+        The load may fail to follow the motor by the hysteresis that is not predicted, and by a share of the
+        hysteresis that is. If the hysteresis is not known, only the loop's own bound limits that.
+        """
+        width = loop_width_arcsec(whole)
+        known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)
+        self._slack = width - known if width else self._maximum
+        self._standing = 0
 
     def reset(self, value_arcsec: float = 0.0) -> None:
-        """Begin again, at this value (what the load target has in it already, so that nothing jumps)."""
+        """Begin again without a doubt, at this value, which the load target already contains."""
         if not math.isfinite(value_arcsec):
             raise InputError(f"load loop: a value of {value_arcsec!r} arcsec; expected a finite number")
         self._value = min(max(value_arcsec, -self._maximum), self._maximum)
-        self._doubted = False
-        self._restart()
+        self._doubt, self._beyond = "", False
+        self._patience = 0
+        self._standing = 0
 
-    def step(self, error_arcsec: float | None, moving: bool) -> float:
-        """One period: arcsec to add to the load target.
+    def step(self, target: float, load: float | None, motor: float, moving: bool) -> float:
+        """One period: arcsec to add to the load target; it changes by at most the slew limit.
 
-        ``error_arcsec`` is the load target (without what this has added) less the load encoder; None where
-        the encoder is not believed. It changes by at most the slew limit.
+        ``target`` is the load target without what this adds, ``load`` the load encoder (None if there is no
+        fresh reading), ``motor`` the load angle by the motor encoder and the model.
         """
-        if error_arcsec is None or math.isnan(error_arcsec):
-            self._restart()
+        if load is None or not math.isfinite(load) or not math.isfinite(motor):
+            self._standing = 0
             return self._fade()
         if moving:
-            self._restart()
-            return self._fade() if self._doubted else self._value
-        if self._doubted:
+            self._standing = 0
+        else:
+            self._standing += 1
+            # The error without this loop.
+            error = target + self._value - load
+            if self._standing <= self._settled:
+                self._settle(error, load - motor, motor)
+            else:
+                self._observe(error, load - motor, motor)
+        if self._doubt:
             return self._fade()
-        self._standing += 1
-        if self._standing <= self._settled:
-            # An average of what came last; what came first was still settling.
-            self._average += max(self._share, 1.0 / self._standing) * (error_arcsec - self._average)
-            self._begin_arcsec = self._average
-            return self._value
-        jumped = abs(error_arcsec - self._average) > self._jump
-        self._average += self._share * (error_arcsec - self._average)
-        added = self._value - self._begin_value
-        answered = self._begin_arcsec - self._average
-        unanswered = abs(added) > self._jump and answered * added < _FOLLOWS * added * added
-        if jumped or unanswered:
-            self._doubted = True
-        if self._doubted or abs(error_arcsec) > self._maximum:
-            return self._fade()
-        step = min(max(self._gain_step * error_arcsec, -self._slew_step), self._slew_step)
-        self._value = min(max(self._value + step, -self._maximum), self._maximum)
+        if self._standing > self._settled and not self._outliers:
+            step = min(max(self._gain_step * (target - load), -self._slew_step), self._slew_step)
+            self._value = min(max(self._value + step, -self._maximum), self._maximum)
         return self._value
+
+    # ---------------------------------------------------------------- at rest
+
+    def _settle(self, error: float, difference: float, motor: float) -> None:
+        """One of the first readings at rest: an average that forgets those in which the load was settling."""
+        self._outliers = 0
+        self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
+        if self._standing < self._settled:
+            return
+        if self._doubt and not self._beyond:
+            self._compare()
+        if not self._doubt or self._beyond:
+            self._reference, self._rest_motor = self._difference, self._motor
+        if self._beyond and abs(self._error) <= self._most:
+            self._end()
+
+    def _observe(self, error: float, difference: float, motor: float) -> None:
+        """A reading at rest, after the load has settled."""
+        deviation = difference - self._difference
+        explained = self._explained() + 2.0 * abs(motor - self._motor)
+        if abs(deviation) > explained:
+            self._outliers += 1
+            if self._outliers == _OUTLIERS:
+                self._jump(deviation, explained)
+            return
+        self._outliers = 0
+        self._average(error, difference, motor, self._share)
+        if self._doubt and not self._beyond:
+            back = abs(self._jumped) <= max(self._explained(), _AGREEMENT * self._jumped_most)
+            self._agreeing = self._agreeing + 1 if back else 0
+            if self._agreeing >= self._patience:
+                self._end()
+            return
+        self._reference += self._drift_share * (self._difference - self._reference)
+        self._rest_motor += self._drift_share * (self._motor - self._rest_motor)
+        moved = self._motor - self._rest_motor
+        missing = math.copysign(1.0, moved) * (self._reference - self._difference)
+        explained = self._explained() + self._slack
+        if min(missing, abs(moved)) > explained:
+            self._suspect(
+                f"the load encoder lags the motor by {missing:.1f} arcsec at rest; count, noise and "
+                f"hysteresis of this axis explain {explained:.1f}", self._difference - self._reference,
+            )  # fmt: skip
+        elif not self._doubt and abs(self._error) > self._most:
+            self._beyond = True
+            self._doubt = (
+                f"the mean error at rest is {self._error:.1f} arcsec without the loop, which adds at most "
+                f"{self._maximum:g}"
+            )
+        elif self._beyond and abs(self._error) < self._most - self._explained():
+            self._end()
+
+    def _average(self, error: float, difference: float, motor: float, share: float) -> None:
+        deviation, moved = difference - self._difference, motor - self._motor
+        self._difference += share * deviation
+        self._motor += share * moved
+        self._error += share * (error - self._error)
+        if self._standing > self._settled or (self._standing > 1 and self._noise_readings < self._settled):
+            self._noise_readings += 1
+            noise_share = max(self._noise_share, 1.0 / self._noise_readings)
+            self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
+
+    def _explained(self) -> float:
+        """Difference of the encoders at rest that this axis explains without any motion of the load."""
+        return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
+
+    # ---------------------------------------------------------------- doubt about the encoder
+
+    def _jump(self, size: float, explained: float) -> None:
+        """The load encoder has moved at rest; the averages go with it."""
+        self._outliers = 0
+        self._difference += size
+        self._error -= size
+        if self._doubt and not self._beyond:
+            self._jumped += size
+            self._jumped_most = max(self._jumped_most, abs(self._jumped))
+            self._agreeing = 0
+            return
+        self._suspect(
+            f"the load encoder moved by {size:.1f} arcsec without the motor; count and noise of this axis "
+            f"explain {explained:.1f}", size,
+        )  # fmt: skip
+
+    def _suspect(self, words: str, size: float) -> None:
+        self._doubt, self._beyond = words, False
+        self._jumped, self._agreed, self._agreeing = size, frozenset(), 0
+        self._off = self._jumped_most = abs(size)
+        self._patience = min(max(2 * self._patience, self._patience_min), self._patience_max)
+
+    def _compare(self) -> None:
+        """At rest after a motion in doubt: whether the encoders have agreed after both directions."""
+        off = abs(self._difference - self._reference)
+        self._off = max(self._off, off)
+        tolerance = max(self._explained(), min(_AGREEMENT * self._off, self._maximum))
+        if off > tolerance:
+            self._agreed = frozenset()
+        moved = self._motor - self._rest_motor
+        # An encoder that stands still agrees at most once in two rests that are farther apart.
+        if abs(moved) > max(self._explained() + self._slack, 3.0 * tolerance):
+            self._rest_motor = self._motor
+            if off <= tolerance:
+                self._agreed |= {1 if moved > 0.0 else -1}
+                if self._agreed == _BOTH:
+                    self._end()
+
+    def _end(self) -> None:
+        """The doubt is over: the loop continues from the value that it has faded to."""
+        self._doubt, self._beyond = "", False
+        self._reference, self._rest_motor = self._difference, self._motor
 
     def _fade(self) -> float:
         value, step = self._value, self._slew_step
         self._value = 0.0 if abs(value) <= step else value - math.copysign(step, value)
         return self._value
-
-    def _restart(self) -> None:
-        """What was seen at rest does not count any more."""
-        self._standing = 0
-        self._average = self._begin_arcsec = 0.0
-        self._begin_value = self._value

@@ -31,7 +31,7 @@ class _Part(Strict):
 class LoadLoopSettings(_Part):
     """A slow integral of the error that the load encoder measures, in addition to the model."""
 
-    gain_1_s: float = Field(0.5, gt=0, le=50, description="share of the error that it takes away per second")
+    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error that it takes away per second")
     maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="most that it may add, at the load")
     slew_arcsec_s: float = Field(
         20.0, gt=0, le=10_000, description="fastest change of what it adds, at the load"

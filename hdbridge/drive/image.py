@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.dictionary import dictionary_of, find, held
-from hdbridge.drive.layout import Layout, cyclic_mode, layouts
+from hdbridge.drive.layout import Layout, Layouts, cyclic_mode, layouts
 from hdbridge.drive.objects import Address
 from hdbridge.drive.pdo import PdoEntry
 from hdbridge.drive.states import Command, PowerWalk, State
@@ -65,16 +65,18 @@ class ProcessImage:
 
     `accept` takes the frames of a cycle, `pack_rpdo` gives the frames to send; the power states are walked by
     ``power`` (aim with ``power.go``). Positions are unwrapped multi-turn Python integers. ``od`` is by
-    default the dictionary of the axis's own EDS.
+    default the dictionary of the axis's own EDS, ``pdos`` the mapping that the boot-up writes.
     """
 
-    def __init__(self, axis: AxisConfig, od: ObjectDictionary | None = None) -> None:
+    def __init__(
+        self, axis: AxisConfig, od: ObjectDictionary | None = None, pdos: Layouts | None = None
+    ) -> None:
         od = dictionary_of(axis) if od is None else od
         self.axis = axis
         self.node_id: int = axis.drive.node_id
         self.cyclic = cyclic_mode(axis)
         self._enabling = self.cyclic.enabling
-        self.tpdos, self.channel_tpdos, self.rpdos, absent = layouts(axis, od)
+        self.tpdos, self.channel_tpdos, self.rpdos, absent = pdos or layouts(axis, od)
         self.sync_id: int = objects.COB_SYNC
         self.heartbeat_id: int = objects.COB_HEARTBEAT + axis.drive.master_node_id
         """Identifier of the master's own heartbeat; its data is one byte 05h."""
@@ -104,7 +106,8 @@ class ProcessImage:
         self._unwrap_motor = Unwrap(1 << position.type.bits if position else INT32_RANGE)
         self._unwrap_demand = Unwrap(1 << demand.type.bits if demand else INT32_RANGE)
         self._unwrap_load = Unwrap(axis.load_encoder.source.wraps_at_counts)
-        self._has_demand = objects.POSITION_DEMAND not in absent
+        self.has_demand = objects.POSITION_DEMAND not in absent
+        """The drive sends its position demand."""
         self._handlers = self._handlers_of((*self.tpdos, *self.channel_tpdos))
         self.tpdo_ids: tuple[int, ...] = tuple(layout.can_id for layout in self.tpdos)
         """Identifiers of the frames that each cycle needs."""
@@ -187,7 +190,7 @@ class ProcessImage:
 
     def _take_position(self, counts: int) -> None:
         motor_counts = self.motor_counts = self._unwrap_motor.update(counts)
-        if not self._has_demand and self.power.state is not _ENABLED:
+        if not self.has_demand and self.power.state is not _ENABLED:
             self.demand_counts = motor_counts
 
     def _take_torque(self, permille: int) -> None:
@@ -301,10 +304,14 @@ class ProcessImage:
             word |= HALT_BIT
         frames = tuple([frame(word, target_counts) for frame in self._packers])
         self.target_counts = target_counts
-        if not self._has_demand:
+        self.follow_target(target_counts)
+        return frames
+
+    def follow_target(self, target_counts: int) -> None:
+        """A target was sent in this cycle; the one before it is the demand now, if the drive sends none."""
+        if not self.has_demand:
             self.demand_counts = self._under_way
             self._under_way = self.motor_counts + wrap_int32(target_counts - self.motor_counts)
-        return frames
 
     def seed(self, motor_counts: int, load_counts: int, statusword: int) -> None:
         """Start the multi-turn counts from readings over SDO, so that the cycle goes on from there."""

@@ -185,7 +185,7 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
             words.append(word)
         fixed: tuple[PdoEntry, ...] | None = None
         if not all(map(is_writable, [count, *words])):
-            fixed = _mapped(od, [held(each) for each in words[: held(count) or 0]])
+            fixed = mapped(od, [held(each) for each in words[: held(count) or 0]])
         can_id = None
         if not is_writable(cob_id):
             can_id = held(cob_id)
@@ -197,15 +197,16 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
         yield _Offer(place + 1, len(words), fixed, can_id, every)
 
 
-def _mapped(od: ObjectDictionary, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
-    """The entries of a fixed mapping; none if they are not known, or not of whole bytes."""
+def mapped(od: ObjectDictionary | None, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
+    """The entries of a mapping, by its words; none if one is not known, or not of whole bytes."""
     entries = []
     for word in words:
         if word is None:
             return ()
         index, sub, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
-        variable = find(od, index, sub)
-        kind = integer_type(variable) if variable is not None else None
+        standard = objects.STANDARD.get((index, sub))
+        variable = find(od, index, sub) if od is not None else None
+        kind = integer_type(variable) if variable is not None else standard.type if standard else None
         if kind is None or kind.bits != bits:
             kind = next((each for each in IntegerType if each.bits == bits and not each.signed), None)
         if kind is None:

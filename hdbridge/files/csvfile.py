@@ -1,8 +1,9 @@
-"""Columns of numbers in a CSV file: read fast, complained about exactly, written to read back the same.
+"""Columns of numbers in a CSV file, as any program writes it; written to read back the same.
 
-A header line names the columns; one row per sample; UTF-8; gzip where the content or the name says so. A file
-that numpy's own parser takes costs about two microseconds per row; anything else is read again, row by row,
-to find out what is wrong with it, or to keep a column of text.
+A header line names the columns; one row per sample. Separators, decimal commas, comments, lines before the
+header, a row of units under it, the encoding and gzip are recognised, and reported as remarks. A file that
+numpy's parser takes costs about two microseconds per row; anything else is read row by row, to find out what
+is wrong with it, or to keep a column of text.
 """
 
 from __future__ import annotations
@@ -12,22 +13,25 @@ import csv
 import gzip
 import io
 import math
+import re
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
-from hdbridge.files.expectation import nearest, one_line
+from hdbridge.files.expectation import one_line
 from hdbridge.files.regular import open_regular
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
-"""A column: float64, or text where it holds something else than numbers."""
+"""A column: float64, or text if it holds something else than numbers."""
 
 MAXIMUM_BYTES = 2 << 30
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -35,33 +39,200 @@ _GZIP_LEVEL = 4  # beyond it time grows several-fold and the size hardly falls
 _ROWS_AT_ONCE = 50_000
 _PIECE_BYTES = 1 << 20
 
+_SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+_HEAD_BYTES = 1 << 16
+_HEAD_ROWS = 100
+"""The header is looked for among so many rows."""
+_SAMPLED = 20
+"""Rows of data that are looked at for decimal commas."""
+_COMMENT = re.compile(rb"(?:^|(?<=[\r\n]))([ \t]*(?:#|%|//)[ \t]*)([^\r\n]*)")
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?$")
+_DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?=[ T])")
+_FRACTION = re.compile(r"(?<=:\d\d)[.,](\d+)")
+_DAY_S: Final = 86_400.0
 
-def read_columns(path: Path, required: Sequence[str], numeric: Collection[str]) -> dict[str, Column]:
-    """The file's columns by name, in its order.
 
-    ``required`` columns must be there; they and those of ``numeric`` must hold finite numbers throughout.
-    Other columns are kept: as numbers where they are (an empty cell is NaN), else as text. InputError names
-    the file, the line (the header is line 1) and the column.
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Where the columns of a file are, and how its rows are written."""
+
+    names: tuple[str, ...]
+    """Of the columns in order; one without a name has its number, counted from 1."""
+    header_line: int
+    """The line of the header; 0 if the file has none."""
+    first_line: int
+    """Lines before the first row of data."""
+    separator: str
+    decimal_comma: bool = False
+    units: tuple[str, ...] = ()
+    """Cells of a row of units."""
+    remarks: tuple[str, ...] = ()
+
+
+class CsvFile:
+    """A CSV file whose layout is known; `read` gives its columns.
+
+    ``wanted`` are names of columns that the caller needs, or numbers (1 is the first): the header is the line
+    that has them. InputError names the file, and the line if there is one.
     """
-    content = _content(path)
-    reader = csv.reader(_lines(content))
-    names, header_lines = _header(path, reader)
-    _check_header(path, header_lines, names, required)
-    finite = {*required, *numeric}
-    columns = _fast(content, header_lines, names)
-    if columns is None:
-        columns = _slow(path, reader, names, finite)
-    for name in names:
-        if name in finite:
-            _check_finite(path, content, header_lines, name, columns[name])
-    return columns
 
+    def __init__(self, path: Path, wanted: Collection[str] = ()) -> None:
+        self.path = path
+        content, encoding = _content(path)
+        self._held: bytes | None = content  # until it is read: a stream gives it only once
+        self._layout = found = _layout(path, content, wanted)
+        said = ("comments left out" if _commented(content) else "", encoding)
+        self.remarks: tuple[str, ...] = (*found.remarks, *filter(None, said))
+        """What was assumed of how the file is written, in words; `read` may add one. Empty for plain CSV."""
 
-def line_of_row(path: Path, row: int) -> int:
-    """The line of the file (the header is line 1) on which a row of data (the first is row 0) stands."""
-    content = _content(path)
-    _, header_lines = _header(path, csv.reader(_lines(content)))
-    return _line_of_row(content, header_lines, row)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the columns, in the order of the file; a column without a name has its number."""
+        return self._layout.names
+
+    @property
+    def header_line(self) -> int:
+        """The line of the header; 0 if the first line holds numbers."""
+        return self._layout.header_line
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The cell of each column in a row of units under the header; empty without one."""
+        return dict(zip(self.names, self._layout.units, strict=False))
+
+    def find(self, column: str) -> str | None:
+        """The name of a column that is given by name or by number; None if there is no such column.
+
+        InputError if two columns have the name.
+        """
+        if self.names.count(column) > 1:
+            raise _wrong(
+                f"{self.path}:{self.header_line}: two columns are called '{column}'; expected each name "
+                f"once: name the column by its number, as in {self.names.index(column) + 1}"
+            )
+        if column in self.names:
+            return column
+        if column.isdecimal() and 1 <= int(column) <= len(self.names):
+            return self.names[int(column) - 1]
+        return None
+
+    def read(self, finite: Collection[str] = (), times: Collection[str] = ()) -> dict[str, Column]:
+        """The columns by name, in the order of the file.
+
+        Columns of ``finite`` must hold finite numbers throughout; those of ``times`` may hold ISO times or
+        times of day, which become seconds since the first. Others are kept: as numbers if they are (an empty
+        cell is NaN), else as text. Of columns with the same name the first is kept.
+        """
+        content = self._text()
+        self._held = None
+        columns = self._fast(content)
+        if columns is None:
+            columns = self._slow(content, finite, times)
+        for name in columns:
+            if name in finite and len(wrong := np.flatnonzero(~np.isfinite(columns[name]))):
+                line = self._line_of(content, int(wrong[0]))
+                found = columns[name][int(wrong[0])]
+                raise _wrong(f"{self.path}:{line}: {name}: {found}; expected a finite number")
+        return columns
+
+    def line_of_row(self, row: int) -> int:
+        """The line of the file (the first is 1) with a row of data (the first is row 0)."""
+        return self._line_of(self._text(), row)
+
+    def _text(self) -> bytes:
+        """The text with blank lines for its comments, and one tab for the spaces between two columns."""
+        content = _content(self.path)[0] if self._held is None else self._held
+        if _commented(content):
+            content = _COMMENT.sub(b"", content)
+        if self._layout.separator == " ":
+            content = re.sub(rb"[ \t]+", rb"\t", content)
+            content = re.sub(rb"(?:^|(?<=[\r\n]))\t|\t(?=[\r\n]|$)", b"", content)
+        return content
+
+    def _line_of(self, content: bytes, row: int) -> int:
+        first = self._layout.first_line
+        for line, text in enumerate(_lines(content, first), first + 1):
+            row -= bool(text.strip())
+            if row < 0:
+                return line
+        return first
+
+    @property
+    def _delimiter(self) -> str:
+        return "\t" if self._layout.separator == " " else self._layout.separator
+
+    def _fast(self, content: bytes) -> dict[str, Column] | None:
+        """All columns by numpy's parser; None if it finds something that is not a number, or a ragged row."""
+        layout = self._layout
+        if not _lines(content, layout.first_line).readline().strip():
+            return None
+        if layout.decimal_comma:
+            if self._delimiter == ",":
+                return None
+            content = content.replace(b",", b".")
+        try:
+            table = np.loadtxt(
+                _lines(content, layout.first_line),
+                delimiter=self._delimiter,
+                comments=None,
+                quotechar='"',
+                ndmin=2,
+                unpack=True,
+            )
+        except ValueError:
+            return None
+        if len(table) != len(layout.names):
+            return None
+        return self._named([np.ascontiguousarray(column) for column in table])
+
+    def _slow(self, content: bytes, finite: Collection[str], times: Collection[str]) -> dict[str, Column]:
+        """All columns, row by row; InputError at the first row that is wrong."""
+        rows: list[list[str]] = []
+        lines: list[int] = []
+        for row, line in self._rows(content):
+            rows.append(row)
+            lines.append(line)
+        count = len(self.names)
+        cells = list(zip(*rows, strict=True)) if rows else [()] * count
+        comma = self._layout.decimal_comma
+        columns = []
+        wrong: list[tuple[int, str, str]] = []
+        for name, column in zip(self.names, cells, strict=True):
+            made = _column(column, blanks=name not in finite, comma=comma)
+            if made.dtype.kind != "f" and name in times and (seconds := _seconds(column)) is not None:
+                made = seconds
+                self.remarks = (*self.remarks, f"dates or times of day in '{name}'")
+            elif made.dtype.kind != "f" and name in finite:
+                row_number = next(at for at, cell in enumerate(column) if not _is_number(cell, comma))
+                wrong.append((row_number, name, column[row_number].strip()))
+            columns.append(made)
+        if wrong:
+            row_number, name, cell = min(wrong)
+            what = f"'{cell}' is not a number" if cell else "no value"
+            also = " or an ISO time" if name in times else ""
+            raise _wrong(f"{self.path}:{lines[row_number]}: {name}: {what}; expected a number{also}")
+        return self._named(columns)
+
+    def _named(self, columns: Sequence[Column]) -> dict[str, Column]:
+        named: dict[str, Column] = {}
+        for name, column in zip(self.names, columns, strict=True):
+            named.setdefault(name, column)
+        return named
+
+    def _rows(self, content: bytes) -> Iterator[tuple[list[str], int]]:
+        """The rows of data with their lines, each with a cell for every column."""
+        layout, count = self._layout, len(self.names)
+        paired = layout.decimal_comma and layout.separator == ","
+        for cells, at in _parsed(self.path, _lines(content, layout.first_line), self._delimiter):
+            row, line = cells, at + layout.first_line
+            if paired and len(row) == 2 * count:
+                row = [f"{whole},{part}" for whole, part in zip(row[::2], row[1::2], strict=True)]
+            if len(row) == count + 1 and not row[-1].strip():
+                row = row[:-1]
+            if len(row) != count:
+                raise _wrong(f"{self.path}:{line}: {len(row)} values; expected {count}, one for each column")
+            yield row, line
 
 
 def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
@@ -77,7 +248,7 @@ def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column]) -> None:
-    """Write the file atomically, compressed where its name ends in ``.gz``; same columns, same bytes."""
+    """Write the file atomically, compressed if its name ends in ``.gz``; same columns, same bytes."""
     content = io.BytesIO()
     if path.suffix == ".gz":
         with gzip.GzipFile("", "wb", _GZIP_LEVEL, content, mtime=0) as file:
@@ -96,8 +267,8 @@ def _wrong(text: str) -> InputError:
     return InputError(one_line(text))
 
 
-def _content(path: Path) -> bytes:
-    """The file's bytes, decompressed: UTF-8 without a byte-order mark."""
+def _content(path: Path) -> tuple[bytes, str]:
+    """The file's text in UTF-8 without a byte-order mark, decompressed; the encoding, if it was another."""
     try:
         with open_regular(path) as plain:
             content = _bounded(plain)
@@ -115,13 +286,23 @@ def _content(path: Path) -> bytes:
         raise _wrong(f"{path}: not gzip data; expected a compressed file, or a name without .gz")
     if len(content) > MAXIMUM_BYTES:
         raise _wrong(f"{path}: more than {MAXIMUM_BYTES >> 30} GiB; split the record")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return content.decode("utf-16").encode(), "UTF-16 text"
+        except UnicodeError:
+            raise _wrong(f"{path}: UTF-16 text that is damaged; expected CSV in UTF-8") from None
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         content.decode()
     except UnicodeDecodeError as problem:
-        line = content.count(b"\n", 0, problem.start) + 1
-        raise _wrong(f"{path}:{line}: not UTF-8 text; expected CSV in UTF-8") from None
-    return content
+        try:
+            return content.decode("cp1252").encode(), "Windows-1252 text"
+        except UnicodeDecodeError:
+            line = content.count(b"\n", 0, problem.start) + 1
+            raise _wrong(
+                f"{path}:{line}: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"
+            ) from None
+    return content, ""
 
 
 def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
@@ -132,122 +313,233 @@ def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
     return content.getvalue()
 
 
+def _commented(content: bytes) -> bool:
+    return any(mark in content for mark in (b"#", b"%", b"//")) and _COMMENT.search(content) is not None
+
+
 def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
-    """The lines of the file, ends and all, but for the first few."""
+    """The lines of the file, ends and all, without the first few."""
     lines = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8", newline="")
     for _ in range(skipped):
         lines.readline()
     return lines
 
 
-def _header(path: Path, reader: Any) -> tuple[list[str], int]:
-    """The column names, and the lines that they and what is blank before them take."""
-    for row in _rows(path, reader):
-        return [name.strip() for name in row], reader.line_num
-    raise _wrong(f"{path}: the file is empty; expected a header line and one row per sample")
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A line near the beginning of the file that is not blank."""
+
+    number: int
+    text: str
+    comment: bool
+
+    def cells(self, separator: str) -> list[str]:
+        if separator == " ":
+            return self.text.split()
+        try:
+            return [cell.strip() for cell in next(csv.reader([self.text], delimiter=separator), [])]
+        except csv.Error:
+            return []
 
 
-def _check_header(path: Path, line: int, names: Sequence[str], required: Sequence[str]) -> None:
-    where = f"{path}:{line}"
-    for name in required:
-        if name in names:
-            continue
-        if len(names) == 1 and any(each in names[0] for each in ";\t"):
-            raise _wrong(f"{where}: the columns are not separated by commas; expected comma-separated values")
-        if all(map(_is_number, names)):
-            raise _wrong(f"{where}: the first line holds numbers; expected the names of the columns")
-        close = nearest(name, [each for each in names if each not in required])
-        hint = f"; is '{close}' meant?" if close else ""
-        raise _wrong(f"{where}: column '{name}' is missing; found {', '.join(names)}{hint}")
-    for place, name in enumerate(names):
-        if not name:
-            raise _wrong(f"{where}: column {place + 1} has no name")
-        if name in names[:place]:
-            raise _wrong(f"{where}: column '{name}' stands twice")
+def _head(content: bytes) -> list[_Line]:
+    lines = []
+    text = content[:_HEAD_BYTES].decode(errors="replace")
+    for number, line in enumerate(io.StringIO(text, newline=""), 1):
+        bare = line.strip("\r\n")
+        comment = _COMMENT.match(bare.encode())
+        bare = comment[2].decode() if comment else bare
+        if bare.strip():
+            lines.append(_Line(number, bare, comment is not None))
+    return lines[:_HEAD_ROWS]
 
 
-def _fast(content: bytes, header_lines: int, names: Sequence[str]) -> dict[str, Column] | None:
-    """All columns by numpy's parser; None where it finds something that is not a number, or a ragged row."""
-    if not _lines(content, header_lines).readline().strip():
-        return None
-    try:
-        table = np.loadtxt(
-            _lines(content, header_lines), delimiter=",", comments=None, quotechar='"', ndmin=2
-        )
-    except ValueError:
-        return None
-    if table.shape[1] != len(names):
-        return None
-    return {name: np.ascontiguousarray(table[:, place]) for place, name in enumerate(names)}
+def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
+    """Separator and header: the line with most of the ``wanted`` names, else the one above the numbers."""
+    head = _head(content)
+    rows = [line for line in head if not line.comment]
+    if not rows:
+        raise _wrong(f"{path}: the file is empty; expected a header line and one row per sample")
+    separator, header = _named_header(head, wanted) or _guessed_header(head)
+    data = [line for line in rows if header is None or line.number > header.number]
+    if header is None:  # what is above the numbers belongs to nothing
+        data = data[next((at for at, line in enumerate(data) if _holds_numbers(line, separator)), 0) :]
+    first = [line.cells(separator) for line in data[:_SAMPLED]]
+    cells = header.cells(separator) if header else [""] * len(first[0])
+    if len(cells) > 1 and not cells[-1] and all(len(row) < len(cells) or not row[-1] for row in first):
+        cells = cells[:-1]  # each line ends with a separator; `CsvFile._rows` drops the empty cell
+    names = tuple(cell or str(place) for place, cell in enumerate(cells, 1))
+    needed = [place for place, name in enumerate(names) if name in wanted or str(place + 1) in wanted]
+    needed = needed or list(range(len(names)))
+    remarks = [] if separator == "," else [_SEPARATORS[separator]]
+    units: tuple[str, ...] = ()
+    if len(first) > 1 and _is_row_of_units(first[0], first[1], needed):
+        units = tuple(first[0])
+        remarks.append(f"a row of units in line {data[0].number}")
+        data, first = data[1:], first[1:]
+    paired = separator == "," and bool(first) and _is_paired(first[0], len(names))
+    comma = paired or any(
+        _DECIMAL_COMMA.match(row[place]) for row in first for place in needed if place < len(row)
+    )
+    if comma:
+        remarks.append("decimal commas")
+    if header is None:
+        remarks.append("no header, so columns have numbers")
+    elif header.comment:
+        remarks.append(f"the header in the comment of line {header.number}")
+    begin = header or data[0]
+    above = [line for line in rows if line.number < begin.number]
+    if above:
+        remarks.append(f"{len(above)} line{'s' * (len(above) > 1)} above the header left out")
+    return _Layout(
+        names,
+        header.number if header else 0,
+        data[0].number - 1 if data and (units or not header) else begin.number,
+        separator,
+        comma,
+        units,
+        tuple(remarks),
+    )
 
 
-def _slow(path: Path, reader: Any, names: Sequence[str], finite: Collection[str]) -> dict[str, Column]:
-    """All columns, row by row; InputError at the first row that is wrong."""
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    for row in _rows(path, reader):
-        if len(row) != len(names):
-            hint = "; decimal commas? write 0.5, not 0,5" if len(row) == 2 * len(names) else ""
-            raise _wrong(
-                f"{path}:{reader.line_num}: {len(row)} values; expected {len(names)}, one for each "
-                f"column{hint}"
-            )
-        rows.append(row)
-        lines.append(reader.line_num)
-    cells = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
-    columns = {name: _column(cells[name], blanks=name not in finite) for name in names}
-    wrong = [
-        (_first_wrong(cells[name]), name)
-        for name in names
-        if name in finite and columns[name].dtype.kind != "f"
+def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, _Line] | None:
+    """The separator, and the line that has most of the names; None if no line has any."""
+    found = [
+        (len(set(wanted).intersection(line.cells(separator))), not line.comment, -line.number, separator)
+        for line in head
+        for separator in _SEPARATORS
     ]
-    if wrong:
-        row_number, name = min(wrong)
-        cell = cells[name][row_number].strip()
-        what = f"'{cell}' is not a number" if cell else "no value"
-        raise _wrong(f"{path}:{lines[row_number]}: {name}: {what}; expected a number")
-    return columns
+    count, _, number, separator = max(found, key=lambda each: each[:3])
+    if not count or all(name.isdecimal() for name in wanted):
+        return None
+    return separator, next(line for line in head if line.number == -number)
 
 
-def _rows(path: Path, reader: Any) -> Iterator[list[str]]:
-    """The rows that are not blank."""
+def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
+    """The separator that gives most cells of numbers, and the line of names above them, if there is one."""
+    best: tuple[int, str, _Line | None] | None = None
+    for separator in _SEPARATORS:
+        rows = [line for line in head if not line.comment]
+        first = next((line for line in rows if _holds_numbers(line, separator)), None)
+        if first is None:
+            continue
+        count, numbers = len(first.cells(separator)), _numbers(first, separator)
+        above = [
+            line
+            for line in head
+            if line.number < first.number and len(line.cells(separator)) in {count, count // 2, count - 1}
+        ][-2:]
+        words = [line for line in above if not any(map(_is_number, line.cells(separator)))]
+        if best is None or numbers > best[0]:
+            best = numbers, separator, words[0] if words else None
+    if best is not None:
+        _, separator, header = best
+        return separator, header
+    line = next(line for line in head if not line.comment)
+    return max(_SEPARATORS, key=lambda each: len(line.cells(each)) - (each == " ")), line
+
+
+def _holds_numbers(line: _Line, separator: str) -> bool:
+    values = _numbers(line, separator)
+    return values > 0 and 2 * values >= len(line.cells(separator))
+
+
+def _numbers(line: _Line, separator: str) -> int:
+    """Cells that are numbers or times."""
+    cells = line.cells(separator)
+    return sum(_is_number(cell, separator != ",") or _moment(cell) is not None for cell in cells)
+
+
+def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequence[int]) -> bool:
+    """Words in each needed column, and numbers or times in the row below."""
+    if max(needed) >= min(len(first), len(second)):
+        return False
+
+    def is_value(cell: str) -> bool:
+        return _is_number(cell) or bool(_DECIMAL_COMMA.match(cell)) or _moment(cell) is not None
+
+    words = [first[place] for place in needed]
+    return any(words) and not any(map(is_value, words)) and all(is_value(second[place]) for place in needed)
+
+
+def _is_paired(cells: Sequence[str], count: int) -> bool:
+    """Each value is two cells: its decimal comma looks like a separator."""
+    whole, part = cells[::2], cells[1::2]
+    return (
+        count > 1
+        and len(cells) == 2 * count
+        and all(re.fullmatch(r"[+-]?\d+", each) for each in whole)
+        and all(re.fullmatch(r"\d+", each) for each in part)
+    )
+
+
+def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tuple[list[str], int]]:
+    """The rows that are not blank, each with the number of its last line."""
+    reader = csv.reader(lines, delimiter=delimiter)
     try:
         for row in reader:
             if row and (len(row) > 1 or row[0].strip()):
-                yield row
+                yield row, reader.line_num
     except csv.Error as problem:
-        raise _wrong(f"{path}:{reader.line_num}: not CSV: {problem}") from None
+        raise _wrong(f"{path}: not CSV: {problem}") from None
 
 
-def _column(cells: Sequence[str], *, blanks: bool) -> Column:
+def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:
     """Numbers, if all cells are (blank ones are NaN, if that is allowed), else text."""
+    texts = (
+        [cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in cells] if comma else cells
+    )
     try:
-        numbers = [float(cell) if cell or not blanks else math.nan for cell in cells]
+        numbers = [float(cell) if cell or not blanks else math.nan for cell in texts]
     except ValueError:
         return np.array(cells, dtype=np.str_)
-    if any("_" in cell for cell in cells):  # Python's float takes 1_000; CSV has no such numbers
+    if any("_" in cell for cell in texts):  # Python's float takes 1_000; CSV has no such numbers
         return np.array(cells, dtype=np.str_)
     return np.array(numbers, dtype=np.float64)
 
 
-def _is_number(cell: str) -> bool:
-    return _column([cell], blanks=False).dtype.kind == "f"
+def _is_number(cell: str, comma: bool = False) -> bool:
+    return _column([cell], blanks=False, comma=comma).dtype.kind == "f"
 
 
-def _first_wrong(cells: Sequence[str]) -> int:
-    return next(row for row, cell in enumerate(cells) if not _is_number(cell))
+def _seconds(cells: Sequence[str]) -> FloatArray | None:
+    """Seconds since the first of ISO times or times of day; None if one cell is neither.
+
+    Times of day without a date go on past midnight.
+    """
+    moments = [moment for cell in cells if (moment := _moment(cell)) is not None]
+    if not moments or len(moments) < len(cells):
+        return None
+    whole = np.array([each.whole for each in moments], dtype=np.float64)
+    part = np.array([each.part for each in moments], dtype=np.float64)
+    seconds: FloatArray = whole - whole[0] + part
+    if _CLOCK.match(cells[0].strip()):
+        seconds = seconds + _DAY_S * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _DAY_S)
+    return seconds
 
 
-def _check_finite(path: Path, content: bytes, header_lines: int, name: str, column: FloatArray) -> None:
-    wrong = np.flatnonzero(~np.isfinite(column))
-    if len(wrong):
-        line = _line_of_row(content, header_lines, int(wrong[0]))
-        raise _wrong(f"{path}:{line}: {name}: {column[wrong[0]]}; expected a finite number")
+class _Moment(NamedTuple):
+    """A time: whole seconds, and the rest."""
+
+    whole: int
+    part: float
 
 
-def _line_of_row(content: bytes, header_lines: int, row: int) -> int:
-    for line, text in enumerate(_lines(content, header_lines), header_lines + 1):
-        row -= bool(text.strip())
-        if row < 0:
-            return line
-    return header_lines
+def _moment(cell: str) -> _Moment | None:
+    """An ISO time, or a time of day; None if the text is neither."""
+    text = cell.strip()
+    if clock := _CLOCK.match(text):
+        hours, minutes, seconds = (int(each) for each in clock.groups()[:3])
+        return _Moment(3600 * hours + 60 * minutes + seconds, float(f"0.{clock[4] or 0}"))
+    if len(text) < len("2000-01-01"):
+        return None
+    fraction = _FRACTION.search(text)
+    text = _DAY_FIRST.sub(
+        lambda each: f"{each[3]}-{int(each[2]):02d}-{int(each[1]):02d}", _FRACTION.sub("", text)
+    )
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return _Moment(round(moment.timestamp()), float(f"0.{fraction[1]}") if fraction else 0.0)

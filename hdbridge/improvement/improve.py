@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class Source:
     folder: Path
     """Where everything new goes."""
     journal: Journal | None = None
-    given: tuple[Path, ...] = ()
+    given: Mapping[Path, Recording] = field(default_factory=dict)
     independent_zeros: bool = False
     """The encoders' zeros were lost between the given recordings."""
 
@@ -75,11 +75,11 @@ def improve(
     active.check_bound_to(drive.axis, drive.identity)
     bench = _Bench(drive, date, progress, interrupted)
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
-    paths, recording, apart = _begin(source, bench)
+    recordings, apart = _begin(source, bench)
     tell("diagnosing")
-    diagnosis = _diagnosed(recording, active, apart)
+    diagnosis = diagnose(recordings, active, independent_zeros=apart)
     view = axis_view(drive.axis)
-    plans = _plans_of(source, recording)
+    plans = _plans_of(source, recordings.values())
     rivals = untold(diagnosis, active, view, plans)
     found: list[Round] = []
     while len(found) < rounds:
@@ -90,17 +90,16 @@ def improve(
         tell(diagnosis.verdict())
         tell(f"round {len(found) + 1}: {journal.plan.about}, to tell {', '.join(tells) or 'more'}")
         apart = bench.run(journal) or apart or earlier
-        paths.append(folder)
-        recording = Recording.load(*paths)
-        diagnosis = _diagnosed(recording, active, apart)
+        recordings[folder] = journal.recording()
+        diagnosis = diagnose(recordings, active, independent_zeros=apart)
         plans.append(journal.plan)
         rivals = untold(diagnosis, active, view, plans)
         left = tuple(map(alternatives, diagnosis.findings))
         found.append(Round(journal.plan.name, journal.plan.about, str(folder), tells, left))
     result = Improvement(
         axis=drive.axis.name,
-        recordings=tuple(map(str, paths)),
-        date=recording.date or Recording.load(paths[0]).date,
+        recordings=tuple(map(str, recordings)),
+        date=next(iter(recordings.values())).date,
         plan=source.plan.name,
         active=active,
         diagnosis=diagnosis,
@@ -111,10 +110,11 @@ def improve(
         advice=advice(diagnosis),
         trial=None,
         offer=Offer(False, "nothing found: the active model stays"),
-        survived=survived_in(paths),
+        survived=survived_in(list(recordings)),
     )
     if diagnosis.findings:
-        result = _concluded(result, bench, source, profile, recording, tell)
+        whole = Recording.joined(list(recordings.values()))
+        result = _concluded(result, bench, source, profile, whole, tell)
     return _kept(source.folder, result)
 
 
@@ -133,20 +133,20 @@ class _Bench:
         return len({each.session for each in tasks_of(journal.recording())}) > 1
 
 
-def _begin(source: Source, bench: _Bench) -> tuple[list[Path], Recording, bool]:
+def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
+    """The recordings that are diagnosed first, and if an encoder may have lost its zero between them."""
     if source.journal is not None:
         apart = bench.run(source.journal)
-        return [source.journal.folder], source.journal.recording(), apart
-    recording = Recording.load(*source.given)
-    _check_is_of(recording, bench.drive.axis, source.given[0])
-    return list(source.given), recording, source.independent_zeros
+        return {source.journal.folder: source.journal.recording()}, apart
+    for path, recording in source.given.items():
+        _check_is_of(recording, bench.drive.axis, path)
+    return dict(source.given), source.independent_zeros
 
 
-def _plans_of(source: Source, recording: Recording) -> list[Plan]:
+def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
     """The plans by which was measured, as far as they are known."""
     if source.journal is not None:
         return [source.journal.plan]
-    given = [recording] if len(source.given) == 1 else [Recording.load(each) for each in source.given]
     return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
 
 
@@ -160,10 +160,6 @@ def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
                 f"{path}: this recording is of {what} {theirs}, but here is {ours} ({axis.path}); "
                 "improve the axis that it was measured on"
             )
-
-
-def _diagnosed(recording: Recording, active: TransmissionModel, apart: bool) -> Diagnosis:
-    return diagnose(recording, active, independent_zeros=apart)
 
 
 def _journal(

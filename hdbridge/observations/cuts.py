@@ -6,7 +6,7 @@ and nothing is known of the axis in between; or, where the next sample or two ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -57,7 +57,7 @@ def observed(record: Record, ratio: float) -> Observed:
             "ticks"
         )
         times = np.concatenate([spread(part.time_s) for part in record.parts()])
-        record = Record({**record.columns, "time_s": times}, record.source, record.starts)
+        record = replace(record, columns={**record.columns, "time_s": times})
     kept = np.ones(len(record), dtype=np.bool_)
     for first, end in _edges(record):
         kept[first:end] = ~_misread(record.rows(first, end), ratio)
@@ -77,7 +77,7 @@ def observed(record: Record, ratio: float) -> Observed:
             f"{f', and {len(new) - 1} more' if len(new) > 1 else ''}): nothing is known of the axis between "
             "the parts"
         )
-        record = Record(record.columns, record.source, tuple(sorted({*record.starts, *new})))
+        record = replace(record, starts=tuple(sorted({*record.starts, *new})))
     steps = np.diff(record.time_s)
     period_s = float(np.median(steps)) if len(steps) else 0.0
     if period_s >= SLOWEST_S and float(np.ptp(record.motor_position_deg)) > 0.0:
@@ -100,7 +100,7 @@ def _picked(record: Record, kept: BoolArray) -> Record:
     before = np.concatenate([[0], np.cumsum(kept)])
     starts = tuple(dict.fromkeys(int(before[each]) for each in record.starts))
     columns = {name: column[kept] for name, column in record.columns.items()}
-    return Record(columns, record.source, starts)
+    return replace(record, columns=columns, starts=starts)
 
 
 def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:

@@ -17,29 +17,14 @@ import numpy as np
 from hdbridge.effects import Channel, FloatArray, Motion
 from hdbridge.effects.base import MEASURED
 from hdbridge.errors import InputError
-from hdbridge.files.csvfile import Column, line_of_row, read_columns, write_columns
+from hdbridge.files.csvfile import Column, CsvFile, write_columns
+from hdbridge.records.columns import CHANNELS, OPTIONAL, REQUIRED, CsvColumns, Origin, Said, read
+from hdbridge.records.ratio import remedy
 from hdbridge.units import ARCSEC_PER_DEG
 
-REQUIRED: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "time_s": "time; it never runs backwards, its zero and its steps are free",
-        "motor_position_deg": "measured motor angle, multi-turn",
-        "load_position_deg": "measured load angle, multi-turn",
-    }
-)
-OPTIONAL: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "motor_target_deg": "commanded motor angle, multi-turn",
-        **{each.value: each.about for each in MEASURED},
-    }
-)
+__all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "time_shifts_s"]
+
 MINIMUM_SAMPLES: Final = 2
-_DEG_PER_RAD: Final = float(np.degrees(1.0))
-_DEG_PER_TURN: Final = 360.0
-UNIT_SHARE: Final = 0.006
-"""How far a slope may be off that of a unit to look like it: a ratio that is next to the gear's is as far."""
-LEAST_COUNTS: Final = 1000.0
-"""An encoder has at least so many counts per turn."""
 
 WRONG_RATIO: Final = 0.003
 """A ratio this far off, relatively, is another gear's; the closest pair of common ones is 0.6 % apart."""
@@ -56,6 +41,8 @@ class Record:
     """Where it comes from, for messages."""
     starts: tuple[int, ...] = field(default=(0,))
     """The rows where one of its records begins: between two of them nothing is known of the axis."""
+    origin: Origin | None = None
+    """The CSV file that it was read from, and how; None for any other record."""
 
     def __post_init__(self) -> None:
         missing = [name for name in REQUIRED if name not in self.columns]
@@ -72,27 +59,45 @@ class Record:
         return type(self), (dict(self.columns), self.source, self.starts)
 
     @classmethod
-    def read_csv(cls, path: Path | str, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
-        """Read a CSV file, plain or gzip.
+    def read_csv(
+        cls,
+        path: Path | str,
+        minimum_samples: int = MINIMUM_SAMPLES,
+        *,
+        columns: Said = None,
+        units: Said = None,
+        unwrap: Said = None,
+    ) -> Self:
+        """Read a CSV file of any program, plain or gzip.
 
-        InputError, with file and line: a required column is missing, a value of a known column is no finite
-        number, a row is ragged, time runs backwards, there are too few samples, it is not UTF-8 or not gzip.
+        ``columns`` says which column is which channel, ``units`` in which unit, ``unwrap`` by which period a
+        counter wraps, as the command line does: ``columns="motor=theta_m,time=t"`` or a mapping. What
+        was assumed is in ``.origin.remarks``.
+
+        InputError, with file and line: a required column is missing, a value of a known column is not a
+        finite number, a row is ragged, time runs backwards, there are too few samples, no known encoding.
         """
-        path = Path(path)
-        columns = read_columns(path, list(REQUIRED), OPTIONAL)
-        time_s = columns["time_s"]
-        if len(time_s) < minimum_samples:
+        return cls.of_csv(Path(path), CsvColumns.of(columns, units, unwrap), minimum_samples)
+
+    @classmethod
+    def of_csv(cls, path: Path, said: CsvColumns, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
+        """`read_csv`, with what is said of the file's columns taken apart already."""
+        file = CsvFile(path, [said.column(channel) for channel in CHANNELS])
+        found, origin = read(file, said)
+        record = cls(found, str(path), origin=origin)
+        if len(record) < minimum_samples:
             raise InputError(
-                f"{path}: {len(time_s)} samples are too few; expected at least {minimum_samples}"
+                f"{path}: {len(record)} samples are too few; expected at least {minimum_samples}"
             )
-        backwards = np.flatnonzero(np.diff(time_s) < 0.0)
+        backwards = np.flatnonzero(np.diff(record.time_s) < 0.0)
         if len(backwards):
             row = int(backwards[0]) + 1
+            cure = origin.clock_cure(record.time_s)
             raise InputError(
-                f"{path}:{line_of_row(path, row)}: time_s: {time_s[row]:g} after {time_s[row - 1]:g}; "
-                "expected time that does not run backwards"
+                f"{origin.place(row)}: time_s: {record.time_s[row]:g} after {record.time_s[row - 1]:g}; "
+                f"expected time that does not run backwards{f': {cure}' if cure else ''}"
             )
-        return cls(columns, str(path))
+        return record
 
     def write_csv(self, path: Path | str) -> None:
         """Write the record atomically, gzip where the name ends in ``.gz``.
@@ -177,13 +182,11 @@ class Record:
         if off <= WRONG_RATIO or off * travel_deg * ARCSEC_PER_DEG <= WRONG_RATIO_ARCSEC:
             return
         if abs(slope) * ratio < 0.01:
-            found, cure = "the load stands still while the motor turns", "look at the load encoder's column"
-        elif slope < 0.0:
-            found = f"the motor makes {-1 / slope:.5g} turns per turn of the load, against it"
-            cure = "turn the direction of one encoder round"
+            found = "the load stands still while the motor turns"
         else:
-            found = f"the motor makes {1 / slope:.5g} turns per turn of the load"
-            cure = _cure(slope * ratio, ratio)
+            found = f"the motor makes {1 / abs(slope):.5g} turns per turn of the load"
+            found += ", against it" if slope < 0.0 else ""
+        cure = remedy(slope * ratio, ratio, WRONG_RATIO, self.origin)
         name = f"{self.source}: " if self.source else ""
         over = f"measured over {travel_deg:.3g} deg of the load"
         raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
@@ -192,7 +195,7 @@ class Record:
         """The samples from row ``first`` up to, not including, ``end``."""
         columns = {name: column[first:end] for name, column in self.columns.items()}
         inside = (start - first for start in self.starts if first < start < end)
-        return type(self)(columns, self.source, (0, *inside))
+        return type(self)(columns, self.source, (0, *inside), self.origin)
 
     def between(self, start_s: float, end_s: float) -> Self:
         """The samples of a span of time, both ends included."""
@@ -209,7 +212,7 @@ class Record:
 def concatenate(records: Sequence[Record]) -> Record:
     """Several records as one, in the order given, with one absolute zero.
 
-    A record whose time begins anew is moved in time to follow the one before. Columns that not every one has
+    A record whose time starts again is moved in time to follow the one before. Columns that not every one has
     are left out.
     """
     if not records:
@@ -244,34 +247,6 @@ def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
             end_s = float(record.time_s[-1]) + shift_s
         shifts.append(shift_s)
     return tuple(shifts)
-
-
-def _cure(times: float, ratio: float) -> str:
-    """What may be wrong where the load goes so many times as far as the ratio says."""
-    usual = {
-        1.0 / _DEG_PER_RAD: "the load's angle looks like radians: convert it to degrees",
-        _DEG_PER_RAD: "the motor's angle looks like radians: convert it to degrees",
-        1.0 / _DEG_PER_TURN: "the load's angle looks like turns: convert it to degrees",
-        _DEG_PER_TURN: "the motor's angle looks like turns: convert it to degrees",
-        3600.0: "the load's angle looks like arcseconds: convert it to degrees",
-        ratio**2: "the columns of motor and load are exchanged",
-        ratio: "the motor's angle is told at the gear's output: multiply it by the ratio",
-    }
-    value, cure = min(usual.items(), key=lambda each: abs(times / each[0] - 1.0))
-    if abs(times / value - 1.0) < UNIT_SHARE:
-        rest = abs(times / value - 1.0)
-        return (
-            cure
-            if rest < WRONG_RATIO
-            else f"{cure} (then it is {100.0 * rest:.2g} % off: see the ratio, too)"
-        )
-    for name, counts in (("load", _DEG_PER_TURN * times), ("motor", _DEG_PER_TURN / times)):
-        if counts > LEAST_COUNTS:
-            return (
-                f"the {name}'s angle looks like counts, some {counts:.4g} to a turn: convert it to degrees "
-                "(times 360, divided by the counts per turn)"
-            )
-    return "correct the ratio, or the counts per turn of an encoder"
 
 
 def _frozen(column: Any) -> Column:

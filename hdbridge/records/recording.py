@@ -12,19 +12,24 @@ import importlib.metadata
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from hdbridge.axis import Identity
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically, wrong
+from hdbridge.records.columns import CsvColumns, Said
 from hdbridge.records.record import Record, concatenate, time_shifts_s
 from hdbridge.strictness import Strict
 
+GAP_CYCLES: Final = 5
+"""Within so few missing cycles the motor does not reverse and come back unnoticed."""
+PART_SAMPLES: Final = 50
+"""A shorter part of a recording that is cut at its gaps is left out."""
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
@@ -88,18 +93,25 @@ class Recording:
     notes: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def load(cls, *paths: Path | str) -> Self:
+    def load(cls, *paths: Path | str, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
         """Recording folders and CSV files, as one recording in the order given.
 
+        ``columns``, ``units`` and ``unwrap`` are for CSV files of other programs, as for `Record.read_csv`.
         InputError for whatever is wrong with one of them, and for files that have changed since they were
         recorded.
         """
-        return cls.joined([cls._load_one(Path(path)) for path in paths])
+        said = CsvColumns.of(columns, units, unwrap)
+        return cls.joined([cls._load_one(Path(path), said) for path in paths])
 
     @classmethod
-    def _load_one(cls, path: Path) -> Self:
+    def _load_one(cls, path: Path, said: CsvColumns) -> Self:
         if not path.is_dir():
-            return cls(Record.read_csv(path))
+            return cls(Record.of_csv(path, said))
+        if said:
+            raise InputError(
+                f"{path}: --columns, --units and --unwrap are for CSV files, and this is a recording; read "
+                "it without them"
+            )
         if not (path / ABOUT_NAME).exists():
             raise InputError(
                 f"{path}: no {ABOUT_NAME} in this folder; expected a recording, or name its CSV files"
@@ -116,7 +128,7 @@ class Recording:
                         f"{file} has changed since it was recorded; restore it, or read it alone as a "
                         "CSV file",
                     )
-            records.append(Record.read_csv(file, minimum_samples=0))
+            records.append(replace(Record.read_csv(file, minimum_samples=0), origin=None))
         return cls(
             records[0] if len(records) == 1 else concatenate(records),
             about.segments,

@@ -106,7 +106,11 @@ def _status(result: Calibration) -> tuple[Status, tuple[Command, ...]]:
 
 
 def _verdict(result: Calibration) -> str:
-    text = sentence(result.offer.reason if result.offer is not None else result.fit.held_out.text)
+    offer, checked = result.offer, result.validation
+    text = "" if checked is None else sentence(checked.summary)
+    if checked is None or offer is None or not offer.made or checked.worse:
+        reason = sentence(offer.reason if offer is not None else result.fit.held_out.text)
+        text = f"{text} {reason}".strip()
     if notes := len(result.fit.warnings):
         text += f" Read the {'note' if notes == 1 else f'{notes} notes'} under 'What the model leaves'."
     return text

@@ -75,7 +75,10 @@ def test_a_command_asks_the_daemon_for_what_it_says(ctl, machine, line, asked):
 
 def test_status_is_a_table_for_people_and_the_state_for_machines(ctl, machine, tmp_path):
     machine.axes["joint-2"].at = messages.ControlState.QUICK_STOPPED
+    doubt = "the load encoder moved by 19.0 arcsec without the motor"
+    machine.axes["joint-1"].load_loop = messages.LoadLoopState(configured=True, on=True, doubt=doubt)
     said = ctl("status", "--json", "state.json")
+    assert f"the load loop of axis 'joint-1' does not act: {doubt}" in said
     assert "machine 'cell', simulated; virtual hdbridge is up, load 31 %; cycle of 4 ms" in said
     assert "nobody has the right to move" in said
     assert "axis 'joint-2' stopped: a TPDO is missing; check the cable" in said

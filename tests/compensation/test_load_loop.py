@@ -1,142 +1,286 @@
-"""Laws of the slow loop over the load encoder, on a load that is one number."""
+"""Laws of the slow loop over the load encoder, on a load that follows its motor but for one offset."""
 
 import math
+from dataclasses import dataclass, field
+from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.control.loadloop import LoadLoop
+from hdbridge.control.loadloop import LoadLoop, loop_width_arcsec
+from hdbridge.effects import Hysteresis, HysteresisMemory
 from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
 
 PERIOD_S = 0.004
 MAXIMUM, SLEW = 40.0, 100.0
-errors = st.none() | st.floats(-60, 60) | st.floats()
+COUNT = 0.5
+numbers = st.floats(-60, 60) | st.floats()
+lags = st.floats(-35, 35)
+signs = st.sampled_from([-1, 1])
 
 
-def loop(gain: float = 1.0) -> LoadLoop:
-    return LoadLoop(gain, MAXIMUM, SLEW, PERIOD_S)
+def loop(gain: float = 1.0, counts: float = COUNT, maximum: float = MAXIMUM, slew: float = SLEW) -> LoadLoop:
+    return LoadLoop(gain, maximum, slew, PERIOD_S, counts_arcsec=counts)
 
 
-def at_rest(its: LoadLoop, offset: float, seconds: float) -> float:
-    """A load that is off by this much and follows what is added; what is left of the error."""
-    for _ in range(round(seconds / PERIOD_S)):
-        its.step(offset - its.value_arcsec, moving=False)
-    return offset - its.value_arcsec
+@dataclass
+class Plant:
+    """A motor of whole counts, a load that lags it by ``lag``, and an encoder with noise that may jump."""
+
+    its: LoadLoop
+    lag: float = 0.0
+    noise: float = 0.0
+    count: float = 0.0
+    target: float = 0.0
+    jump: float = 0.0
+    frozen: float | None = None
+    random: Random = field(default_factory=lambda: Random(1))
+
+    def step(self, moving: bool = False) -> float:
+        """One period with a motor that follows at once."""
+        motor = self.target + self.its.value_arcsec
+        if self.count:
+            motor = self.count * round(motor / self.count)
+        load = motor - self.lag + self.jump + self.noise * self.random.gauss(0.0, 1.0)
+        if self.frozen is not None:
+            load = self.frozen
+        return self.its.step(self.target, load, motor, moving)
+
+    def rest(self, seconds: float) -> float:
+        """The true error at the end."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.step()
+        return self.lag - self.its.value_arcsec
+
+    def move(self, target: float, seconds: float = 1.0) -> float:
+        """To another place, and rest there."""
+        self.target = target
+        self.step(moving=True)
+        return self.rest(seconds)
+
+    def freeze(self) -> None:
+        self.frozen = self.target + self.its.value_arcsec - self.lag
 
 
-@given(st.lists(st.tuples(errors, st.booleans(), st.integers(1, 200)), max_size=20))
-def test_it_is_bounded_and_never_steps_whatever_it_is_told(told):
+# ---------------------------------------------------------------- the value
+
+
+@given(
+    st.lists(
+        st.tuples(numbers, st.none() | numbers, numbers, st.booleans(), st.integers(1, 200)), max_size=20
+    )
+)
+def test_the_value_is_bounded_and_never_steps_for_any_input(inputs):
     its = loop(gain=5.0)
     value = 0.0
-    for error, moving, periods in told:
+    for target, load, motor, moving, periods in inputs:
+        if not math.isfinite(target):
+            continue
         for _ in range(periods):
-            last, value = value, its.step(error, moving)
+            last, value = value, its.step(target, load, motor, moving)
             assert abs(value) <= MAXIMUM
             assert abs(value - last) <= SLEW * PERIOD_S * (1.0 + 1e-9)
 
 
-@given(st.floats(-35, 35), st.floats(0.2, 5.0))
-def test_at_rest_it_takes_the_mean_error_away(offset, gain):
-    its = loop(gain)
-    left = at_rest(its, offset, 1.0 + 10.0 / gain)
-    assert abs(left) <= 1e-3 * abs(offset) + 1e-9
-    assert not its.doubted
+@given(lags, st.floats(0.2, 5.0))
+def test_at_rest_the_mean_error_is_taken_away(lag, gain):
+    plant = Plant(loop(gain), lag)
+    assert abs(plant.rest(1.0 + 10.0 / gain)) <= 1e-3 * abs(lag) + 1e-9
+    assert not plant.its.doubt
 
 
-def test_in_motion_it_holds():
-    its = loop()
-    at_rest(its, 20.0, 3.0)
-    held = its.value_arcsec
-    assert {its.step(error, moving=True) for error in (500.0, -20.0, math.inf)} == {held}
+def test_in_motion_the_value_is_held():
+    plant = Plant(loop(), 20.0)
+    plant.rest(3.0)
+    held = plant.its.value_arcsec
+    assert {plant.its.step(0.0, load, 0.0, moving=True) for load in (500.0, -20.0)} == {held}
 
 
-@given(st.floats(-35, 35))
-def test_it_fades_out_where_the_encoder_is_not_believed_and_comes_back(offset):
-    its = loop()
-    at_rest(its, offset, 3.0)
-    for _ in range(round(MAXIMUM / SLEW / PERIOD_S)):
-        its.step(None, moving=False)
-    assert its.value_arcsec == 0.0
-    assert abs(at_rest(its, offset, 12.0)) <= 1e-3 * abs(offset) + 1e-9
+@given(lags)
+def test_without_a_reading_it_fades_out_and_comes_back(lag):
+    plant = Plant(loop(), lag)
+    plant.rest(3.0)
+    for _ in range(round(MAXIMUM / SLEW / PERIOD_S) + 1):
+        plant.its.step(0.0, None, 0.0, moving=False)
+    assert plant.its.value_arcsec == 0.0
+    assert abs(plant.rest(12.0)) <= 1e-3 * abs(lag) + 1e-9
 
 
-def test_at_its_bound_it_does_not_wind_up():
-    its = loop(gain=5.0)
-    its.reset(32.0)
-    at_rest(its, 60.0, 20.0)
-    assert its.value_arcsec == MAXIMUM
-    its.step(59.0 - MAXIMUM, moving=False)
-    assert its.value_arcsec == MAXIMUM
-    its.step(-1.0, moving=True)
-    for _ in range(200):
-        its.step(-1.0, moving=False)
-    assert its.value_arcsec < MAXIMUM
-
-
-@given(st.floats(-35, 35))
-def test_a_frozen_encoder_gets_no_more_than_a_quarter_and_then_nothing(shown):
-    its = loop(gain=5.0)
-    values = [abs(its.step(shown, moving=False)) for _ in range(5000)]
-    assert max(values) <= 0.25 * MAXIMUM + SLEW * PERIOD_S
-    assert values[-1] == 0.0 or max(values) <= 0.25 * MAXIMUM
-    if abs(shown) > 0.1:
-        assert its.doubted
-
-
-@given(st.floats(-20, 20), st.floats(14, 1000), st.sampled_from([-1, 1]))
-def test_an_encoder_that_jumps_at_rest_is_not_followed(offset, size, sign):
-    its = loop()
-    at_rest(its, offset, 2.0)
-    before = its.value_arcsec
-    for _ in range(1000):
-        value = its.step(offset + sign * size - its.value_arcsec, moving=False)
-        assert min(before, 0.0) <= value <= max(before, 0.0)
-    assert value == 0.0
-
-
-def test_an_encoder_once_doubted_is_believed_again_only_after_a_reset():
-    its = loop(gain=5.0)
-    for _ in range(5000):
-        its.step(15.0, moving=False)
-    assert its.doubted
-    its.step(5.0, moving=True)
-    assert at_rest(its, 5.0, 6.0) == 5.0
-    its.reset()
-    assert not its.doubted
-    assert abs(at_rest(its, 5.0, 6.0)) < 0.01
-
-
-def test_an_error_beyond_its_bound_is_none_of_its_own():
-    its = loop()
-    at_rest(its, 20.0, 3.0)
-    its.step(0.0, moving=True)
-    for _ in range(1000):
-        its.step(61.0 - its.value_arcsec, moving=False)
-    assert (its.value_arcsec, its.doubted) == (0.0, False)
-    its.step(0.0, moving=True)
-    assert abs(at_rest(its, 20.0, 10.0)) < 0.01
+@given(st.floats(41, 79), signs)
+def test_at_its_bound_it_does_not_wind_up(lag, sign):
+    plant = Plant(loop(gain=5.0), sign * lag)
+    plant.rest(5.0)
+    assert plant.its.value_arcsec == sign * MAXIMUM
+    plant.lag = sign * 39.0
+    plant.move(100.0)
+    assert abs(plant.its.value_arcsec) < MAXIMUM
+    assert plant.its.doubt == ""
 
 
 @pytest.mark.parametrize("value", [-12.0, 0.0, 39.0])
-def test_a_reset_goes_on_from_where_it_was(value):
+def test_a_reset_continues_from_its_value(value):
     its = loop()
     its.reset(value)
-    assert its.step(3.0, moving=False) == value
+    assert its.step(3.0, 0.0, 0.0, moving=False) == value
+
+
+# ---------------------------------------------------------------- the doubt
+
+
+@given(
+    lag=st.floats(-30, 30),
+    noise=st.floats(0, 3),
+    count=st.floats(0.01, 10.0),
+    moves=st.lists(st.tuples(st.floats(-500, 500), st.floats(-3, 3)), max_size=6),
+    seed=st.integers(0, 1000),
+)
+def test_motor_counts_noise_and_reversals_are_never_taken_for_a_fault(lag, noise, count, moves, seed):
+    its = loop(gain=0.5, counts=count + 0.1, maximum=20.0, slew=20.0)
+    plant = Plant(its, lag, noise, count, random=Random(seed))
+    plant.rest(4.0)
+    assert its.doubt == ""
+    for target, change in moves:
+        plant.lag = lag + change  # the model is wrong by something else at every place
+        plant.move(target, 2.0)
+        assert its.doubt == ""
+
+
+@given(st.floats(-20, 20), st.floats(2.0, 1000), signs)
+def test_an_encoder_that_moves_at_rest_is_not_followed_until_it_moves_back(lag, size, sign):
+    plant = Plant(loop(), lag)
+    plant.rest(2.0)
+    before = plant.its.value_arcsec
+    plant.jump = sign * size * COUNT
+    for _ in range(1000):
+        value = plant.step()
+        assert min(before, 0.0) <= value <= max(before, 0.0)
+    assert value == 0.0
+    assert "moved by" in plant.its.doubt
+    plant.jump = 0.0
+    assert abs(plant.rest(12.0)) < 0.1
+    assert plant.its.doubt == ""
+
+
+@given(st.floats(0.1, 3.0), st.integers(0, 1000), signs)
+def test_with_noise_a_jump_is_found_and_the_doubt_ends_with_it(noise, seed, sign):
+    plant = Plant(loop(), 10.0, noise, random=Random(seed))
+    plant.rest(4.0)
+    plant.jump = sign * 30.0 * noise
+    plant.rest(2.0)
+    assert "moved by" in plant.its.doubt
+    plant.jump = 0.0
+    plant.rest(2.0)
+    assert plant.its.doubt == ""
+
+
+def test_each_further_doubt_doubles_the_time_that_the_encoder_is_observed():
+    plant = Plant(loop(), 10.0)
+    plant.rest(2.0)
+    waits = []
+    for _ in range(4):
+        plant.jump = 20.0
+        plant.rest(0.5)
+        plant.jump = 0.0
+        periods = 0
+        while plant.its.doubt:
+            plant.step()
+            periods += 1
+        waits.append(periods * PERIOD_S)
+        plant.rest(1.0)
+    assert waits == pytest.approx([1.0, 2.0, 4.0, 8.0], abs=0.02)
+
+
+SMALL = TransmissionModel(100.0, (Hysteresis(offset_arcsec=1.0, width_deg=3.0, exponent=1.6),))
+"""A gear with 2 arcsec of hysteresis."""
+
+
+@given(st.floats(6, 20), signs)
+def test_an_encoder_that_stands_still_is_found_by_the_motion_of_the_motor(shown, sign):
+    its = loop(gain=2.0)
+    its.use_models(SMALL, TransmissionModel(100.0))
+    plant = Plant(its, sign * shown)
+    plant.frozen = -sign * shown
+    most = max(abs(plant.step()) for _ in range(3000))
+    assert most <= 2.0 * (2.0 + COUNT)
+    assert "lags the motor" in its.doubt
+    assert its.value_arcsec == 0.0
+
+
+def test_an_encoder_that_stood_still_is_believed_again_after_motion_in_both_directions():
+    plant = Plant(loop(gain=2.0, maximum=20.0), 10.0)
+    plant.its.use_models(SMALL, SMALL)
+    plant.frozen = -10.0
+    plant.rest(3.0)
+    assert "lags the motor" in plant.its.doubt
+    for target in (3000.0, 10.0, 0.0, 7.0, 100.0, 70.0, 0.0, 3000.0, 2990.0):
+        plant.move(target)
+        assert plant.its.doubt
+        assert plant.its.value_arcsec == 0.0
+    plant.frozen = None
+    plant.move(6000.0)
+    assert plant.its.doubt
+    assert abs(plant.move(2000.0, 8.0)) < 0.1
+    assert plant.its.doubt == ""
+
+
+def test_an_error_that_is_too_large_is_left_alone_and_reported():
+    plant = Plant(loop(), 20.0)
+    plant.rest(3.0)
+    plant.lag = 85.0
+    plant.move(100.0, 2.0)
+    assert plant.its.value_arcsec == 0.0
+    assert "is 85.0 arcsec without the loop, which adds at most 40" in plant.its.doubt
+    plant.lag = 20.0
+    assert abs(plant.move(200.0, 12.0)) < 0.01
+    assert plant.its.doubt == ""
+
+
+def test_a_slow_drift_is_followed():
+    plant = Plant(loop(gain=1.0), 0.0, noise=0.1)
+    plant.its.use_models(SMALL, SMALL)
+    for _ in range(30):
+        plant.lag += 0.05
+        plant.rest(20.0)
+        assert plant.its.doubt == ""
+    assert abs(plant.lag - plant.its.value_arcsec) < 1.0
+
+
+def test_switching_it_on_again_ends_a_doubt():
+    plant = Plant(loop(), 10.0)
+    plant.rest(2.0)
+    plant.jump = 5.0
+    plant.rest(1.0)
+    assert plant.its.doubt
+    plant.its.reset()
+    assert plant.its.doubt == ""
+
+
+# ---------------------------------------------------------------- what it is made from
+
+
+@pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
+def test_the_width_of_a_loop_is_twice_its_offset(law):
+    model = TransmissionModel(100.0, (law(offset_arcsec=-12.5, width_deg=20.0, exponent=1.6),))
+    assert loop_width_arcsec(model) == pytest.approx(25.0)
+    assert loop_width_arcsec(TransmissionModel(100.0)) == 0.0
 
 
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
-        ((0.0, 1.0, 1.0, 1.0), "gain_1_s is 0.0"),
-        ((1.0, math.nan, 1.0, 1.0), "maximum_arcsec"),
-        ((1.0, 1.0, math.inf, 1.0), "slew_arcsec_s"),
-        ((1.0, 1.0, 1.0, -1.0), "period_s"),
-        ((6.0, 1.0, 1.0, 1.0), "at most 5"),
+        ((0.0, 1.0, 1.0, 1.0, 1.0), "gain_1_s is 0.0"),
+        ((1.0, math.nan, 1.0, 1.0, 1.0), "maximum_arcsec"),
+        ((1.0, 1.0, math.inf, 1.0, 1.0), "slew_arcsec_s"),
+        ((1.0, 1.0, 1.0, -1.0, 1.0), "period_s"),
+        ((1.0, 1.0, 1.0, 1.0, 0.0), "counts_arcsec"),
+        ((6.0, 1.0, 1.0, 1.0, 1.0), "at most 5"),
     ],
 )
 def test_numbers_that_make_no_loop_are_refused(numbers, message):
+    *first, counts = numbers
     with pytest.raises(InputError, match=message):
-        LoadLoop(*numbers)
+        LoadLoop(*first, counts_arcsec=counts)
     with pytest.raises(InputError, match="finite"):
         loop().reset(math.nan)

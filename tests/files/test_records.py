@@ -33,12 +33,11 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
     [
         (b"", ": the file is empty; expected a header line and one row per sample"),
         (b"\n\n", ": the file is empty; expected a header line and one row per sample"),
-        (b"time_s,motor_position_deg\n0,1\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg"),
-        (b"time_s,motor_position_deg,load_pos_deg\n0,1,2\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg, load_pos_deg; is 'load_pos_deg' meant?"),
-        (b"time_s;motor_position_deg;load_position_deg\n0;1;2\n", ":1: the columns are not separated by commas; expected comma-separated values"),
-        (b"0,1,2\n1,2,3\n", ":1: the first line holds numbers; expected the names of the columns"),
-        (f"{HEAD},time_s\n0,1,2,3\n".encode(), ":1: column 'time_s' stands twice"),
-        (f"{HEAD},\n0,1,2,\n".encode(), ":1: column 4 has no name"),
+        (b"time_s,motor_position_deg\n0,1\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg; pass --columns load=COLUMN"),
+        (b"time_s,motor_position_deg,load_pos_deg\n0,1,2\n", ":1: column 'load_position_deg' is missing; found time_s, motor_position_deg, load_pos_deg; pass --columns load=load_pos_deg"),
+        (b"time_s;motor_position_deg;load_position_deg\n0;1;2\n1;1;x\n", ":3: load_position_deg: 'x' is not a number; expected a number"),
+        (b"0,1,2\n1,2,3\n", ": the first line holds numbers and columns 'time_s', 'motor_position_deg', 'load_position_deg' are missing; name the columns by their numbers, 1 to 3: --columns time=N,motor=N,load=N"),
+        (f"{HEAD},time_s\n0,1,2,3\n".encode(), ":1: two columns are called 'time_s'; expected each name once: name the column by its number, as in 1"),
         (f"{HEAD}\n0,1,2\n1,abc,2\n".encode(), ":3: motor_position_deg: 'abc' is not a number; expected a number"),
         (f"{HEAD}\n0,1,2\n1,,2\n".encode(), ":3: motor_position_deg: no value; expected a number"),
         (f"{HEAD}\n0,1,2\n1,1_0,2\n".encode(), ":3: motor_position_deg: '1_0' is not a number; expected a number"),
@@ -53,7 +52,7 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD}\n0,1,2,3\n1,1,2,3\n".encode(), ":2: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n".encode(), ": 1 samples are too few; expected at least 2"),
         (f"{HEAD}\n".encode(), ": 0 samples are too few; expected at least 2"),
-        (f"{HEAD},note\n0,1,2,\xfc\n".encode("latin-1"), ":2: not UTF-8 text; expected CSV in UTF-8"),
+        (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"),
         (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off (Compressed file ended before the end-of-stream marker was reached)"),
     ],
 )  # fmt: skip
@@ -219,5 +218,5 @@ def test_a_long_record_takes_the_fast_way(tmp_path, monkeypatch):
     path = tmp_path / "long.csv"
     one = record(samples=20_000, travel_deg=3.3)
     one.write_csv(path)
-    monkeypatch.setattr("hdbridge.files.csvfile._slow", None)
+    monkeypatch.setattr("hdbridge.files.csvfile.CsvFile._slow", None)
     assert Record.read_csv(path) == one

@@ -200,7 +200,10 @@ def test_before_and_after_are_drawn_to_one_scale():
     assert "2.00 times that" in text
     assert charts["Before: no compensation"]["y_range"] == charts["After: the new model"]["y_range"]
     assert charts["After, enlarged"]["y_range"] is None
-    assert "Offered.</strong> Stepping 3 sigma 90 to 5.68 arcsec. Read the note" in text
+    assert (
+        "Offered.</strong> 90.0 to 5.7 arcsec (3 sigma), 16 times better; best possible 2.84. Read the note"
+        in text
+    )
 
 
 @pytest.mark.parametrize(

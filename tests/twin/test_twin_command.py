@@ -15,6 +15,7 @@ from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.files.csvfile import write_columns
 from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
@@ -154,6 +155,13 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
     done = run_here(profile, "twin", profile, tmp_path / "bare.csv")
     assert done.returncode == 2
     assert "no column motor_target_deg" in done.stderr
+    assert "pass --columns target=COLUMN" in done.stderr
+    named = {{"motor_target_deg": "demand"}.get(name, name): each for name, each in record.columns.items()}
+    write_columns(tmp_path / "named.csv", named)
+    options = ("--columns", "target=demand", "--units", "target=deg")
+    done = run_here(profile, "twin", profile, tmp_path / "named.csv", *options, "--check")
+    assert done.returncode == 2
+    assert "there is no active twin" in done.stderr
 
 
 def fitted(truth: Truth) -> Callable[..., Twin]:

@@ -114,7 +114,7 @@ def corrections() -> dict[str, float]:
 
         return run
 
-    loop = LoadLoop(1.0, 40.0, 100.0, PERIOD_S)
+    loop = LoadLoop(1.0, 40.0, 100.0, PERIOD_S, counts_arcsec=3.6)
     # In turns, so that a machine that slows down does so for both.
     alone_us, behind_us = [], []
     for _ in range(9):
@@ -124,7 +124,7 @@ def corrections() -> dict[str, float]:
         "compensation, alone": statistics.median(alone_us),
         "correction, unchanging": statistics.median(behind_us),
         "correction, changing": median_us(cycle(2, changing)),
-        "load loop, at rest": median_us(lambda: loop.step(1.0, False)),
+        "load loop, at rest": median_us(lambda: loop.step(1.0, 0.0, 0.0, False)),
     }
 
 

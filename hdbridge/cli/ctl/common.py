@@ -164,6 +164,8 @@ def concerns(state: AxisState) -> Iterator[str]:
         yield f"axis '{state.name}' stopped: {state.fault}"
     if state.adaptation.frozen is not None:
         yield f"axis '{state.name}' does not adapt: {state.adaptation.frozen}"
+    if state.load_loop.on and state.load_loop.doubt is not None:
+        yield f"the load loop of axis '{state.name}' does not act: {state.load_loop.doubt}"
     for each in state.advice:
         yield f"axis '{state.name}': {each}"
 

@@ -32,6 +32,7 @@ class EventKind(StrEnum):
     CHANGED = "changed"
     STREAM_REFUSED = "stream-refused"
     ENDING = "ending"
+    LOAD_LOOP = "load-loop"
     NOTE = "note"
     """From the service: a lease, a job, the recorder, the watch, the adaptation."""
 

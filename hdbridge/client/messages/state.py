@@ -62,6 +62,11 @@ class LoadLoopState(Report):
     configured: bool = Field(description="whether the machine file has one for this axis")
     on: bool = False
     correction_arcsec: float = Field(0.0, description="what it adds now")
+    doubt: str | None = Field(
+        None,
+        description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
+        examples=["the mean error at rest is 46.3 arcsec without the loop, which adds at most 20"],
+    )
 
 
 class AdaptationState(Report):
@@ -143,6 +148,7 @@ class CycleState(Report):
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
     alive: bool = Field(description="whether the loop turned lately")
+    pid: int = Field(0, ge=0, description="process id of the control loop")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
     late_us: float | None = Field(None, description="how late the newest cycle began")
     busy_us: float | None = Field(None, description="how long the newest cycle took")

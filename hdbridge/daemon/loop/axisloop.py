@@ -59,7 +59,8 @@ class AxisLoop:
         self._follow = self.follower.follow
         self._sampler = AxisSampler(self.cycle, self.follower)
         self._changing = self._underrun = False
-        """What was told last of the change of the compensation, and of the stream."""
+        self._doubt = ""
+        """What was told last of the change of the compensation, of the stream, and of the load loop."""
         self._enable_id = self._disable_id = self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
@@ -357,6 +358,10 @@ class AxisLoop:
             self._underrun = set_point.underrun
             if self._underrun:
                 self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+        doubt = self.follower.loop_doubt
+        if doubt != self._doubt:
+            self._doubt = doubt
+            self._tell(self.index, EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
         if self._changing and not self.follower.correction.changing:
             self._changing = False
             self.follower.changed()

@@ -70,7 +70,7 @@ class AxisSampler:
                 flags |= _CHANGING
             if underrun:
                 flags |= _UNDERRUN
-            if follower.loop_doubted:
+            if follower.loop_doubt:
                 flags |= _DOUBTED
         else:
             flags |= _AT_REST

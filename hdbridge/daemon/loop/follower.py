@@ -100,6 +100,8 @@ class Follower:
             # It starts from the value that is in the target now, so that nothing jumps.
             self._load_loop.reset(self.loop_arcsec)
         self._load_loop_on = setting.load_loop
+        if self._load_loop is not None:
+            self._load_loop.use_models(setting.adapted or setting.model, self.correction.model)
 
     # ---------------------------------------------------------------- turn by turn
 
@@ -160,16 +162,20 @@ class Follower:
         self._needs = needs
 
     @property
-    def loop_doubted(self) -> bool:
-        """Whether the load loop does not believe the load encoder."""
-        return self._load_loop is not None and self._load_loop.doubted
+    def loop_doubt(self) -> str:
+        """Reason why the load loop does not act, in words; empty while it may."""
+        return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
         """The load target with the slow integral of the measured error; within the limits."""
-        error: float | None = None
+        image, correction = self._image, self.correction
+        load: float | None = None
         if self._load_loop_on and feedback.fresh:
-            error = ARCSEC_PER_DEG * (target_deg - self._image.load_deg(feedback.load_counts))
-        self.loop_arcsec = load_loop.step(error, not self.set_point.at_rest)
+            load = ARCSEC_PER_DEG * image.load_deg(feedback.load_counts)
+        by_motor = ARCSEC_PER_DEG * image.motor_deg(feedback.motor_counts) / self._ratio
+        by_motor += correction.predicted_arcsec
+        moving = not self.set_point.at_rest or correction.changing
+        self.loop_arcsec = load_loop.step(ARCSEC_PER_DEG * target_deg, load, by_motor, moving)
         trimmed = target_deg + self.loop_arcsec / ARCSEC_PER_DEG
         limits = self._axis.limits
         # Where the axis stands outside of its limits the target says so; the loop adds nothing to that.
@@ -192,5 +198,14 @@ def _load_loop(setup: AxisSetup) -> LoadLoop | None:
     settings = setup.load_loop
     if settings is None:
         return None
-    period_s = setup.config.drive.cycle_s
-    return LoadLoop(settings.gain_1_s, settings.maximum_arcsec, settings.slew_arcsec_s, period_s)
+    config = setup.config
+    motor_count_deg = abs(config.motor_encoder.degrees(1)) / config.gear.ratio
+    loop = LoadLoop(
+        settings.gain_1_s,
+        settings.maximum_arcsec,
+        settings.slew_arcsec_s,
+        config.drive.cycle_s,
+        counts_arcsec=ARCSEC_PER_DEG * (motor_count_deg + abs(config.load_encoder.degrees(1))),
+    )
+    loop.use_models(setup.compensation.model, setup.compensation.model)
+    return loop

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 2
+VERSION: Final = 3
 PAGE: Final = 4096
 LINE: Final = 64
 """A cache line: what two processes write lies in different ones."""
@@ -59,7 +59,7 @@ class SampleFlag(IntFlag):
     UNDERRUN = 64
     """A stream ran out of knots in motion."""
     LOOP_DOUBTED = 128
-    """The load loop does not believe the load encoder; it is out of use until it is switched on again."""
+    """The load loop does not act; the last `EventKind.LOAD_LOOP` of the axis says why."""
     CHANNEL0_KNOWN = 256
     CHANNEL1_KNOWN = 512
 
@@ -124,6 +124,8 @@ class EventKind(IntEnum):
     STREAM_REFUSED = 11
     """A knot of the stream was refused and the axis brakes; ``text`` says why."""
     ENDING = 12
+    LOAD_LOOP = 13
+    """The load loop no longer acts (``code`` 1) and ``text`` says why, or acts again (``code`` 0)."""
 
 
 class Event(NamedTuple):

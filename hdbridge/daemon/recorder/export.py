@@ -25,12 +25,8 @@ from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.reading import Flight, ModelUsed
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
-from hdbridge.records.recording import Recording
+from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 
-GAP_CYCLES: Final = 5
-"""Within so few missing cycles the motor does not reverse and come back unnoticed."""
-PART_SAMPLES: Final = 50
-"""A shorter part is left out."""
 ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
 UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
 """Afterwards the encoders' zeros may be others: the drive was booted, or homed."""

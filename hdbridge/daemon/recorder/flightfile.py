@@ -36,6 +36,7 @@ _BAD: Final = {
     EventKind.REFUSED: "warning",
     EventKind.STREAM_REFUSED: "warning",
     EventKind.UNDERRUN: "warning",
+    EventKind.LOAD_LOOP: "warning",
 }
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "integer"}

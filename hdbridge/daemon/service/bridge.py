@@ -86,6 +86,8 @@ class ServiceBridge:
         self._simulated = simulated
         self._started = datetime.now(UTC)
         self._stopped: dict[str, Entry] = {}
+        self._loop_doubts: dict[str, str] = {}
+        """Text of the last event of each load loop."""
         self._seen = 0
         self._bus_up = True
         self._loop_pid = 0
@@ -170,6 +172,8 @@ class ServiceBridge:
                 self._stopped[name] = entry
             elif event.kind is EventKind.STATE and event.code in LATCHED:
                 self._stopped.pop(name, None)  # why it stopped is told when it stands
+            elif event.kind is EventKind.LOAD_LOOP:
+                self._loop_doubts[name] = event.text
             elif event.kind is EventKind.BUS_DOWN:
                 self._bus_up = False
             elif event.kind is EventKind.BUS_UP:
@@ -247,6 +251,7 @@ class ServiceBridge:
                 period_s=core.memory.period_s,
                 cycle=core.observer.cycle,
                 alive=core.observer.alive,
+                pid=core.memory.status.loop_pid,
                 skipped=int(head["skipped"]) if head is not None else 0,
                 late_us=float(head["late_us"]) if head is not None else None,
                 busy_us=float(head["busy_us"]) if head is not None else None,
@@ -264,6 +269,7 @@ class ServiceBridge:
         return reports.axis_state(
             self._axis(name),
             self._stopped.get(name),
+            self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
             self.book.of_axis(name),
             adaptation.state() if adaptation is not None else messages.AdaptationState(),
             self.advice(name),

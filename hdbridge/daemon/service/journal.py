@@ -18,6 +18,7 @@ _LEVELS: Final = {
     EventKind.FAULT: logging.WARNING,
     EventKind.REFUSED: logging.WARNING,
     EventKind.UNDERRUN: logging.WARNING,
+    EventKind.LOAD_LOOP: logging.WARNING,
     EventKind.STREAM_REFUSED: logging.WARNING,
     EventKind.DONE: logging.DEBUG,
     EventKind.MOTION_ENDED: logging.DEBUG,

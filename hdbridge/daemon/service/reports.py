@@ -145,11 +145,14 @@ def limits(config: AxisConfig) -> messages.Limits:
 def axis_state(
     axis: ServiceAxis,
     stopped: Entry | None,
+    loop_doubt: str,
     job: messages.Job | None,
     adaptation: messages.AdaptationState,
     advice: Sequence[str],
 ) -> messages.AxisState:
-    """Everything about an axis; ``stopped`` is the entry that told of its last stop."""
+    """Everything about an axis; ``stopped`` is the entry of its last stop, ``loop_doubt`` the text of
+    its load loop's last event.
+    """
     link, config = axis.link, axis.axis.config
     flags = SampleFlag(int(link.value("flags")))
     known = link.core.observer.newest is not None
@@ -195,6 +198,7 @@ def axis_state(
             configured=axis.axis.load_loop is not None,
             on=in_use.load_loop,
             correction_arcsec=link.value("loop_arcsec"),
+            doubt=loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
         ),
         adaptation=adaptation,
         advice=list(advice),

@@ -541,10 +541,51 @@ def test_the_load_loop_takes_away_what_the_model_leaves_and_fades_when_switched_
         daemon.use(daemon.setting(model=without, load_loop=True))
         daemon.run(4.0)
         assert record(daemon)["loop_arcsec"][-1] != 0.0
-        # The encoder slips: what it shows at rest is not believed any more.
+        # The encoder slips by 19 arcsec, and comes back.
         daemon.nodes[0].faults.load_jump_counts = 150
         daemon.run(3.0)
         axis = record(daemon)
         assert axis["flags"][-1] & SampleFlag.LOOP_DOUBTED
         assert axis["loop_arcsec"][-1] == 0.0
+        (event,) = daemon.told(E.LOAD_LOOP)
+        assert (event.code, event.axis) == (1, 0)
+        assert "moved by" in event.text
+        daemon.nodes[0].faults.load_jump_counts = 0
+        daemon.run(9.0)
+        axis = record(daemon)
+        assert not axis["flags"][-1] & SampleFlag.LOOP_DOUBTED
+        assert [each.code for each in daemon.told(E.LOAD_LOOP)] == [1, 0]
+        assert abs(7.3 - axis["load_position_deg"][-20:].mean()) < 0.3 * abs(left)
+        assert np.abs(np.diff(axis["loop_arcsec"])).max() <= 40.0 * 0.004 * (1 + 1e-9)
         assert daemon.states == [S.ENABLED]
+
+
+@pytest.mark.parametrize(
+    ("scheme", "maximum_arcsec"),
+    [
+        pytest.param(Scheme.EXTENDED, 20.0, id="the settings of docs/files.md"),
+        pytest.param(Scheme.SYNCHRONOUS, 60.0, id="it has all of the hysteresis to take away"),
+    ],
+)
+def test_a_sound_load_encoder_is_never_in_doubt(scheme: Scheme, maximum_arcsec: float) -> None:
+    """Reversals at rest, by one motor count and by more, and in motion."""
+    settings = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=maximum_arcsec)
+    with stepped_daemon(setup=lambda _, made: replace(made, load_loop=settings)) as daemon:
+        daemon.verify()
+        daemon.enable()
+        daemon.use(daemon.setting(scheme=scheme, load_loop=True))
+        for target in (2.0, 6.0, 3.0, 3.001, 2.999, 3.0, 2.9):
+            id_ = daemon.move(target)
+            daemon.until(lambda id_=id_: daemon.ended(id_))
+            daemon.run(3.0)
+        for speed in (4.0, -4.0, 4.0, -1.0, 0.05, -0.05):
+            daemon.done(K.JOG, a=speed, b=5.0)
+            daemon.run(0.7)
+        daemon.done(K.STOP)
+        daemon.run(6.0)
+        assert daemon.told(E.LOAD_LOOP) == []
+        axis = record(daemon)
+        assert not np.any(axis["flags"] & SampleFlag.LOOP_DOUBTED)
+        assert 1.0 < np.abs(axis["loop_arcsec"]).max() <= maximum_arcsec
+        left = 3600.0 * (axis["load_target_deg"] - axis["load_position_deg"])[-20:].mean()
+        assert abs(left) < 0.5 * maximum_arcsec

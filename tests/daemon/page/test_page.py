@@ -10,8 +10,11 @@ from support.browser import browser
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
-from hdbridge.client.messages import Event, EventKind
+from hdbridge.client.messages import Event, EventKind, Job
 from hdbridge.daemon.page import page_file, page_files
+
+
+NOON = "2025-01-31T12:00:00Z"
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +127,47 @@ def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
     assert eventually(lambda: asked(bridge, "reset")) == [("joint-1", "reset")]
 
 
+def test_a_job_that_moves_the_axis_is_shown_with_its_progress(bridge, page):
+    assert page.evaluate("document.querySelector('#job').hidden")
+    bridge.axes["joint-1"].job = Job(
+        id="step-3",
+        kind="step",
+        axis="joint-1",
+        state="running",
+        share=0.42,
+        text="sweep 2 of 3",
+        started=NOON,
+    )
+    page.until("!document.querySelector('#job').hidden")
+    assert page.text("#job") == "step-3 moves this axis: sweep 2 of 3, 42 %. Stop ends it."
+    bridge.axes["joint-1"].job = None
+    page.until("document.querySelector('#job').hidden")
+
+
+def test_an_axis_without_a_model_is_not_called_compensated(bridge, page):
+    bridge.axes["joint-1"].model = None
+    page.until("document.querySelector('#compensation').innerText === 'off (no model)'")
+
+
+def test_labels_of_an_axis_at_rest_are_distinct(page):
+    """Half a million arcsec or a tenth of one: the labels of a chart are different numbers."""
+    page.until("document.querySelector('#load').innerText === '0.0003'")
+    labels = page.evaluate("""import('/page/plots.js').then(({ labels }) =>
+        [0.0002, 0.0005, 0.001, 0.02, 0.25, 1, 50].map((step) =>
+            labels(null, [0, 1, 2, 3].map((n) => 12 + n * step), 1, 50, step)))""")
+    assert [len(set(each)) for each in labels] == [4] * 7
+    assert labels[0] == ["12.0000", "12.0002", "12.0004", "12.0006"]
+
+
+@pytest.mark.parametrize("width", [360, 1000, 1280])
+def test_no_figure_is_cut_off(place, bridge, chromium, width):
+    show(chromium, place, width=width, height=740)
+    cut = chromium.evaluate("""[...document.querySelectorAll('.figures div, .figures dd')]
+        .filter((each) => each.scrollWidth > each.clientWidth).map((each) => each.innerText)""")
+    assert cut == []
+    assert chromium.evaluate("document.documentElement.scrollWidth") <= width
+
+
 def test_another_clients_control_is_shown(bridge, page):
     bridge.lease.take("cell controller")
     page.until("document.querySelector('#holder').innerText === 'cell controller has control'")
@@ -148,7 +192,7 @@ def test_events_that_were_and_that_come_are_listed(place, bridge, chromium):
 
 
 def event(number, text):
-    return Event(sequence=number, kind=EventKind.NOTE, date="2025-01-31T12:00:00Z", text=text)
+    return Event(sequence=number, kind=EventKind.NOTE, date=NOON, text=text)
 
 
 def test_what_chromium_drops_while_a_page_goes_away_is_asked_again(place, chromium):

@@ -354,3 +354,31 @@ def test_during_a_job_the_model_of_the_job_is_reported(pair: Service) -> None:
     play(story())
     both = ("synchronous", "hysteresis")
     assert seen == {("hysteresis", both, True, ("hysteresis",)), ("both", both, False, both)}
+
+
+def test_a_load_loop_that_does_not_act_says_why_in_state_and_events(tmp_path: Path) -> None:
+    loop = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
+    with stepped_service(tmp_path, setup=lambda _, made: replace(made, load_loop=loop)) as made:
+        made.machine = replace(made.machine, axes=(replace(made.machine.axes[0], load_loop=loop),))
+
+        async def story() -> None:
+            async with made.enabled() as (bridge, token):
+                axis, encoder = bridge.axes["axis1"], made.daemon.nodes[0].faults
+                await bridge.core.timing.sleep(3.0)
+                assert axis.state().load_loop.doubt is None
+                for _ in range(2):
+                    encoder.load_jump_counts = 150
+                    await until(bridge, lambda: axis.state().load_loop.doubt is not None)
+                    assert "the load encoder moved by" in axis.state().load_loop.doubt
+                    encoder.load_jump_counts = 0
+                    await until(bridge, lambda: axis.state().load_loop.doubt is None)
+                events = [each for each in bridge.events().events if each.kind == "load-loop"]
+                assert ["acts again" in each.text for each in events] == [False, True, False, True]
+                assert {each.axis for each in events} == {"axis1"}
+                encoder.load_jump_counts = 150
+                await until(bridge, lambda: axis.state().load_loop.doubt is not None)
+                for on in (False, True):
+                    await axis.switch_load_loop(token, on=on)
+                await until(bridge, lambda: axis.state().load_loop.doubt is None, timeout_s=1.0)
+
+        play(story())

@@ -21,9 +21,9 @@ let chosen = null;
 let feed = null;
 
 const charts = {
-  position: timeChart("chart-position", "deg", [["load", "--one"], ["target", "--two", [5, 4]]], 4),
-  error: timeChart("chart-error", "arcsec", [["load encoder less target", "--one"]], 1),
-  transmission: timeChart("chart-transmission", "arcsec", [["measured", "--one"], ["predicted", "--two", [5, 4]]], 1),
+  position: timeChart("chart-position", "deg", [["load", "--one"], ["target", "--two", [5, 4]]], 4, 0.002),
+  error: timeChart("chart-error", "arcsec", [["load encoder less target", "--one"]], 1, 4),
+  transmission: timeChart("chart-transmission", "arcsec", [["measured", "--one"], ["predicted", "--two", [5, 4]]], 1, 4),
   cycle: barChart("chart-cycle", "\u00b5s", "share of cycles, %", [["late by up to", "--one"]], (n) => (n < CLASSES_US.length - 1 ? String(CLASSES_US[n]) : "more")),
   orders: barChart("chart-orders", "per motor turn", "amplitude, arcsec", [["measured", "--one"], ["what the model leaves", "--two"]], String),
 };

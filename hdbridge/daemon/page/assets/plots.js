@@ -5,9 +5,24 @@ import { LOAD_BINS, MOTOR_BINS } from "./harmonics.js";
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const number = (value, digits) => (value === null || !Number.isFinite(value) ? "-" : value.toFixed(digits));
 
+/** Labels of an axis with the decimals that distinguish its ticks. */
+export function labels(plot, splits, axis, space, increment) {
+  const digits = Math.min(6, Math.max(0, Math.ceil(-Math.log10(increment) - 1e-9)));
+  return splits.map((value) => (value === null ? "" : (value || 0).toFixed(digits).replace("-", "\u2212")));
+}
+
+/** The range of what is drawn with a margin; at least `least` wide, or noise at rest would fill the chart. */
+function spread(low, high, least) {
+  if (low === null || high === null) return [-least / 2, least / 2];
+  const half = Math.max(0.55 * (high - low), least / 2);
+  const middle = (low + high) / 2;
+  return [middle - half, middle + half];
+}
+
 function axes(xLabel, yLabel) {
   const each = (label, size) => ({
     label,
+    values: labels,
     labelSize: 18,
     labelFont: "12px system-ui",
     font: "11px system-ui",
@@ -16,7 +31,7 @@ function axes(xLabel, yLabel) {
     grid: { stroke: colour("--line"), width: 1 },
     ticks: { stroke: colour("--line"), width: 1 },
   });
-  return [each(xLabel, 30), each(yLabel, 56)];
+  return [each(xLabel, 30), each(yLabel, 64)];
 }
 
 class Chart {
@@ -65,10 +80,10 @@ const line = (label, name, digits, dash) => ({
   points: { show: false },
 });
 
-/** Lines over the last seconds; 0 is now. */
-export function timeChart(id, unit, lines, digits) {
+/** Lines over the last seconds; 0 is now. The vertical axis spans at least `least` of its unit. */
+export function timeChart(id, unit, lines, digits, least) {
   return new Chart(id, () => ({
-    scales: { x: { time: false } },
+    scales: { x: { time: false }, y: { range: (_, low, high) => spread(low, high, least) } },
     axes: axes("s", unit),
     series: [{ label: "s", value: (_, value) => number(value, 1) }, ...lines.map(([label, name, dash]) => line(label, name, digits, dash))],
   }));

@@ -92,6 +92,14 @@ export function machine(state) {
 export function axis(state) {
   at("state").textContent = state.state;
   at("mode").textContent = state.state === "enabled" ? state.mode : state.power;
+  const lag = state.motor_target_deg === null || state.motor_position_deg === null ? null : state.motor_target_deg - state.motor_position_deg;
+  at("following").textContent = number(lag, 3);
+  at("torque").textContent = number(state.motor_torque_nm, 3);
+  at("compensation").textContent = compensation(state);
+  at("job").hidden = !(state.job || state.state === "lent");
+  at("job").textContent = state.job
+    ? `${state.job.id} moves this axis: ${state.job.text || state.job.kind}, ${Math.round(100 * state.job.share)} %. Stop ends it.`
+    : "The drive homes this axis; the loop sends it no targets meanwhile.";
   at("fault").hidden = !state.fault;
   if (state.fault) {
     at("fault-text").textContent = state.fault.text;
@@ -116,12 +124,24 @@ export function axis(state) {
       ]
     : [["model", "none: this axis is not compensated"]];
   rows.push(
-    ["compensation", state.compensating ? `${state.scheme}${state.changing ? ", changing" : ""}${state.limited ? ", at its limit" : ""}` : "off"],
+    ["compensation", compensation(state)],
     ["hysteresis state", state.memory_known ? "known" : "not known until the axis has turned far enough"],
-    ["load-side loop", state.load_loop.on ? `on, ${number(state.load_loop.correction_arcsec, 1)} arcsec` : "off"],
+    ["load-side loop", loadLoop(state.load_loop)],
     ["adaptation", adaptation(state.adaptation)],
   );
   facts(at("model"), rows);
+}
+
+function compensation(state) {
+  if (!state.model) return "off (no model)";
+  if (!state.compensating) return state.scheme === "none" ? "off" : `off (${state.scheme} is chosen)`;
+  return `${state.scheme}${state.changing ? ", changing" : ""}${state.limited ? ", at its limit" : ""}`;
+}
+
+function loadLoop(loop) {
+  if (!loop.on) return "off";
+  const doubt = loop.doubt === null ? "" : `; does not act: ${loop.doubt}`;
+  return `on, ${number(loop.correction_arcsec, 1)} arcsec${doubt}`;
 }
 
 export function events(news) {

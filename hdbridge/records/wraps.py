@@ -1,0 +1,141 @@
+"""Angles that jump by a constant: a counter that wraps, or an angle of one turn.
+
+The jump is seen in one angle and not in the other: a record that was put together from several jumps in both.
+Its size is constant: a misread sample is off by anything, and the next one is back.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from hdbridge.effects import FloatArray
+from hdbridge.records.columns import Unit
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
+"""No gear's error jumps by as much."""
+CONSTANT_SHARE: Final = 0.05
+"""Maximum deviation of the jumps of one counter from each other, as a share of their size."""
+NOMINAL_SHARE: Final = 0.02
+"""Maximum deviation of a jump from the period of a counter, as a share."""
+LEAST_TIMES: Final = 3.0
+"""A jump is so many times as large as any other change of a step."""
+SAME_SHARE: Final = 0.3
+"""The other angle has jumped as well if it leaves no more than this share of the jump unexplained."""
+THERE_AND_BACK: Final = 2
+"""Maximum number of samples that a misreading lasts."""
+WINDOW: Final = 5
+"""Steps whose median is what a step is expected to be."""
+_PERIODS: Final = (DEG_PER_TURN, math.tau, 1.0, 21_600.0, 1_296_000.0, *(2.0**bits for bits in range(8, 33)))
+"""A turn in each unit, and the values of binary counters."""
+
+
+class Wraps(NamedTuple):
+    """Jumps of an angle that wraps."""
+
+    rows: NDArray[np.intp]
+    """The first sample after each jump."""
+    period_deg: float
+    """Size of the jumps, one turn if they are whole turns."""
+    jump_deg: float
+    """Size of the jumps as they are; a whole number of periods."""
+    tolerance_deg: float
+    """How far the sizes may be off."""
+
+
+def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
+    """Where an angle jumps by a constant and the other angle of the axis does not, each of shape (n,).
+
+    None if it does not. A single jump counts if it is a whole number of turns, or a power of two of counts.
+    """
+    if len(angle_deg) < 2 * WINDOW:
+        return None
+    step, other = np.diff(angle_deg), np.diff(other_deg)
+    excess = step - median_filter(step, WINDOW, mode="nearest")
+    slip = step - _slope(step, other) * other
+    alone = np.abs(slip - excess) <= SAME_SHARE * np.abs(excess)
+    size = np.where(alone, np.abs(excess), 0.0)
+    large = np.flatnonzero(size > max(0.5 * float(np.max(size)), LEAST_JUMP_DEG))
+    jumps = _lasting(large, excess)
+    if not len(jumps):
+        return None
+    sizes = np.abs(slip[jumps])
+    jump = float(np.mean(sizes))
+    turns = np.maximum(np.round(sizes / DEG_PER_TURN), 1.0)
+    if np.all(np.abs(sizes / turns - DEG_PER_TURN) < CONSTANT_SHARE * DEG_PER_TURN):
+        sizes = sizes / turns
+    period = float(np.mean(sizes))
+    calm = float(np.max(np.delete(size, large), initial=0.0))
+    if np.any(np.abs(sizes - period) > CONSTANT_SHARE * period) or LEAST_TIMES * calm > period:
+        return None
+    # An angle wraps at the same place each time, where the gear's error is the same: no mean reduces it.
+    off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
+    wraps = Wraps(jumps + 1, period, jump, min(off, NOMINAL_SHARE * period))
+    return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
+
+
+def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
+    """The period in the unit of the angle's column: the roundest that jumps and counts leave open."""
+    scale = abs(unit.factor)
+    count = count_of(angle_deg / unit.factor)
+    binary = 2.0 ** round(math.log2(wraps.jump_deg / scale))
+    if unit.name == "counts" and abs(binary * scale - wraps.jump_deg) <= wraps.tolerance_deg:
+        return float(binary)
+    if nominal := _nominal(wraps, scale, count):
+        return nominal
+    period, off = wraps.period_deg / scale, wraps.tolerance_deg / scale
+    if count and off < 0.5 * count:
+        return round(period / count) * count
+    for digits in range(1, 13):
+        rounded = float(f"{period:.{digits}g}")
+        if abs(rounded - period) <= off:
+            return rounded
+    return period
+
+
+def unwrapped(angle_deg: FloatArray, period_deg: float) -> FloatArray:
+    """The continuous angle, shape (n,); right while no step exceeds half the period."""
+    return np.asarray(np.unwrap(angle_deg, period=period_deg))
+
+
+def _nominal(wraps: Wraps, scale: float, count: float) -> float:
+    """The period if it is a turn of some unit or what a binary counter holds; else 0."""
+    period, off = wraps.period_deg / scale, wraps.tolerance_deg / scale
+    near = [each for each in _PERIODS if abs(each - period) <= max(off, 1e-6 * each)]
+    if count and count != 1.0:
+        counted = 2.0 ** round(math.log2(period / count)) * count
+        near += [counted] if abs(counted - period) <= max(off, 1e-6 * counted) else []
+    return min(near, key=lambda each: abs(each - period), default=0.0)
+
+
+def _slope(step: FloatArray, other: FloatArray) -> float:
+    """How far the angle goes for a step of the other one, by the median of the larger steps."""
+    size = np.abs(other)
+    large = size > 0.5 * float(np.quantile(size, 0.9))
+    return float(np.median(step[large] / other[large])) if np.any(large) else 0.0
+
+
+def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
+    """The jumps that are not taken back at once."""
+    kept = np.ones(len(jumps), dtype=np.bool_)
+    for place in range(len(jumps) - 1):
+        out, back = jumps[place], jumps[place + 1]
+        returned = abs(excess[out] + excess[back]) < CONSTANT_SHARE * abs(excess[out])
+        if kept[place] and back - out <= THERE_AND_BACK and returned:
+            kept[place : place + 2] = False
+    return jumps[kept]
+
+
+def count_of(values: FloatArray) -> float:
+    """The largest decimal number that divides all steps; 0 if that is only the last digit."""
+    for decimals in range(10):
+        whole = np.round(values * 10.0**decimals)
+        if np.all(np.abs(values * 10.0**decimals - whole) < 1e-4) and np.max(np.abs(whole)) < 2.0**53:
+            count = int(np.gcd.reduce(np.diff(whole).astype(np.int64)))
+            return 0.0 if decimals and count == 1 else count / 10.0**decimals
+    return 0.0
