@@ -30,14 +30,14 @@ UNWRITABLE = {
     "folder": ("", "circle", LONG, "junk", "axis", "junk/new", "pipe"),
 }
 RIGHT = {
-    "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "recording",
+    "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "record.csv",
     "OBJECT": "6064h", "VALUE": "1", "ANGLE": "1", "AXIS": "joint-1", "SPEED": "1", "JOB": "step-1",
     "TEXT": "words", "VERSION": "1", "FILE.mcap": "flight.mcap", "FILE.mcap|FOLDER": "flight.mcap",
     "SCHEME": "both", "KIND": "step", "BEFORE": "active", "AFTER": "active", "MODE": "on",
     "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out",
 }  # fmt: skip
 """What a command is given in addition to the wrong value; nothing is ever done with it."""
-NEEDED = {("diagnose", "--model"), ("record", "export", "--out")}
+NEEDED = {("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out")}
 """Options that a command cannot do without, except in another use of it."""
 PARENTS_MADE = {("new", "NAME"), ("record", "export", "--out")}
 """A folder that is not there is right, with its parents."""
