@@ -73,12 +73,15 @@ def command(
     delays are fitted until it does as the axis did. `--simulate` uses the twin after
     `hdbridge model commit PROFILE --twin`.
     """
+    from hdbridge.axis import AxisConfig
+
     files = Profile.find(profile)
     if check and (compare or afresh or truth is not None):
         raise InputError(
             "--check holds the recordings against the profile's twin: leave out the other options"
         )
-    axis, recording = _loaded(files, load_recordings(recordings, columns, units, unwrap))
+    axis = AxisConfig.load(files.axis)
+    recording = _joined(axis, load_recordings(recordings, columns, units, unwrap))
     if check:
         _check(files, axis, recording, json_file, html_file)
         return
@@ -231,13 +234,11 @@ def _check(
     console.print(found.sentence, markup=False, soft_wrap=True)
 
 
-def _loaded(files: Profile, recordings: dict[Path, Recording]) -> tuple[AxisConfig, Recording]:
-    """The axis and all recordings as one; InputError where they are not of one axis, or have no command."""
-    from hdbridge.axis import AxisConfig
+def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
+    """All recordings as one; InputError if one is not of this axis, or has no command."""
     from hdbridge.observations.foreign import check_records
     from hdbridge.records.recording import Recording
 
-    axis = AxisConfig.load(files.axis)
     for path, each in recordings.items():
         if each.axis is not None and each.axis != axis.name:
             raise InputError(
@@ -251,7 +252,7 @@ def _loaded(files: Profile, recordings: dict[Path, Recording]) -> tuple[AxisConf
                 f"the simulated drive is given as the real one was{name}"
             )
     check_records({path: each.record for path, each in recordings.items()}, axis.gear.ratio)
-    return axis, Recording.joined(list(recordings.values()))
+    return Recording.joined(list(recordings.values()))
 
 
 def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: bool) -> Translation:
