@@ -146,11 +146,11 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """Where the models of an axis lie; InputError unless there is an axis file, of whatever content."""
+    """The folder with the models of an axis; InputError unless it has an axis file, valid or not."""
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):
-        raise InputError(f"{axis}: is no axis file; expected 'schema: hdbridge.axis/1' in it")
+        raise InputError(f"{axis}: not an axis file; expected 'schema: hdbridge.axis/1' in it")
     return axis.parent
 
 

@@ -54,7 +54,7 @@ def new(
 
     With `--from scan --interface socketcan --channel can0` the axis file has the drive's identity, encoders
     and gear, as far as it tells them; what is left to fill in is marked, and `hdbridge check` stops there.
-    Nothing is moved. A folder that is there already is refused.
+    Nothing is moved. An existing folder with files in it is refused.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.bringup.newprofile import copy_bundled

@@ -67,7 +67,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _check_truths(given: Path | list[Path] | None) -> None:
-    """Read what the simulated axes are like: a wrong file is refused before folders are made for results."""
+    """Reads the truth files: a wrong one is refused before folders are made for results."""
     if given:
         from hdbridge.sim.truth import Truth
 
@@ -77,7 +77,7 @@ def _check_truths(given: Path | list[Path] | None) -> None:
 
 @contextmanager
 def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
-    """A complaint of the library about a parameter names the option that a person has typed."""
+    """Replaces the parameter in an error of the library by the option that a person has typed."""
     try:
         yield
     except InputError as problem:

@@ -18,7 +18,7 @@ from hdbridge.errors import InputError
 UsageError: Any = typer.BadParameter.__mro__[1]
 """What is wrong with a command line. typer has it from click or brings its own; it exports only an heir."""
 _PLACES = ("PROFILE", "MACHINE")
-"""What stands for a path or the name of something that comes with hdbridge."""
+"""Metavars of parameters that take a path or the name of a bundled profile."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
@@ -33,9 +33,9 @@ def refusal(error: Any) -> str:
 
 
 def strict(command: Any) -> Any:
-    """The command, with values refused that typer takes: empty texts, numbers that are none, no paths.
+    """Makes a command refuse values that typer accepts: empty texts, NaN and infinity, impossible paths.
 
-    Before the command runs, and before it is asked what its outputs are. InputError in one line.
+    Checked before the command runs and before its outputs are; InputError in one line.
     """
     for each in getattr(command, "commands", {}).values():
         strict(each)
@@ -45,7 +45,7 @@ def strict(command: Any) -> Any:
 
 
 def _checked(param: Any, convert: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
-    """What ``convert`` makes of the value of an option or argument."""
+    """Converts and checks the value of an option or argument."""
     given = list(value) if isinstance(value, list | tuple) else [value]
     if "" in given and param.default != "":
         raise _wrong(param, context, "", "a text that is not empty")

@@ -248,7 +248,7 @@ def check_interface(interface: str, where: str) -> None:
 
 
 def absent_interface(settings: BusSettings) -> str | None:
-    """In words, that this computer has no network interface of a SocketCAN channel's name; None if it has."""
+    """Message if this computer has no network interface for a SocketCAN channel; None if it has."""
     channel = str(settings.channel)
     if settings.interface != "socketcan" or (_NETWORK / channel).exists():
         return None

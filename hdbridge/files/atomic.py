@@ -152,13 +152,13 @@ def make_folder(path: Path | str) -> Path:
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """A folder with these files, whole or not at all; their paths.
+    """Writes a new folder with these files, all or none of them; returns their paths.
 
-    InputError if there is something already, or no folder can be made there; OutputError if the files cannot
-    be written, as on a full disk. Then nothing is left, and parents that were made for it are removed.
+    InputError if the folder is not empty or cannot be made; OutputError if the files cannot be written, as on
+    a full disk. After an error nothing is left, not even parents that were made for the folder.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: is there already; expected a new folder, nothing was written")
+        raise InputError(f"{folder}: already exists; expected a new folder, nothing was written")
     made = [each for each in folder.absolute().parents if not each.exists()]
     aside = folder.with_name(f".{folder.name}.{os.getpid()}")
     try:

@@ -1,4 +1,4 @@
-"""Files that are read: regular ones, so that no command waits for a writer that never comes."""
+"""Opens regular files only: a command that opened a named pipe would wait for its writer."""
 
 from __future__ import annotations
 

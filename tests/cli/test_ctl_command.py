@@ -213,7 +213,7 @@ def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monk
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 @pytest.mark.parametrize("line", ["status", "watch --count 1", "jobs"])
-def test_tables_are_whole_at_any_width(ctl, machine, monkeypatch, line, width):
+def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line, width):
     shown = (
         machine.axes["joint-2"]
         .state()
@@ -233,7 +233,11 @@ def test_tables_are_whole_at_any_width(ctl, machine, monkeypatch, line, width):
     ctl("job", "joint-1", "step", "--no-wait")
     for name, value in (("COLUMNS", str(width)), ("FORCE_COLOR", "1"), ("TERM", "xterm")):
         monkeypatch.setenv(name, value)
-    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", ctl(*line.split())).replace("\r", "\n").splitlines()
+    lines = (
+        re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", process("ctl", *line.split()).stdout)
+        .replace("\r", "\n")
+        .splitlines()
+    )
     rows = [each for each in lines if each[:1] in tuple("┏┃┡│└")]
     assert rows
     assert max(map(len, rows)) <= width

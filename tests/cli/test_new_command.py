@@ -32,7 +32,7 @@ def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(hdbridge, tmp_path,
     assert hdbridge("check", "cells/my-axis").returncode == 0
     again = hdbridge("new", "cells/my-axis")
     assert again.returncode == 2
-    assert "is there already" in again.stderr
+    assert "already exists" in again.stderr
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ class FakeAxis:
         self.at = messages.ControlState.DISABLED
         self.target_deg = 0.0
         self.scheme = messages.Scheme.NONE
-        self.job: messages.Job | None = None
+        self.running: messages.Job | None = None
         self.model: messages.ModelInUse | None = None
         self.load_loop = messages.LoadLoopState(configured=True)
         self.queued: list[WayPoint] = []
@@ -58,7 +58,7 @@ class FakeAxis:
             load_position_deg=self.target_deg + 1 / 3600, error_arcsec=1.0, scheme=self.scheme,
             compensating=self.scheme is not messages.Scheme.NONE, memory_known=True, limits=LIMITS,
             fault=fault, model=self.model, load_loop=self.load_loop,
-            adaptation=messages.AdaptationState(), queued=len(self.queued), job=self.job,
+            adaptation=messages.AdaptationState(), queued=len(self.queued), job=self.running,
         )  # fmt: skip
 
     def _moved(self, holder: str, what: str, *given: Any) -> None:

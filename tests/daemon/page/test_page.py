@@ -128,7 +128,7 @@ def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
 
 def test_a_job_that_moves_the_axis_is_shown_with_its_progress(bridge, page):
     assert page.evaluate("document.querySelector('#job').hidden")
-    bridge.axes["joint-1"].job = Job(
+    bridge.axes["joint-1"].running = Job(
         id="step-3",
         kind="step",
         axis="joint-1",
@@ -139,7 +139,7 @@ def test_a_job_that_moves_the_axis_is_shown_with_its_progress(bridge, page):
     )
     page.until("!document.querySelector('#job').hidden")
     assert page.text("#job") == "step-3 moves this axis: sweep 2 of 3, 42 %. Stop ends it."
-    bridge.axes["joint-1"].job = None
+    bridge.axes["joint-1"].running = None
     page.until("document.querySelector('#job').hidden")
 
 

@@ -56,7 +56,7 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         stop = run_to_its_end(tmp_path, "stop", command="ctl")
         os.kill(service, signal.SIGCONT)
         assert stop.returncode == 7
-        assert f"the daemon is process {daemon.process.pid}, '" in stop.stderr
+        assert f"the daemon is process {daemon.process.pid} of " in stop.stderr
         assert f"'kill {daemon.process.pid}' stops its axes in order" in stop.stderr
 
         before = daemon.cycle()
