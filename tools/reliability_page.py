@@ -51,11 +51,11 @@ enters *operation enabled* without a request. The places:
   the one that stopped, and every command but a reset was refused. The reset by the service led to disabled,
   with the axis where it stood; enabled by command it moved again.
 
-Each row is tried on four drives that all keep to CiA 402 ([truth file](truth-file.md#firmware)):
+Each row is tried on {drives} drives that all keep to CiA 402 ([truth file](truth-file.md#firmware)):
 
 {characters}
 
-A cell has the cycles from the fault to the reaction on these four, in this order; a dash if the place or the
+A cell has the cycles from the fault to the reaction on these {drives}, in this order; a dash if the place or the
 drive cannot show the fault. `make test` tries them all on the virtual bus. `make test-slow` tries each row on
 all {combinations} combinations of these choices.
 
@@ -121,7 +121,9 @@ def page(seen: list[Seen]) -> str:
         cells = " | ".join(cell(row, place) for place in (VIRTUAL, VCAN, DAEMON))
         lines.append(f"| {row.name} | {_expected(row)} | {_within(row)} | {cells} |")
     characters = "\n".join(f"* *{each}*: {_behaviour(each)};" for each in CHARACTERS)
-    head = HEAD.format(characters=f"{characters[:-1]}.", combinations=len(every_character()))
+    head = HEAD.format(
+        drives=len(CHARACTERS), characters=f"{characters[:-1]}.", combinations=len(every_character())
+    )
     text = head + "\n".join(lines) + "\n"
     text += FURTHER_HEAD + "".join(_further(each, seen_of(each.name, DAEMON)) for each in FURTHER)
     return (

@@ -5,12 +5,16 @@ from pathlib import Path
 
 import pytest
 
+from hdbridge.client.messages import ControlState
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "daemon-api.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.mark.parametrize("number", range(len(EXAMPLES)))
 def test_an_example_runs(number, api, monkeypatch, capsys):
+    api.bridge.__init__("arm", "base")
+    api.bridge.axes["arm"].at = ControlState.ENABLED
     monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
     exec(compile(EXAMPLES[number], f"{PAGE.name}, example {number + 1}", "exec"), {"__name__": "__main__"})
     assert not api.bridge.state().lease.held
