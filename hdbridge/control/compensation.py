@@ -299,7 +299,9 @@ class Compensation:
         self._weight = 0.0
         self._target = 0.0
         self._correction = self._static = 0.0
-        self._prefilter = None if model.response is None else Prefilter(_lead(model.response, period_s))
+        self._prefilter = (
+            None if model.response is None else Prefilter(_lead(model.response, period_s), period_s)
+        )
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs

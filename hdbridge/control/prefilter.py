@@ -21,9 +21,9 @@ from hdbridge.model.response import LeadFilter
 class Prefilter:
     """Filters a correction; one call per cycle."""
 
-    __slots__ = ("_last", "_predicted", "_reaches", "_step", "_weights")
+    __slots__ = ("_full_step", "_last", "_predicted", "_reaches", "_step", "_weights")
 
-    def __init__(self, lead: LeadFilter) -> None:
+    def __init__(self, lead: LeadFilter, period_s: float) -> None:
         self._weights = lead.weights
         self._predicted = deque(repeat(0.0, len(lead.weights)), len(lead.weights))
         """Predicted corrections, arcsec, the furthest ahead first."""
@@ -31,6 +31,7 @@ class Prefilter:
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
         """Factors of the last step and of its change that give each new prediction's distance."""
+        self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0
 
@@ -67,4 +68,4 @@ class Prefilter:
                 )
                 predicted.appendleft(predict(ahead_deg, then))
         added: float = sum(map(mul, self._weights, map(sub, predicted, repeat(correction_arcsec))))
-        return correction_arcsec + added
+        return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * added

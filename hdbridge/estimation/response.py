@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.errors import InputError
-from hdbridge.model.response import LeadFilter, Response, ResponsePoint
+from hdbridge.model.response import LeadFilter, Response
 from hdbridge.procedures.even_speed import EvenRun
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -50,8 +50,36 @@ FADE = 0.12
 UNKNOWN = 0.5
 """Response that is expected where none is known, per transmission error."""
 REGULARISATION = 1e-3
+FADE_SHARE = 0.3
 SUM_WEIGHT = 1e3
 """Weight of the condition that nothing changes at rest."""
+
+
+class Limits(NamedTuple):
+    """Limits of the axis on a correction, and the largest order that is corrected."""
+
+    amplitude_arcsec: float
+    maximum_arcsec: float
+    slew_arcsec_s: float
+    acceleration_deg_s2: float
+
+    @property
+    def largest_gain(self) -> float:
+        """Gain at which the largest order takes half of the permitted size."""
+        return 0.5 * self.maximum_arcsec / self.amplitude_arcsec
+
+    @property
+    def largest_gain_hz(self) -> float:
+        """Gain times frequency at which the largest order takes half of the permitted slew."""
+        return 0.5 * self.slew_arcsec_s / (math.tau * self.amplitude_arcsec)
+
+    def full_speed_deg_s(self, gain: float) -> float:
+        """Speed from which a filter of this gain works in full.
+
+        While it fades out in the slowest part of a stop, it takes `FADE_SHARE` of the load's speed at most.
+        """
+        reach_deg = gain * self.amplitude_arcsec / ARCSEC_PER_DEG
+        return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_deg / FADE_SHARE)
 
 
 class Harmonics(NamedTuple):
@@ -126,18 +154,18 @@ def response_of(
     orders: Sequence[int],
     ratio: float,
     cycle_s: float,
+    limits: Limits,
     *,
-    largest_gain: float | None = None,
-    slew_gain_hz: float | None = None,
+    highest_hz: float = math.inf,
 ) -> Response | None:
     """Response and filter from runs without and with correction; None if no frequency is known.
 
-    ``largest_gain`` and ``slew_gain_hz`` (gain times frequency) are what the axis's limits on size and slew
-    allow.
+    Nothing beyond ``highest_hz`` is corrected in full.
     """
     lag_s = following_lag_s(none)
     points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
-    kept = _known(points, cycle_s, largest_gain or math.inf, slew_gain_hz or math.inf)
+    highest_hz = min(highest_hz, HIGHEST / cycle_s)
+    kept = _known(points, highest_hz, MAX_GAP / cycle_s, limits)
     if not kept:
         return None
     known_hz = kept[-1].frequency_hz
@@ -146,16 +174,11 @@ def response_of(
         cycle_ms=1000.0 * cycle_s,
         following_lag_ms=round(1000.0 * lag_s, 3),
         known_to_hz=round(known_hz, 2),
-        points=tuple(
-            ResponsePoint(
-                frequency_hz=round(each.frequency_hz, 3),
-                gain=float(f"{1.0 / abs(each.wanted):.5g}"),
-                phase_deg=round(-math.degrees(np.angle(each.wanted)), 2),
-                uncertainty=float(f"{2.0 * each.deviation:.3g}"),
-            )
-            for each in points
-        ),
-        filter=_filter(kept, lag_s, cycle_s, fastest),
+        frequency_hz=tuple(round(each.frequency_hz, 3) for each in points),
+        gain=tuple(float(f"{1.0 / abs(each.wanted):.5g}") for each in points),
+        phase_deg=tuple(round(-math.degrees(np.angle(each.wanted)), 2) for each in points),
+        uncertainty=tuple(float(f"{2.0 * each.deviation:.3g}") for each in points),
+        filter=_filter(kept, lag_s, cycle_s, fastest, limits),
     )
 
 
@@ -208,19 +231,17 @@ def _mean(group: Sequence[_Found]) -> _Found:
     return _Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)) / abs(mean))
 
 
-def _known(
-    points: Sequence[_Found], cycle_s: float, largest_gain: float, slew_gain_hz: float
-) -> list[_Found]:
+def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
     """The points from zero up to the first gap, doubt or limit."""
     kept: list[_Found] = []
     before_hz = 0.0
     for each in points:
         hertz, size = each.frequency_hz, abs(each.wanted)
-        if hertz > HIGHEST / cycle_s or hertz - before_hz > MAX_GAP / cycle_s:
+        if hertz > highest_hz or hertz - before_hz > max_gap_hz:
             break
         if 2.0 * each.deviation > MAX_UNCERTAINTY:
             continue
-        if size > largest_gain or size * hertz > slew_gain_hz:
+        if size > limits.largest_gain or size * hertz > limits.largest_gain_hz:
             break
         kept.append(each)
         before_hz = hertz
@@ -235,7 +256,9 @@ def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexA
     return total
 
 
-def _filter(kept: Sequence[_Found], lag_s: float, cycle_s: float, fastest_hz: float) -> LeadFilter:
+def _filter(
+    kept: Sequence[_Found], lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
+) -> LeadFilter:
     """Least squares on the relative error: what the wanted filter makes 1 up to the last point, 0 beyond."""
     known = np.array([0.0, *(each.frequency_hz for each in kept)])
     size = np.log([1.0, *(abs(each.wanted) for each in kept)])
@@ -274,5 +297,6 @@ def _filter(kept: Sequence[_Found], lag_s: float, cycle_s: float, fastest_hz: fl
     return LeadFilter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
+        full_speed_deg_s=limits.full_speed_deg_s(float(np.exp(size).max())),
         weights=tuple(float(f"{each:.9g}") for each in weights),
     )

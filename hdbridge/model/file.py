@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.axis import Identity, Teeth
 from hdbridge.effects import CATALOGUE, Effect, conflicts
 from hdbridge.files.expectation import nearest
-from hdbridge.files.yamlfile import Document, Hex, dump_yaml
+from hdbridge.files.yamlfile import Document, Hex, Line, dump_yaml
 from hdbridge.model.response import Response
 from hdbridge.strictness import Strict
 
@@ -111,6 +111,8 @@ def text_of(document: Mapping[str, Any]) -> str:
     data = dict(document)
     if "provenance" in data:
         data["provenance"] = _hexadecimal(data["provenance"])
+    if "response" in data:
+        data["response"] = _in_lines(data["response"])
     return _HEADER + dump_yaml(data)
 
 
@@ -160,3 +162,15 @@ def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
             name: Hex(value) if isinstance(value, int) else value for name, value in data["drive"].items()
         }
     return data
+
+
+def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with each list in one line."""
+    return {
+        name: Line(value)
+        if isinstance(value, list)
+        else _in_lines(value)
+        if isinstance(value, Mapping)
+        else value
+        for name, value in data.items()
+    }

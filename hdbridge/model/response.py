@@ -1,7 +1,7 @@
 """Response of an axis to its correction in motion, and the filter that makes up for it.
 
 At rest the load answers a correction fully. In motion servo, command filter and interpolation change its
-amplitude and phase. `Response` has the measured points and the filter weights that were computed from them;
+amplitude and phase. `Response` has the measured points and the filter weights computed from them;
 `hdbridge.estimation.response` computes both.
 """
 
@@ -14,24 +14,19 @@ from pydantic import Field, model_validator
 from hdbridge.strictness import Strict
 
 
-class ResponsePoint(Strict):
-    """Response at one frequency."""
-
-    frequency_hz: float = Field(gt=0, description="frequency of the correction")
-    gain: float = Field(gt=0, description="amplitude that the load makes of a correction of 1")
-    phase_deg: float = Field(description="phase of the load against the correction, following lag excluded")
-    uncertainty: float = Field(ge=0, description="half width of the 95 % interval, as a share of the gain")
-
-
 class LeadFilter(Strict):
     """Weights of the correction along the path, from the near future to the past.
 
-    Weight j applies to the correction that belongs to the load target ``lead_cycles - j / per_cycle`` cycles
-    ahead. The weights sum to 1, so that nothing changes at rest.
+    Near standstill the filter fades out: what is left of the move in it would let the motor turn back. Weight
+    j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The weights
+    sum to 1, so that nothing changes at rest.
     """
 
     lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")
     per_cycle: int = Field(ge=1, le=8, description="weights per cycle")
+    full_speed_deg_s: float = Field(
+        gt=0, description="load speed from which the filter works in full; it fades out with its square"
+    )
     weights: tuple[float, ...] = Field(min_length=1, max_length=1000, description="the weights, sum 1")
 
     @model_validator(mode="after")
@@ -52,8 +47,22 @@ class Response(Strict):
     cycle_ms: float = Field(gt=0, description="SYNC period of the measurement")
     following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")
     known_to_hz: float = Field(gt=0, description="frequency up to which the correction is applied in full")
-    points: tuple[ResponsePoint, ...] = Field(description="measured points, by rising frequency")
+    frequency_hz: tuple[float, ...] = Field(description="measured frequencies, rising")
+    gain: tuple[float, ...] = Field(description="amplitude that the load makes of a correction of 1, at each")
+    phase_deg: tuple[float, ...] = Field(
+        description="phase of the load against the correction at each, following lag excluded"
+    )
+    uncertainty: tuple[float, ...] = Field(
+        description="half width of the 95 % interval at each, as a share of the gain"
+    )
     filter: LeadFilter = Field(description="filter of the correction, computed from the points")
+
+    @model_validator(mode="after")
+    def _check(self) -> Response:
+        columns = (self.frequency_hz, self.gain, self.phase_deg, self.uncertainty)
+        if not self.frequency_hz or len({len(each) for each in columns}) != 1:
+            raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")
+        return self
 
     def fits_cycle(self, cycle_s: float) -> bool:
         """Returns True if the filter was made for this SYNC period."""

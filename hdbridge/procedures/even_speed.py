@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from hdbridge.errors import InputError
 from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Steps
 
-SHARES = (1.0, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
-"""Speeds of the default test, as shares of the axis's own."""
+SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
+"""Speeds of the default test, as shares of the limit. At the limit a drive cuts the correction off."""
 WINDOW_S = 1.0
 TURNS = 3.0
 """Motor turns that a run covers at least."""

@@ -14,7 +14,7 @@ from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.errors import InputError
 from hdbridge.estimation.response import gain
 from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response, ResponsePoint
+from hdbridge.model.response import LeadFilter, Response
 
 PERIOD = 0.004
 WIDE = CompensationLimits(maximum_arcsec=1000.0, slew_arcsec_s=1e6, ramp_s=0.2)
@@ -22,10 +22,17 @@ RATIO = 50.0
 
 
 def response(weights, lead=4, per_cycle=2, cycle_ms=4.0) -> Response:
-    point = ResponsePoint(frequency_hz=10.0, gain=1.0, phase_deg=0.0, uncertainty=0.1)
-    lead_filter = LeadFilter(lead_cycles=lead, per_cycle=per_cycle, weights=tuple(weights))
     return Response(
-        cycle_ms=cycle_ms, following_lag_ms=5.0, known_to_hz=80.0, points=(point,), filter=lead_filter
+        cycle_ms=cycle_ms,
+        following_lag_ms=5.0,
+        known_to_hz=80.0,
+        frequency_hz=(10.0, 20.0),
+        gain=(1.0, 1.1),
+        phase_deg=(0.0, -5.0),
+        uncertainty=(0.1, 0.1),
+        filter=LeadFilter(
+            lead_cycles=lead, per_cycle=per_cycle, full_speed_deg_s=4.0, weights=tuple(weights)
+        ),
     )
 
 
@@ -151,3 +158,14 @@ def test_the_model_file_keeps_it(tmp_path):
     assert TransmissionModel.load(tmp_path / "model.yaml") == given
     assert TransmissionModel.from_document(given.document()) == given
     assert TransmissionModel.from_text(replace(given, response=None).dump()).response is None
+
+
+@settings(deadline=None, max_examples=20)
+@given(measured=filters, far_deg=st.floats(0.3, 10.0))
+def test_no_filter_makes_the_motor_turn_back_at_the_end_of_a_move(measured, far_deg):
+    """The load would stay on the wrong side of its hysteresis."""
+    filtered = begun(model(measured))
+    targets = [*smooth_move(far_deg, math.sqrt(far_deg / 8.0)), *[far_deg] * 60]
+    motor = np.array([filtered.command(target) for target in targets])
+    late = motor[-75:]  # the slowest part, and the filter's reach
+    assert late.max() - motor[-1] < 0.01
