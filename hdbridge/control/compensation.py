@@ -448,7 +448,7 @@ class Compensation:
         self._weight, self._target, self._correction = other._weight, other._target, other._correction
         self._static = self._correction if other._prefilter is None else other._static
         if self._prefilter is not None:
-            self._prefilter.reset(self._static)
+            self._prefilter.take_over(other._prefilter, self._static)
 
     def _fade(self) -> None:
         """One cycle nearer to what is known of the channels."""

@@ -41,6 +41,13 @@ class Prefilter:
         self._last = None
         self._step = 0.0
 
+    def take_over(self, other: Prefilter | None, correction_arcsec: float) -> None:
+        """Continue where another filter is, or start with this correction if they differ in form."""
+        self.reset(correction_arcsec)
+        if other is not None and (other._reaches, len(other._weights)) == (self._reaches, len(self._weights)):
+            self._predicted = other._predicted.copy()
+            self._last, self._step = other._last, other._step
+
     def follow(
         self,
         load_deg: float,
