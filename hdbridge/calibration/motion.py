@@ -76,6 +76,14 @@ class MotionTest:
         return reached
 
     @property
+    def summary(self) -> str:
+        """Ripple at the highest speed, without and with the correction in force, in words."""
+        fastest = max(self.ripples, key=lambda each: each.speed_deg_s)
+        after = fastest.static_arcsec if fastest.filtered_arcsec is None else fastest.filtered_arcsec
+        left = "" if after is None else f" to {after:.2f}"
+        return f"ripple at {fastest.speed_deg_s:g} deg/s {fastest.none_arcsec:.2f}{left} arcsec"
+
+    @property
     def harms_at(self) -> tuple[float, ...]:
         """Speeds at which the filtered correction leaves more ripple than no correction, deg/s."""
         return tuple(
@@ -113,6 +121,24 @@ class MotionTest:
             "response": self.response.model_dump(mode="json") if self.response else None,
             "remarks": list(self.remarks),
         }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> MotionTest:
+        """Reads `as_dict`."""
+        ripples = tuple(
+            Ripple(
+                each["speed_deg_s"],
+                each["none_arcsec"],
+                each["static_arcsec"],
+                each["filtered_arcsec"],
+                tuple(each["faded_orders"]),
+            )
+            for each in data["speeds"]
+        )
+        response = data["response"]
+        return cls(
+            ripples, Response.model_validate(response) if response else None, tuple(map(str, data["remarks"]))
+        )
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:

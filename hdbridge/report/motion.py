@@ -12,9 +12,17 @@ from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
 def motion_page(axis_name: str, result: MotionTest) -> Page:
     """The page of one test."""
-    sections = [
-        Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)]),
-    ]
+    return Page(
+        title=f"Motion test of axis '{axis_name}'",
+        verdict=_verdict(result),
+        sections=motion_sections(result),
+        footer=f"hdbridge {__version__}. Ripple is the rms error of the load about a straight line.",
+    )
+
+
+def motion_sections(result: MotionTest) -> list[Section]:
+    """Ripple over speed, and the response if there is one."""
+    sections = [Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)])]
     if result.response is not None:
         sections.append(
             Section(
@@ -24,12 +32,7 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
                 [Grid(_response(result.response))],
             )
         )
-    return Page(
-        title=f"Motion test of axis '{axis_name}'",
-        verdict=_verdict(result),
-        sections=sections,
-        footer=f"hdbridge {__version__}. Ripple is the rms error of the load about a straight line.",
-    )
+    return sections
 
 
 def _verdict(result: MotionTest) -> str:
