@@ -16,7 +16,7 @@ from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
-from hdbridge.estimation.response import STOP, Harmonics, Limits, Trial, gain, harmonics, response_of
+from hdbridge.estimation.response import STOP, Harmonics, Limits, Trial, agree, gain, harmonics, response_of
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
 from hdbridge.procedures.even_speed import EvenSpeed
@@ -28,6 +28,10 @@ CHANCE = 1.05
 """Factor by which a ripple must be larger to count as larger."""
 FADED = 0.5
 """Gain of the filter, as a share of the wanted one, below which an order counts as faded out."""
+RETUNED = (
+    "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
+    "{:.1f} ms now): it was retuned, or the load changed; measure the response again"
+)
 TRIALS = 2
 """Filters that are tried; the second one also learns from the first."""
 
@@ -167,17 +171,16 @@ def motion_test(
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
-    if not measure:
-        filtered = None if model.response is None else runner.run("filtered correction", model)
-        return MotionTest(tuple(_ripples(runner, none, static, filtered, model.response)), model.response)
-    trials = [Trial(static)]
-    ripples = tuple(_ripples(runner, none, static, None, None))
     limits = Limits(
         max(runner.amplitudes.values()),
         axis.compensation.maximum_arcsec,
         axis.compensation.slew_arcsec_s,
         axis.limits.acceleration_deg_s2,
     )
+    if not measure:
+        return _tested(runner, model, none, static, limits)
+    trials = [Trial(static)]
+    ripples = tuple(_ripples(runner, none, static, None, None))
     highest, best = math.inf, MotionTest(ripples, None)
     for _ in range(TRIALS):
         response = response_of(
@@ -201,6 +204,25 @@ def motion_test(
     return replace(
         best, remarks=(f"no filter is kept: at {at} deg/s it leaves more ripple than no correction",)
     )
+
+
+def _tested(
+    runner: _Runner,
+    model: TransmissionModel,
+    none: tuple[Harmonics, ...],
+    static: tuple[Harmonics, ...],
+    limits: Limits,
+) -> MotionTest:
+    """The test of the model's own response, which says if the servo does not answer so any more."""
+    stored = model.response
+    if stored is None:
+        return MotionTest(tuple(_ripples(runner, none, static, None, None)), None)
+    filtered = runner.run("filtered correction", model)
+    found = response_of(none, [Trial(static)], runner.orders, model.ratio, runner.cycle_s, limits)
+    remarks: tuple[str, ...] = ()
+    if found is not None and not agree(stored, found):
+        remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms),)
+    return MotionTest(tuple(_ripples(runner, none, static, filtered, stored)), stored, remarks)
 
 
 class _Runner:

@@ -49,6 +49,9 @@ FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
 UNKNOWN = 0.5
 """Response that is expected where none is known, per transmission error."""
+DIFFERENT = 0.15
+"""Smallest share by which two responses, or following lags, count as different."""
+LAG_NOISE_MS = 0.5
 REGULARISATION = 1e-3
 FADE_SHARE = 0.3
 SUM_WEIGHT = 1e3
@@ -246,6 +249,26 @@ def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limit
         kept.append(each)
         before_hz = hertz
     return kept
+
+
+def agree(one: Response, other: Response) -> bool:
+    """Returns False if the following lag, or most of the common frequencies, differ beyond their noise."""
+    lag_ms = max(abs(one.following_lag_ms), abs(other.following_lag_ms))
+    if abs(one.following_lag_ms - other.following_lag_ms) > max(DIFFERENT * lag_ms, LAG_NOISE_MS):
+        return False
+    hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
+    values, noise = zip(*(_at(each, hertz) for each in (one, other)), strict=True)
+    apart = abs(values[0] / values[1] - 1.0) > np.maximum(DIFFERENT, 1.5 * (noise[0] + noise[1]))
+    return float(apart.mean()) < 0.5 if hertz.size else True
+
+
+def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Response and uncertainty at some frequencies, the following lag included; linear between the points."""
+    known = np.array(response.frequency_hz)
+    late = np.exp(-2j * math.pi * response.following_lag_ms / 1000.0 * known)
+    values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg)) * late
+    found: ComplexArray = np.interp(hertz, known, values.real) + 1j * np.interp(hertz, known, values.imag)
+    return found, np.interp(hertz, known, response.uncertainty)
 
 
 def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexArray:

@@ -50,10 +50,20 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
     again = json.loads((tmp_path / "again.json").read_text())
     for one, other in zip(result["speeds"], again["speeds"], strict=True):
         assert other["filtered_arcsec"] == pytest.approx(one["filtered_arcsec"], rel=0.1, abs=0.2)
+    assert again["remarks"] == []
+    assert "up to 8" in hdbridge("check", "fast").stdout
     # At rest the axis points as well as without the response.
     done = hdbridge("step", "fast", "--simulate", "--count", 12, "--scheme", "both", "--json", "step.json")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "step.json").read_text())["both"]["pooled"]["three_sigma_arcsec"] < 4.5
+
+    # Another servo is noticed.
+    path = fast / "truth.yaml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("command_filter_ms: 1.0", "command_filter_ms: 4.0"), encoding="utf-8")
+    done = hdbridge("motion", "fast", "--simulate", "--no-measure")
+    assert done.returncode == 0, done.stderr
+    assert "measure the response again" in done.stdout
 
 
 def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused(hdbridge, tmp_path):
