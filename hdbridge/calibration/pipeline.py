@@ -12,6 +12,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
 from hdbridge.calibration.journal import Journal, survived_in, tasks_of
 from hdbridge.calibration.measure import measure
+from hdbridge.calibration.motion import MotionTest, motion_test
 from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
@@ -54,11 +55,22 @@ def calibrate(
     tell("fitting")
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
+    if active and active.response and active.response.fits_cycle(axis.drive.cycle_s):
+        # The gear was measured anew, the servo was not.
+        result = replace(result, model=replace(result.model, response=active.response))
     if not result.fit.held_out.improves:
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
     if remark := cap_remark(axis, result.model):
         tell(remark)
+    if journal.plan.validation.motion:
+        tell("measuring the response in motion")
+        try:
+            tested = motion_test(drive, result.model, progress=progress, interrupted=interrupted)
+        except InputError as problem:
+            tell(f"not tested in motion: {problem}")
+        else:
+            result = replace(result, model=replace(result.model, response=tested.response), motion=tested)
     tell("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked = validate(
@@ -80,6 +92,8 @@ def calibrate(
         )
         return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
     figures = (f"stepping 3 sigma {before:.2f} to {after:.2f} arcsec", *checked.worse)
+    if result.motion is not None:
+        figures = (*figures, result.motion.summary)
     reason = f"calibration {journal.folder.name}: {', '.join(figures)}"
     return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
 
@@ -150,12 +164,13 @@ def concluded(folder: Path) -> Calibration:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         validation = Validation.from_dict(data["stepping"]) if data["stepping"] else None
+        motion = MotionTest.from_dict(data["motion"]) if data.get("motion") else None
         offer = Offer(bool(data["offered"]), str(data["reason"]))
     except (ValueError, KeyError, TypeError, OSError):
         raise InputError(
             f"{path}: is not what a calibration has written; restore it, or remove it and report without it"
         ) from None
-    return replace(result, validation=validation, offer=offer)
+    return replace(result, validation=validation, motion=motion, offer=offer)
 
 
 def active_model(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hdbridge.calibration.motion import MotionTest
 from hdbridge.calibration.validation import Stepped, Validation
 from hdbridge.identify import FitResult
 from hdbridge.model import TransmissionModel
@@ -43,6 +44,8 @@ class Calibration:
     shortened: tuple[str, ...] = ()
     """What the plan had to give up on this axis."""
     validation: Validation | None = None
+    motion: MotionTest | None = None
+    """The test in motion, by which the response was measured; None if the plan has none."""
     drift: tuple[tuple[float, float], ...] = ()
     """Time (s) and error (arcsec, the first is zero) at the reference pose each time."""
     offer: Offer | None = None
@@ -130,6 +133,7 @@ class Calibration:
             "warnings": list(fit.warnings),
             "drift": [{"time_s": time_s, "error_arcsec": error} for time_s, error in self.drift],
             "stepping": self.validation.as_dict() if self.validation else None,
+            "motion": self.motion.as_dict() if self.motion else None,
         }
 
 

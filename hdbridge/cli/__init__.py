@@ -69,6 +69,8 @@ PANELS: Final = {
         "home": "Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.",
         "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
         "measured.",
+        "motion": "Run the axis at several speeds; print the ripple of the load without and with "
+        "compensation.",
     },
 }
 """Every command, under the heading that `hdbridge --help` gives it, and what it says of it there.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ from hdbridge.cli.options import (
     notes,
     write_json,
 )
+from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
@@ -59,13 +61,18 @@ def command(
     One that does not improve on data that it has not seen is not offered.
     """
     from hdbridge.calibration import calibrate
+    from hdbridge.calibration.motion import motion_test_s
     from hdbridge.calibration.validation import validation_s
     from hdbridge.cli.measuring import Measurement, phases
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
     work = Measurement.asked(axis, plan, out, resume)
-    work.announce(f"{validation_s(work.plan, axis) / 60:.1f} min to test the model")
+    test_s = validation_s(work.plan, axis)
+    if work.plan.validation.motion:
+        with suppress(InputError):  # too little travel: the calibration says so, and does without
+            test_s += motion_test_s(axis)
+    work.announce(f"{test_s / 60:.1f} min to test the model")
     with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         journal = work.begun(drive, seed if simulate else None)
         with phases() as progress:

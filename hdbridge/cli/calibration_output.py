@@ -71,6 +71,10 @@ def print_calibration(result: Calibration) -> None:
         console.print(f"note: {escape(warning)}", soft_wrap=True)
     if result.validation:
         print_stepping(result.validation)
+    if result.motion:
+        from hdbridge.cli.motion import print_motion
+
+        print_motion(result.motion)
     if result.offer:
         console.print(
             escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True

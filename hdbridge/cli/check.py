@@ -117,6 +117,10 @@ class _Report:
             loaded = TransmissionModel.load(model)
             compensation_for(axis, loaded)
             self.remark = cap_remark(axis, loaded)
+            if response := loaded.response:
+                self.facts["response"] = (
+                    f"measured; orders are corrected up to {response.known_to_hz:.0f} Hz in motion"
+                )
             self.facts["model"] = ", ".join(each.name for each in loaded.effects) or "no effects"
         pdos = layouts(axis)
         self.rows: dict[str, list[str]] = {

@@ -14,6 +14,10 @@ coming from its present state and w the ramp's weight. Three choices matter:
 An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` says which are there; the part
 of the correction that needs one that is not is faded out, as `disengage` does with the whole, and in again.
 
+In motion the servo filters the correction. If the model has the measured response of the axis, the correction
+passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the path that
+the motor is meant to take.
+
 Pure: no clock, no bus.
 """
 
@@ -23,10 +27,12 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
+from hdbridge.control.prefilter import Prefilter
 from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
 from hdbridge.effects.base import MEASURED, Memoryless
 from hdbridge.errors import InputError
 from hdbridge.model import ModelTracker, TransmissionModel
+from hdbridge.model.response import LeadFilter, Response
 from hdbridge.units import ARCSEC_PER_DEG
 
 _TOLERANCE_ARCSEC = 5e-7
@@ -133,6 +139,10 @@ class Inverse:
     def memory_known(self) -> bool:
         """Whether that path has run farther in one direction than the model remembers."""
         return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
+
+    def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
+        """The model's error at a motor angle ahead, arcsec; the state does not change."""
+        return self._tracker.peek(motor_deg, moment)
 
     def begin(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
         """The motor stands here, and how it came to is not known."""
@@ -264,8 +274,8 @@ class Compensation:
     """
 
     __slots__ = (
-        "_correction", "_fading", "_inverse", "_known", "_maximum", "_ratio", "_slew_step", "_target",
-        "_weight", "_weight_step", "limited", "model", "needs",
+        "_correction", "_fading", "_inverse", "_known", "_maximum", "_prefilter", "_ratio", "_slew_step",
+        "_static", "_target", "_weight", "_weight_step", "limited", "model", "needs",
     )  # fmt: skip
 
     def __init__(
@@ -275,7 +285,10 @@ class Compensation:
         period_s: float,
         start: Start = Start.VIRGIN,
     ) -> None:
-        """``period_s`` is the control cycle; ``start`` what is known of the gear's past."""
+        """``period_s`` is the control cycle; ``start`` what is known of the gear's past.
+
+        InputError if the model's response was measured at another cycle.
+        """
         self.model = model
         """Whose inverse it is; `Bench` runs none of another axis, gear or drive."""
         self._inverse = Inverse(model, start)
@@ -285,7 +298,10 @@ class Compensation:
         self._weight_step = period_s / limits.ramp_s if limits.ramp_s > 0.0 else 1.0
         self._weight = 0.0
         self._target = 0.0
-        self._correction = 0.0
+        self._correction = self._static = 0.0
+        self._prefilter = (
+            None if model.response is None else Prefilter(_lead(model.response, period_s), period_s)
+        )
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
@@ -345,7 +361,9 @@ class Compensation:
 
     def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
         """The motor stands at ``motor_deg`` and nothing is being corrected: begin from there."""
-        self._weight = self._correction = 0.0
+        self._weight = self._correction = self._static = 0.0
+        if self._prefilter is not None:
+            self._prefilter.reset(0.0)
         for each in self._inverse.faded:
             each.weight = float(each.needs <= self._known)
         self._inverse.begin(motor_deg, moment)
@@ -354,15 +372,36 @@ class Compensation:
         """Motor target in degrees for this cycle's load target; the model's state moves on with it."""
         motor = self._solved(load_deg, moment)
         wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
-        slew, last, most = self._slew_step, self._correction, self._maximum
-        if not (last - slew <= wanted <= last + slew and -most <= wanted <= most):
-            self.limited += 1
-            wanted = min(max(wanted, last - slew), last + slew)
-            wanted = min(max(wanted, -most), most)
-            motor = self._ratio * (load_deg - wanted / ARCSEC_PER_DEG)
-        self._correction = wanted
+        prefilter, limited = self._prefilter, self.limited
+        if prefilter is None:
+            correction = self._limit(wanted, self._correction)
+            if self.limited != limited:
+                motor = self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
+            self._correction = correction
+            self._inverse.advance(motor, moment)
+            return motor
+        static = self._limit(wanted, self._static)
+        if self.limited != limited:
+            motor = self._ratio * (load_deg - static / ARCSEC_PER_DEG)
+        filtered = prefilter.follow(load_deg, static, moment, self._predicted)
+        correction = self._limit(filtered, self._correction)
+        self.limited = min(self.limited, limited + 1)
+        self._static, self._correction = static, correction
         self._inverse.advance(motor, moment)
-        return motor
+        return motor if correction == static else self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
+
+    def _limit(self, wanted: float, last: float) -> float:
+        """The correction within the slew limit and the cap; counts in `limited`."""
+        slew, most = self._slew_step, self._maximum
+        if last - slew <= wanted <= last + slew and -most <= wanted <= most:
+            return wanted
+        self.limited += 1
+        return min(max(min(max(wanted, last - slew), last + slew), -most), most)
+
+    def _predicted(self, load_deg: float, moment: Moment) -> float:
+        """Correction at a load target ahead, arcsec; the state stays."""
+        motor = self._ratio * (load_deg - self._static / ARCSEC_PER_DEG)
+        return self._weight * self._inverse.error_at(motor, moment)
 
     def _solved(self, load_deg: float, moment: Moment) -> float:
         """One cycle's ramps, and the motor angle that is wanted then."""
@@ -382,10 +421,17 @@ class Compensation:
         """
         most = self._maximum
         wanted = ARCSEC_PER_DEG * (load_deg - self._solved(load_deg, moment) / self._ratio)
+        wanted = min(max(wanted, -most), most)
+        if self._prefilter is None:
+            return wanted
+        self._static = wanted
+        wanted = self._prefilter.follow(load_deg, wanted, moment, self._predicted)
         return min(max(wanted, -most), most)
 
     def issued(self, motor_deg: float, correction_arcsec: float, moment: Moment = _NOWHERE) -> None:
         """This was sent to the motor, with this correction in it: the model's state moves on."""
+        if self._prefilter is not None:
+            motor_deg += self._ratio * (correction_arcsec - self._static) / ARCSEC_PER_DEG
         self._correction = correction_arcsec
         self._inverse.advance(motor_deg, moment)
 
@@ -400,6 +446,9 @@ class Compensation:
         for motor_deg in rest:
             self._inverse.advance(motor_deg, moment)
         self._weight, self._target, self._correction = other._weight, other._target, other._correction
+        self._static = self._correction if other._prefilter is None else other._static
+        if self._prefilter is not None:
+            self._prefilter.take_over(other._prefilter, self._static)
 
     def _fade(self) -> None:
         """One cycle nearer to what is known of the channels."""
@@ -413,5 +462,19 @@ class Compensation:
     def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
         """Motor target in degrees with the correction frozen: for a cycle whose feedback is missing."""
         motor = self._ratio * (load_deg - self._correction / ARCSEC_PER_DEG)
-        self._inverse.advance(motor, moment)
+        if self._prefilter is None:
+            self._inverse.advance(motor, moment)
+        else:
+            self._prefilter.follow(load_deg, self._static, moment, self._predicted)
+            self._inverse.advance(self._ratio * (load_deg - self._static / ARCSEC_PER_DEG), moment)
         return motor
+
+
+def _lead(response: Response, period_s: float) -> LeadFilter:
+    """The filter of a response; InputError if it was measured at another cycle."""
+    if response.fits_cycle(period_s):
+        return response.filter
+    raise InputError(
+        f"the model's response was measured with a cycle of {response.cycle_ms:g} ms, but this axis has "
+        f"{1000.0 * period_s:g} ms: calibrate the axis again, or delete 'response' from the model file"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -75,4 +76,4 @@ def extended_model(
             seen = [each for each in intervals if each.half_width > 0.0]
             uncertainty[effect.name] = nested_half_widths(effect.tidied(ratio), seen)
     provenance = {**model.provenance, "reason": reason}
-    return TransmissionModel(model.ratio, effects, uncertainty, provenance)
+    return replace(model, effects=effects, uncertainty=uncertainty, provenance=provenance, path=None)

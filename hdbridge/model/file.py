@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from hdbridge.axis import Identity, Teeth
 from hdbridge.effects import CATALOGUE, Effect, conflicts
 from hdbridge.files.expectation import nearest
-from hdbridge.files.yamlfile import Document, Hex, dump_yaml
+from hdbridge.files.yamlfile import Document, Hex, Line, dump_yaml
+from hdbridge.model.response import Response
 from hdbridge.strictness import Strict
 
 _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.md describes its keys.\n"
@@ -55,6 +56,7 @@ class ModelFile(BaseModel):
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     effects: tuple[EffectEntry, ...] = Field(description="the effects whose sum is the transmission error")
     provenance: Provenance | None = Field(None, description="where the numbers come from")
+    response: Response | None = Field(None, description="response of the axis to the correction in motion")
 
 
 class Content(NamedTuple):
@@ -64,6 +66,7 @@ class Content(NamedTuple):
     effects: tuple[Effect, ...]
     uncertainty: dict[str, dict[str, Any]]
     provenance: dict[str, Any]
+    response: Response | None = None
 
 
 def content_of(document: Document) -> Content:
@@ -78,7 +81,8 @@ def content_of(document: Document) -> Content:
             uncertainty[effect.name] = entry.uncertainty
     for conflict in conflicts(effects, file.ratio):
         raise document.error(("effects",), conflict)
-    return Content(file.ratio, tuple(effects), uncertainty, document.data.get("provenance") or {})
+    provenance = document.data.get("provenance") or {}
+    return Content(file.ratio, tuple(effects), uncertainty, provenance, file.response)
 
 
 def document_of(
@@ -86,6 +90,7 @@ def document_of(
     effects: Sequence[Effect],
     uncertainty: Mapping[str, Mapping[str, Any]],
     provenance: Mapping[str, Any],
+    response: Response | None = None,
 ) -> dict[str, Any]:
     """The content of a model file as plain data."""
     entries = [
@@ -96,6 +101,8 @@ def document_of(
     data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": ratio, "effects": entries}
     if provenance:
         data["provenance"] = dict(provenance)
+    if response is not None:
+        data["response"] = response.model_dump(mode="json")
     return data
 
 
@@ -104,6 +111,8 @@ def text_of(document: Mapping[str, Any]) -> str:
     data = dict(document)
     if "provenance" in data:
         data["provenance"] = _hexadecimal(data["provenance"])
+    if "response" in data:
+        data["response"] = _in_lines(data["response"])
     return _HEADER + dump_yaml(data)
 
 
@@ -118,6 +127,7 @@ def content_of_document(data: Mapping[str, Any]) -> Content:
         tuple(CATALOGUE[each["effect"]].model_validate(each["parameters"]) for each in entries),
         {each["effect"]: each["uncertainty"] for each in entries if "uncertainty" in each},
         data.get("provenance", {}),
+        Response.model_validate(data["response"]) if "response" in data else None,
     )
 
 
@@ -152,3 +162,15 @@ def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
             name: Hex(value) if isinstance(value, int) else value for name, value in data["drive"].items()
         }
     return data
+
+
+def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with each list in one line."""
+    return {
+        name: Line(value)
+        if isinstance(value, list)
+        else _in_lines(value)
+        if isinstance(value, Mapping)
+        else value
+        for name, value in data.items()
+    }

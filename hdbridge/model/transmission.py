@@ -16,6 +16,7 @@ from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
 from hdbridge.model.binding import binding, check_binding
 from hdbridge.model.file import content_of, content_of_document, document_of, text_of
+from hdbridge.model.response import Response
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class TransmissionModel:
     """Per effect name: parameter name -> 95 % half width, in the parameter's unit."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where the numbers come from: recording, date, versions, drive identity (`Provenance`)."""
+    response: Response | None = None
+    """Response of the axis to the correction in motion; None if it has not been measured."""
     path: Path | None = field(default=None, compare=False)
     """The file that it was read from."""
 
@@ -78,7 +81,7 @@ class TransmissionModel:
 
     def document(self) -> dict[str, Any]:
         """The content of the model file as plain data, ready for JSON."""
-        return document_of(self.ratio, self.effects, self.uncertainty, self.provenance)
+        return document_of(self.ratio, self.effects, self.uncertainty, self.provenance, self.response)
 
     def dump(self) -> str:
         """The model file's text; what it says reads back exactly."""

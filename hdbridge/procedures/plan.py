@@ -180,6 +180,10 @@ class ValidationEntry(Strict):
         description="travel of the positioning test at the load, if the limits allow it",
     )
 
+    motion: bool = Field(
+        False, description="measure the response of the axis in motion, and test the compensation with it"
+    )
+
     @model_validator(mode="after")
     def _enough(self) -> Self:
         if self.cycles == 1:

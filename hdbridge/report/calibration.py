@@ -14,6 +14,7 @@ from hdbridge.calibration import Calibration
 from hdbridge.effects import FloatArray
 from hdbridge.identify.result import Traces
 from hdbridge.model.difference import diff
+from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (
     Block,
     Chart,
@@ -52,6 +53,8 @@ def calibration_page(result: Calibration) -> Page:
     sections = []
     if result.validation is not None:
         sections += stepping_sections(result.validation)
+    if result.motion is not None:
+        sections += motion_sections(result.motion)
     sections += [
         Section("Parameters", _parameters_text(result), [*_parameters(result)]),
         Section(

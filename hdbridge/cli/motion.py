@@ -1,0 +1,146 @@
+"""``hdbridge motion``: ripple over speed, without and with compensation, and the response of the axis."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from hdbridge.cli.options import (
+    ChannelOption,
+    ForceOption,
+    HtmlOption,
+    InterfaceOption,
+    JsonOption,
+    ModelOption,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    console,
+    load_axis,
+    notes,
+    print_table,
+    write_json,
+    write_result,
+)
+from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
+
+if TYPE_CHECKING:
+    from hdbridge.calibration.motion import MotionTest
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("motion")(motion)
+
+
+def motion(
+    profile: ProfileArgument,
+    model: ModelOption = None,
+    measure: Annotated[
+        bool,
+        typer.Option(
+            "--measure/--no-measure",
+            help="Measure the response of the axis, or test the one of the model file.",
+        ),
+    ] = True,
+    propose: Annotated[
+        bool,
+        typer.Option("--propose", help="Keep the model with the measured response as pending."),
+    ] = False,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    force: ForceOption = False,
+    json_file: JsonOption = None,
+    html_file: HtmlOption = None,
+) -> None:
+    """Run the axis at several speeds; print the ripple of the load without and with compensation.
+
+    Measures how the axis answers a correction in motion, and makes up for it.
+    """
+    from hdbridge.calibration.motion import motion_test, motion_test_s
+    from hdbridge.cli.booted import booted
+    from hdbridge.cli.measuring import phases
+    from hdbridge.model import TransmissionModel
+    from hdbridge.model.store import propose as keep
+
+    files = Profile.find(profile)
+    axis = load_axis(files, interface, channel, simulate=simulate)
+    chosen: Path = model or files.model
+    if model is None and not chosen.exists():
+        raise InputError(
+            f"{chosen}: there is no model to compensate with; calibrate first: hdbridge calibrate {profile}"
+        )
+    if propose and not measure:
+        raise InputError("--propose needs a measured response: leave --no-measure out")
+    used = TransmissionModel.load(chosen)
+    used.check_bound_to(axis)
+    notes.print(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
+    with (
+        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
+        phases() as progress,
+    ):
+        result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
+        identity = drive.identity
+    write_json(json_file, result.as_dict())
+    if html_file is not None:
+        from hdbridge.report.motion import motion_page
+        from hdbridge.report.page import render
+
+        write_result(html_file, render(motion_page(axis.name, result)))
+    print_motion(result)
+    if propose and result.response is not None:
+        from dataclasses import replace
+
+        pending = keep(
+            files.axis.parent,
+            replace(used, response=result.response),
+            f"response in motion, known up to {result.response.known_to_hz:.0f} Hz",
+            datetime.now().astimezone(),
+            identity,
+        )
+        console.print(f"pending: {pending}; commit it with: hdbridge model commit {profile}", soft_wrap=True)
+
+
+def print_motion(result: MotionTest) -> None:
+    """The result for a person."""
+    table = Table(title="Ripple of the load at constant speed, rms arcsec", title_justify="left")
+    for name in ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out"):
+        table.add_column(name, justify="left" if "orders" in name else "right")
+    for each in result.ripples:
+        table.add_row(
+            f"{each.speed_deg_s:g}",
+            f"{each.none_arcsec:.2f}",
+            _figure(each.static_arcsec),
+            _percent(each.removed_static_percent),
+            _figure(each.filtered_arcsec),
+            _percent(each.removed_percent),
+            " ".join(map(str, each.faded)),
+        )
+    print_table(table)
+    if result.response is not None:
+        console.print(
+            f"response known up to {result.response.known_to_hz:.0f} Hz, "
+            f"following lag {result.response.following_lag_ms:.2f} ms",
+            soft_wrap=True,
+        )
+    if (reached := result.helps_to_deg_s) is not None:
+        console.print(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
+    for line in result.remarks:
+        console.print(f"note: {line}", markup=False, soft_wrap=True)
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.0f} %"

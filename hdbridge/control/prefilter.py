@@ -1,0 +1,78 @@
+"""The correction that the load follows in motion: the filter of `Response` along the coming path.
+
+The correction is predicted for load targets that lie a few cycles ahead. They continue the last three
+targets at constant acceleration. At rest the prediction is the correction itself, and the filter changes no
+bit of it.
+
+Pure: no clock, no bus.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from itertools import repeat
+from operator import mul, sub
+
+from hdbridge.effects import Moment
+from hdbridge.model.response import LeadFilter
+
+
+class Prefilter:
+    """Filters a correction; one call per cycle."""
+
+    __slots__ = ("_full_step", "_last", "_predicted", "_reaches", "_step", "_weights")
+
+    def __init__(self, lead: LeadFilter, period_s: float) -> None:
+        self._weights = lead.weights
+        self._predicted = deque(repeat(0.0, len(lead.weights)), len(lead.weights))
+        """Predicted corrections, arcsec, the furthest ahead first."""
+        first, per_cycle = lead.lead_cycles, lead.per_cycle
+        ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
+        self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
+        """Factors of the last step and of its change that give each new prediction's distance."""
+        self._full_step = lead.full_speed_deg_s * period_s
+        self._last: float | None = None
+        self._step = 0.0
+
+    def reset(self, correction_arcsec: float) -> None:
+        """Start at rest with this correction."""
+        self._predicted.extend(repeat(correction_arcsec, len(self._weights)))
+        self._last = None
+        self._step = 0.0
+
+    def take_over(self, other: Prefilter | None, correction_arcsec: float) -> None:
+        """Continue where another filter is, or start with this correction if they differ in form."""
+        self.reset(correction_arcsec)
+        if other is not None and (other._reaches, len(other._weights)) == (self._reaches, len(self._weights)):
+            self._predicted = other._predicted.copy()
+            self._last, self._step = other._last, other._step
+
+    def follow(
+        self,
+        load_deg: float,
+        correction_arcsec: float,
+        moment: Moment,
+        predict: Callable[[float, Moment], float],
+    ) -> float:
+        """Filtered correction of this cycle, arcsec.
+
+        ``correction_arcsec`` belongs to the load target ``load_deg``; ``predict`` returns the correction at
+        another load target without changing any state.
+        """
+        step = 0.0 if self._last is None else load_deg - self._last
+        change = step - self._step if self._last is not None else 0.0
+        self._last, self._step = load_deg, step
+        predicted = self._predicted
+        if step == 0.0 and change == 0.0:
+            predicted.extendleft(repeat(correction_arcsec, len(self._reaches)))
+        else:
+            grown = moment.motor_speed_deg_s * change / step if step else 0.0
+            for by_step, by_change in self._reaches:
+                ahead_deg = load_deg + by_step * step + by_change * change
+                then = moment._replace(
+                    motor_speed_deg_s=moment.motor_speed_deg_s + by_step * grown, load_deg=ahead_deg
+                )
+                predicted.appendleft(predict(ahead_deg, then))
+        added: float = sum(map(mul, self._weights, map(sub, predicted, repeat(correction_arcsec))))
+        return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * added

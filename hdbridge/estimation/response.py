@@ -1,0 +1,325 @@
+"""Response of the load to its correction, from runs at constant speed, and the filter that makes up for it.
+
+A correction u of the load target moves the load by G u. The transmission error moves it by E, whether or not
+it is corrected. With a correction c, what remains is E - G F c, with F the filter (1 without). From runs
+without and with correction, per order and speed, ``W = F E / (E - rest)`` is the filter that leaves nothing.
+The amplitudes of the model cancel. W is a function of the frequency alone, so that one filter along the path
+has the right gain and phase at every speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.errors import InputError
+from hdbridge.model.response import LeadFilter, Response
+from hdbridge.procedures.even_speed import EvenRun
+from hdbridge.units import ARCSEC_PER_DEG
+
+ComplexArray = NDArray[np.complex128]
+FloatArray = NDArray[np.float64]
+
+HIGHEST = 0.36
+"""Highest frequency that is corrected in full, as a share of the SYNC rate."""
+STOP = 0.46
+"""Frequency from which nothing is corrected, as a share of the SYNC rate."""
+MIN_Z_SCORE = 4.0
+"""Amplitude over its standard deviation from which an order says something of the response."""
+MIN_DEVIATION = 0.01
+"""Smallest deviation of a point, as a share: the response is not exactly linear."""
+MIN_APPLIED = 0.05
+"""Gain of a filter below which its trial says nothing."""
+MAX_UNCERTAINTY = 0.35
+"""95 % half width, as a share of the gain, above which a frequency counts as unknown."""
+BIN_HZ = 1.5
+"""Points that are closer are merged, or closer than `BIN_SHARE` of their frequency."""
+BIN_SHARE = 0.03
+MAX_GAP = 0.12
+"""Largest gap between two points of a known range, as a share of the SYNC rate."""
+LEAD_CYCLES = 8
+LAG_CYCLES = 10
+"""Reach of the filter into the past, in addition to the following lag."""
+FADE = 0.12
+"""Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
+UNKNOWN = 0.5
+"""Response that is expected where none is known, per transmission error."""
+DIFFERENT = 0.15
+"""Smallest share by which two responses, or following lags, count as different."""
+LAG_NOISE_MS = 0.5
+REGULARISATION = 1e-3
+FADE_SHARE = 0.3
+SUM_WEIGHT = 1e3
+"""Weight of the condition that nothing changes at rest."""
+
+
+class Limits(NamedTuple):
+    """Limits of the axis on a correction, and the largest order that is corrected."""
+
+    amplitude_arcsec: float
+    maximum_arcsec: float
+    slew_arcsec_s: float
+    acceleration_deg_s2: float
+
+    @property
+    def largest_gain(self) -> float:
+        """Gain at which the largest order takes half of the permitted size."""
+        return 0.5 * self.maximum_arcsec / self.amplitude_arcsec
+
+    @property
+    def largest_gain_hz(self) -> float:
+        """Gain times frequency at which the largest order takes half of the permitted slew."""
+        return 0.5 * self.slew_arcsec_s / (math.tau * self.amplitude_arcsec)
+
+    def full_speed_deg_s(self, gain: float) -> float:
+        """Speed from which a filter of this gain works in full.
+
+        While it fades out in the slowest part of a stop, it takes `FADE_SHARE` of the load's speed at most.
+        """
+        reach_deg = gain * self.amplitude_arcsec / ARCSEC_PER_DEG
+        return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_deg / FADE_SHARE)
+
+
+class Harmonics(NamedTuple):
+    """Orders of the load error in one run; arcsec."""
+
+    speed_deg_s: float
+    amplitudes: ComplexArray
+    """The error is the real part of their sum over exp(i k motor angle), shape (orders,)."""
+    deviations: FloatArray
+    """Standard deviation of each part of them."""
+    mean_arcsec: float
+    """Mean of load minus target."""
+    ripple_arcsec: float
+    """Rms about a straight line."""
+
+
+def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
+    """Orders of the load error over the uncompensated motor target; InputError if the run is too short."""
+    if len(run.samples) < 4 * (2 * len(orders) + 2):
+        raise InputError(
+            f"a run at {run.speed_deg_s:g} deg/s has only {len(run.samples)} samples at constant speed: "
+            "allow more travel in the axis file"
+        )
+    target = np.array([each.load_target_deg for each in run.samples])
+    error = ARCSEC_PER_DEG * (np.array([each.load_position_deg for each in run.samples]) - target)
+    line = np.linspace(-1.0, 1.0, len(target))
+    angle = np.radians(ratio * target)[:, None] * np.array(orders, dtype=float)
+    design = np.column_stack([np.ones_like(line), line, np.cos(angle), -np.sin(angle)])
+    solution, *_ = np.linalg.lstsq(design, error, rcond=None)
+    rest = error - design @ solution
+    variance = float(rest @ rest) / (len(error) - design.shape[1])
+    spread = np.sqrt(variance * np.diag(np.linalg.pinv(design.T @ design)))
+    count = len(orders)
+    straight = error - np.polyval(np.polyfit(line, error, 1), line)
+    return Harmonics(
+        run.speed_deg_s,
+        solution[2 : 2 + count] + 1j * solution[2 + count :],
+        np.hypot(spread[2 : 2 + count], spread[2 + count :]) / math.sqrt(2.0),
+        float(solution[0]),
+        float(straight.std()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Runs with one filter, in the order of the runs without correction."""
+
+    runs: tuple[Harmonics, ...]
+    filter: LeadFilter | None = None
+
+
+def following_lag_s(runs: Iterable[Harmonics]) -> float:
+    """Lag of the load behind its target; the hysteresis's offset per direction is fitted as well."""
+    given = list(runs)
+    speed = np.array([each.speed_deg_s for each in given])
+    mean = np.array([each.mean_arcsec for each in given]) / ARCSEC_PER_DEG
+    design = np.column_stack([-speed, np.sign(speed), np.ones_like(speed)])
+    return float(np.linalg.lstsq(design, mean, rcond=None)[0][0])
+
+
+class _Found(NamedTuple):
+    frequency_hz: float
+    wanted: complex
+    """Filter that leaves nothing, without the following lag."""
+    deviation: float
+    """Standard deviation over size."""
+
+
+def response_of(
+    none: Sequence[Harmonics],
+    trials: Sequence[Trial],
+    orders: Sequence[int],
+    ratio: float,
+    cycle_s: float,
+    limits: Limits,
+    *,
+    highest_hz: float = math.inf,
+) -> Response | None:
+    """Response and filter from runs without and with correction; None if no frequency is known.
+
+    Nothing beyond ``highest_hz`` is corrected in full.
+    """
+    lag_s = following_lag_s(none)
+    points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
+    highest_hz = min(highest_hz, HIGHEST / cycle_s)
+    kept = _known(points, highest_hz, MAX_GAP / cycle_s, limits)
+    if not kept:
+        return None
+    known_hz = kept[-1].frequency_hz
+    fastest = max(abs(each.speed_deg_s) for each in none) * ratio / 360.0 * max(orders)
+    return Response(
+        cycle_ms=1000.0 * cycle_s,
+        following_lag_ms=round(1000.0 * lag_s, 3),
+        known_to_hz=round(known_hz, 2),
+        frequency_hz=tuple(round(each.frequency_hz, 3) for each in points),
+        gain=tuple(float(f"{1.0 / abs(each.wanted):.5g}") for each in points),
+        phase_deg=tuple(round(-math.degrees(np.angle(each.wanted)), 2) for each in points),
+        uncertainty=tuple(float(f"{2.0 * each.deviation:.3g}") for each in points),
+        filter=_filter(kept, lag_s, cycle_s, fastest, limits),
+    )
+
+
+def _found(
+    none: Sequence[Harmonics],
+    trials: Sequence[Trial],
+    orders: Sequence[int],
+    ratio: float,
+    cycle_s: float,
+    lag_s: float,
+) -> list[_Found]:
+    """The filter that is wanted, at each order and speed that shows it."""
+    found: list[_Found] = []
+    for trial in trials:
+        for before, after in zip(none, trial.runs, strict=True):
+            hertz = np.array(orders) * abs(before.speed_deg_s) * ratio / 360.0
+            applied = np.ones(len(orders)) if trial.filter is None else gain(trial.filter, hertz, cycle_s)
+            error, effect = before.amplitudes, before.amplitudes - after.amplitudes
+            if before.speed_deg_s < 0.0:  # the angle runs against the time
+                error, effect = error.conj(), effect.conj()
+            spread = np.hypot(before.deviations, after.deviations)
+            clear = abs(effect) > MIN_Z_SCORE * spread
+            clear &= abs(error) > MIN_Z_SCORE * before.deviations
+            clear &= (hertz < STOP / cycle_s) & (abs(applied) > MIN_APPLIED)
+            wanted = (applied * error / effect * np.exp(2j * math.pi * hertz * lag_s))[clear]
+            deviation = np.hypot(spread / abs(effect), before.deviations / abs(error))[clear]
+            rows = zip(hertz[clear].tolist(), wanted.tolist(), deviation.tolist(), strict=True)
+            found += [_Found(at, value, max(relative, MIN_DEVIATION)) for at, value, relative in rows]
+    return sorted(found, key=lambda each: each.frequency_hz)
+
+
+def _merged(found: Sequence[_Found]) -> list[_Found]:
+    """Neighbours in one; what scatters more than its noise is known less well."""
+    groups: list[list[_Found]] = []
+    for each in found:
+        first_hz = groups[-1][0].frequency_hz if groups else -math.inf
+        if each.frequency_hz > first_hz + max(BIN_HZ, BIN_SHARE * first_hz):
+            groups.append([])
+        groups[-1].append(each)
+    return [_mean(group) for group in groups]
+
+
+def _mean(group: Sequence[_Found]) -> _Found:
+    values = np.array([each.wanted for each in group])
+    hertz = np.array([each.frequency_hz for each in group])
+    weight = (np.array([each.deviation for each in group]) * abs(values)) ** -2.0
+    total = float(weight.sum())
+    mean = complex(weight @ values) / total
+    scatter = float(weight @ abs(values - mean) ** 2) / total / max(len(group) - 1, 1)
+    return _Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)) / abs(mean))
+
+
+def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
+    """The points from zero up to the first gap, doubt or limit."""
+    kept: list[_Found] = []
+    before_hz = 0.0
+    for each in points:
+        hertz, size = each.frequency_hz, abs(each.wanted)
+        if hertz > highest_hz or hertz - before_hz > max_gap_hz:
+            break
+        if 2.0 * each.deviation > MAX_UNCERTAINTY:
+            continue
+        if size > limits.largest_gain or size * hertz > limits.largest_gain_hz:
+            break
+        kept.append(each)
+        before_hz = hertz
+    return kept
+
+
+def agree(one: Response, other: Response) -> bool:
+    """Returns False if the following lag, or most of the common frequencies, differ beyond their noise."""
+    lag_ms = max(abs(one.following_lag_ms), abs(other.following_lag_ms))
+    if abs(one.following_lag_ms - other.following_lag_ms) > max(DIFFERENT * lag_ms, LAG_NOISE_MS):
+        return False
+    hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
+    values, noise = zip(*(_at(each, hertz) for each in (one, other)), strict=True)
+    apart = abs(values[0] / values[1] - 1.0) > np.maximum(DIFFERENT, 1.5 * (noise[0] + noise[1]))
+    return float(apart.mean()) < 0.5 if hertz.size else True
+
+
+def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Response and uncertainty at some frequencies, the following lag included; linear between the points."""
+    known = np.array(response.frequency_hz)
+    late = np.exp(-2j * math.pi * response.following_lag_ms / 1000.0 * known)
+    values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg)) * late
+    found: ComplexArray = np.interp(hertz, known, values.real) + 1j * np.interp(hertz, known, values.imag)
+    return found, np.interp(hertz, known, response.uncertainty)
+
+
+def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexArray:
+    """Complex gain of a filter, shape of ``frequency_hz``."""
+    ahead_s = (lead.lead_cycles - np.arange(len(lead.weights)) / lead.per_cycle) * cycle_s
+    turned: ComplexArray = np.exp(2j * math.pi * np.multiply.outer(frequency_hz, ahead_s))
+    total: ComplexArray = turned @ np.array(lead.weights)
+    return total
+
+
+def _filter(
+    kept: Sequence[_Found], lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
+) -> LeadFilter:
+    """Least squares on the relative error: what the wanted filter makes 1 up to the last point, 0 beyond."""
+    known = np.array([0.0, *(each.frequency_hz for each in kept)])
+    size = np.log([1.0, *(abs(each.wanted) for each in kept)])
+    phase = np.unwrap([0.0, *(float(np.angle(each.wanted)) for each in kept)])
+    trust = np.array([kept[0].deviation, *(each.deviation for each in kept)])
+    per_cycle = min(max(2, math.ceil((fastest_hz + known[-1]) * cycle_s)), 4)
+    lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
+    count = (LEAD_CYCLES + lag_cycles) * per_cycle + 1
+    ahead_s = (LEAD_CYCLES - np.arange(count) / per_cycle) * cycle_s
+    hertz = np.linspace(0.0, known[-1], 160)
+    wanted = np.exp(
+        np.interp(hertz, known, size) + 1j * (np.interp(hertz, known, phase) - 2.0 * math.pi * lag_s * hertz)
+    )
+    weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, known, trust))
+    inside = weight[:, None] * np.exp(2j * math.pi * np.outer(hertz, ahead_s)) / wanted[:, None]
+    # Beyond the last point the axis is not known: the filter falls to zero, steeply and then for good.
+    edge, half = float(known[-1]), 0.5 * per_cycle / cycle_s
+    beyond = np.linspace(edge, half, 200)[1:]
+    fade = np.clip((beyond - edge) / (FADE / cycle_s), 0.0, 1.0)
+    last = float(abs(wanted[-1]))
+    dread = (0.05 + 0.95 * fade**2) * np.maximum(1.0 / last, np.minimum(fade, UNKNOWN))
+    outside = dread[:, None] * np.exp(2j * math.pi * np.outer(beyond, ahead_s))
+    rows = np.vstack(
+        [
+            inside.real,
+            inside.imag,
+            outside.real,
+            outside.imag,
+            REGULARISATION * np.eye(count),
+            1e3 * np.ones(count),
+        ]
+    )
+    goal = np.concatenate([weight, np.zeros(len(hertz) + 2 * len(beyond) + count), [SUM_WEIGHT]])
+    weights = np.linalg.lstsq(rows, goal, rcond=None)[0]
+    weights /= weights.sum()
+    return LeadFilter(
+        lead_cycles=LEAD_CYCLES,
+        per_cycle=per_cycle,
+        full_speed_deg_s=limits.full_speed_deg_s(float(np.exp(size).max())),
+        weights=tuple(float(f"{each:.9g}") for each in weights),
+    )

@@ -1,0 +1,69 @@
+"""Response of an axis to its correction in motion, and the filter that makes up for it.
+
+At rest the load answers a correction fully. In motion servo, command filter and interpolation change its
+amplitude and phase. `Response` has the measured points and the filter weights computed from them;
+`hdbridge.estimation.response` computes both.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pydantic import Field, model_validator
+
+from hdbridge.strictness import Strict
+
+
+class LeadFilter(Strict):
+    """Weights of the correction along the path, from the near future to the past.
+
+    Near standstill the filter fades out: what is left of the move in it would let the motor turn back. Weight
+    j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The weights
+    sum to 1, so that nothing changes at rest.
+    """
+
+    lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")
+    per_cycle: int = Field(ge=1, le=8, description="weights per cycle")
+    full_speed_deg_s: float = Field(
+        gt=0, description="load speed from which the filter works in full; it fades out with its square"
+    )
+    weights: tuple[float, ...] = Field(min_length=1, max_length=1000, description="the weights, sum 1")
+
+    @model_validator(mode="after")
+    def _check(self) -> LeadFilter:
+        if not math.isclose(math.fsum(self.weights), 1.0, abs_tol=1e-6):
+            raise ValueError(f"the weights sum to {math.fsum(self.weights):.6g}; expected 1")
+        if (len(self.weights) - 1) % self.per_cycle:
+            raise ValueError(
+                f"{len(self.weights)} weights at {self.per_cycle} per cycle; "
+                "expected a whole number of cycles and one"
+            )
+        return self
+
+
+class Response(Strict):
+    """Measured response of an axis to its correction; valid for the servo gains that it was measured with."""
+
+    cycle_ms: float = Field(gt=0, description="SYNC period of the measurement")
+    following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")
+    known_to_hz: float = Field(gt=0, description="frequency up to which the correction is applied in full")
+    frequency_hz: tuple[float, ...] = Field(description="measured frequencies, rising")
+    gain: tuple[float, ...] = Field(description="amplitude that the load makes of a correction of 1, at each")
+    phase_deg: tuple[float, ...] = Field(
+        description="phase of the load against the correction at each, following lag excluded"
+    )
+    uncertainty: tuple[float, ...] = Field(
+        description="half width of the 95 % interval at each, as a share of the gain"
+    )
+    filter: LeadFilter = Field(description="filter of the correction, computed from the points")
+
+    @model_validator(mode="after")
+    def _check(self) -> Response:
+        columns = (self.frequency_hz, self.gain, self.phase_deg, self.uncertainty)
+        if not self.frequency_hz or len({len(each) for each in columns}) != 1:
+            raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")
+        return self
+
+    def fits_cycle(self, cycle_s: float) -> bool:
+        """Returns True if the filter was made for this SYNC period."""
+        return math.isclose(self.cycle_ms, 1000.0 * cycle_s, rel_tol=1e-6)

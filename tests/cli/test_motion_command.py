@@ -1,0 +1,76 @@
+"""`hdbridge motion` on the simulated drive."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+RAISED = {
+    "velocity_deg_s: 20": "velocity_deg_s: 130",
+    "acceleration_deg_s2: 200": "acceleration_deg_s2: 300",
+    "following_error_deg: 5.0": "following_error_deg: 90.0",
+    "position_min_deg: -400": "position_min_deg: -1500",
+    "position_max_deg: 400": "position_max_deg: 1500",
+    "maximum_arcsec: 300": "maximum_arcsec: 600",
+    "slew_arcsec_s: 20000": "slew_arcsec_s: 100000",
+}
+
+
+@pytest.fixture
+def fast(tmp_path):
+    """The article's axis with raised limits."""
+    shutil.copytree(PROFILE, tmp_path / "fast")
+    path = tmp_path / "fast" / "axis.yaml"
+    text = path.read_text(encoding="utf-8")
+    for low, high in RAISED.items():
+        assert low in text
+        text = text.replace(low, high)
+    path.write_text(text, encoding="utf-8")
+    return tmp_path / "fast"
+
+
+def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hdbridge, fast, tmp_path):
+    done = hdbridge("motion", "fast", "--simulate", "--propose", "--json", "out.json", "--html", "out.html")
+    assert done.returncode == 0, done.stderr
+    assert "pending" in done.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["schema"] == "hdbridge.motion/1"
+    assert result["response"]["known_to_hz"] > 70.0
+    for each in result["speeds"]:
+        assert each["removed_percent"] > 80.0
+        assert each["removed_percent"] > each["removed_static_percent"] - 3.0
+    assert result["speeds"][-1]["removed_static_percent"] < 50.0
+    assert "Gain" in (tmp_path / "out.html").read_text()
+    done = hdbridge("model", "commit", "fast")
+    assert done.returncode == 0, done.stderr
+    done = hdbridge("motion", "fast", "--simulate", "--no-measure", "--json", "again.json")
+    assert done.returncode == 0, done.stderr
+    again = json.loads((tmp_path / "again.json").read_text())
+    for one, other in zip(result["speeds"], again["speeds"], strict=True):
+        assert other["filtered_arcsec"] == pytest.approx(one["filtered_arcsec"], rel=0.1, abs=0.2)
+    assert again["remarks"] == []
+    assert "up to 8" in hdbridge("check", "fast").stdout
+    # At rest the axis points as well as without the response.
+    done = hdbridge("step", "fast", "--simulate", "--count", 12, "--scheme", "both", "--json", "step.json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "step.json").read_text())["both"]["pooled"]["three_sigma_arcsec"] < 4.5
+
+    # Another servo is noticed.
+    path = fast / "truth.yaml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("command_filter_ms: 1.0", "command_filter_ms: 4.0"), encoding="utf-8")
+    done = hdbridge("motion", "fast", "--simulate", "--no-measure")
+    assert done.returncode == 0, done.stderr
+    assert "measure the response again" in done.stdout
+
+
+def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused(hdbridge, tmp_path):
+    (tmp_path / "none.yaml").write_text("schema: hdbridge.model/1\nratio: 50\neffects: []\n")
+    done = hdbridge("motion", "article", "--simulate", "--model", "none.yaml")
+    assert done.returncode == 2
+    assert "no motor order" in done.stderr
+    done = hdbridge("motion", "article", "--simulate", "--no-measure", "--propose")
+    assert done.returncode == 2
+    assert "--no-measure" in done.stderr

@@ -1,0 +1,41 @@
+"""The compensation in motion on drives that hdbridge does not simulate itself."""
+
+from dataclasses import replace
+
+import pytest
+from foreign.bench import foreign_bench
+from foreign.servos import STRUCTURES
+
+from hdbridge import Drive
+from hdbridge.calibration.motion import motion_test
+from hdbridge.effects import MotorOrder, Synchronous
+from hdbridge.estimation.response import HIGHEST
+from hdbridge.model import TransmissionModel
+
+# A third of the SYNC rate is reached by order 4 at these speeds, and later by the others.
+SEEDS = {"pi_notch": 3, "piv": 3, "observed": 0, "state_feedback": 0}
+
+
+def static_model(truth) -> TransmissionModel:
+    orders = tuple(MotorOrder(**each._asdict()) for each in truth.mechanics.motor_orders)
+    return TransmissionModel(truth.mechanics.ratio, (Synchronous(orders=orders),))
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_the_measured_response_removes_the_ripple_at_speed(structure, tmp_path):
+    with foreign_bench(SEEDS[structure], structure, tmp_path) as bench:
+        with Drive(bench.bus, bench.axis, bench.clock) as drive:
+            drive.boot()
+            model = static_model(bench.truth)
+            result = motion_test(drive, model)
+            again = motion_test(drive, replace(model, response=result.response), measure=False)
+        ratio, cycle_s = bench.axis.gear.ratio, bench.axis.drive.cycle_s
+    assert result.response is not None
+    for each in result.ripples:
+        assert each.filtered_arcsec < 1.05 * each.none_arcsec  # never worse than none
+        if 4 * each.speed_deg_s * ratio / 360.0 < 0.8 * HIGHEST / cycle_s:
+            assert each.removed_percent > 88.0, each
+    fast = [each for each in result.ripples if 2 * each.speed_deg_s * ratio / 360.0 > 15.0]
+    assert max(each.removed_percent - each.removed_static_percent for each in fast) > 15.0
+    for one, other in zip(result.ripples, again.ripples, strict=True):
+        assert other.filtered_arcsec == pytest.approx(one.filtered_arcsec, rel=0.1, abs=0.2)
