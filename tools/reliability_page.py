@@ -56,8 +56,8 @@ Each row is tried on {drives} drives that all keep to CiA 402 ([truth file](trut
 {characters}
 
 A cell has the cycles from the fault to the reaction on these {drives}, in this order; a dash if the place or
-the drive cannot show the fault. `make test` tries them all on the virtual bus. `make test-slow` tries each row
-on all {combinations} combinations of these choices.
+the drive cannot show the fault. `make test` tries them all on the virtual bus. `make test-slow` tries each
+row on all {combinations} combinations of these choices.
 
 [timing-and-faults.md](timing-and-faults.md) says what the reactions are.
 
