@@ -171,8 +171,9 @@ ROWS: Final = (
         _F.DROPPED_OUT, _R.QUICK_STOP, 2, without_a_word=True),
     Row("the drive has dropped out between two SYNCs", _frame(0x181, b"\x07\x16" + bytes(6)),
         _F.DROPPED_OUT, _R.QUICK_STOP, 1),
-    Row("the drive misses the master's heartbeat (8130h)", _miss(0x8130), _F.MASTER_LOST, _R.QUICK_STOP, 1),
-    Row("the drive misses set-points (8250h)", _miss(0x8250), _F.MASTER_LOST, _R.QUICK_STOP, 1),
+    # Two cycles: the emergency message may come behind the TPDOs of its cycle.
+    Row("the drive misses the master's heartbeat (8130h)", _miss(0x8130), _F.MASTER_LOST, _R.QUICK_STOP, 2),
+    Row("the drive misses set-points (8250h)", _miss(0x8250), _F.MASTER_LOST, _R.QUICK_STOP, 2),
     Row("the load encoder jumps and stays away", _drive(load_jump_counts=100_000), _F.ENCODER_JUMP,
         _R.QUICK_STOP, 3),
     Row("the load encoder jumps for one sample", lambda bench: _glitch(bench, 100_000), _F.ENCODER_JUMP,
