@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from itertools import repeat
-from operator import mul, sub
+from operator import mul
 
 from hdbridge.effects import Moment
 from hdbridge.model.response import LeadFilter
@@ -66,13 +66,15 @@ class Prefilter:
         predicted = self._predicted
         if step == 0.0 and change == 0.0:
             predicted.extendleft(repeat(correction_arcsec, len(self._reaches)))
-        else:
-            grown = moment.motor_speed_deg_s * change / step if step else 0.0
-            for by_step, by_change in self._reaches:
-                ahead_deg = load_deg + by_step * step + by_change * change
+            return correction_arcsec
+        then = moment
+        grown = moment.motor_speed_deg_s * change / step if step else 0.0
+        for by_step, by_change in self._reaches:
+            ahead_deg = load_deg + by_step * step + by_change * change
+            if moment.direction:  # somebody needs the channels of the motion
                 then = moment._replace(
                     motor_speed_deg_s=moment.motor_speed_deg_s + by_step * grown, load_deg=ahead_deg
                 )
-                predicted.appendleft(predict(ahead_deg, then))
-        added: float = sum(map(mul, self._weights, map(sub, predicted, repeat(correction_arcsec))))
+            predicted.appendleft(predict(ahead_deg, then))
+        added: float = sum(map(mul, self._weights, predicted)) - correction_arcsec
         return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * added

@@ -43,7 +43,7 @@ BIN_SHARE = 0.03
 MAX_GAP = 0.12
 """Largest gap between two points of a known range, as a share of the SYNC rate."""
 LEAD_CYCLES = 8
-LAG_CYCLES = 10
+LAG_CYCLES = 16
 """Reach of the filter into the past, in addition to the following lag."""
 FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""

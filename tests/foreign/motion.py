@@ -1,4 +1,4 @@
-"""Figures of the compensation in motion: `PYTHONPATH=tests python -m foreign.motion [SEEDS]`.
+"""Figures of the compensation in motion: `PYTHONPATH=tests python -m foreign.motion [SEEDS [KIND]...]`.
 
 Each axis has the exact correction of rest as its model. Its response is measured over the bus as
 `hdbridge motion` does. Then the ripple of the load encoder is measured at fixed speeds. Axes: the foreign
@@ -113,8 +113,8 @@ def figures(drive: Drive, model: TransmissionModel) -> np.ndarray:
     return table
 
 
-def main(seeds: int) -> None:
-    for kind in (*STRUCTURES, "simulated"):
+def main(seeds: int, kinds: list[str]) -> None:
+    for kind in kinds or (*STRUCTURES, "simulated"):
         tables, slow = [], []
         for seed in range(seeds):
             with tempfile.TemporaryDirectory() as name:
@@ -151,4 +151,4 @@ def _line(table: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5, sys.argv[2:])
