@@ -10,6 +10,7 @@ from hdbridge.drive import objects
 from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
 from hdbridge.drive.layout import cyclic_mode, layouts
 from hdbridge.drive.nameplate import mode_advice
+from hdbridge.drive.objects import Mode
 from hdbridge.drive.writes import PlannedWrite, permitted, rows
 from hdbridge.errors import InputError
 
@@ -72,9 +73,9 @@ def sent_along(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[str
 def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[Left]]:
     """The rows that are for the boot-up, and those that are left to the drive."""
     od = dictionary_of(axis) if od is None else od
-    pdos = layouts(axis, od)
     if od is not None:
         _check_mode(axis, od)
+    pdos = layouts(axis, od)
     planned: list[PlannedWrite] = []
     left: dict[tuple[int, int], Left] = {}
     for row in rows(axis, od, pdos):
@@ -112,7 +113,7 @@ def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> 
             )
         return reason
     low, high = permitted(variable, kind)
-    if low <= row.value <= high or row.kept:  # of an identifier, the limits mean other bits
+    if low <= row.value <= high or row.kept or row.composed:  # the limits mean a part of the value
         return None
     if row.exact or axis.states(row.field):
         raise InputError(f"{axis.where(row.field)}: {_of(row)}; {eds} permits {low} to {high}")
@@ -124,14 +125,26 @@ def _of(row: PlannedWrite) -> str:
 
 
 def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
-    """`InputError` if the default of 6502h, where the EDS gives one, says that the mode is missing."""
-    variable = find(od, objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub)
-    modes = held(variable) if variable is not None else None
+    """`InputError` if the EDS says that the mode is missing: by the value of 6502h, else the limits of 6060h."""
+    modes, said = _value_of_6502h(od), "6502h is {:08X}h"
+    mode = find(od, objects.MODE.index, objects.MODE.sub)
+    if not modes and mode is not None:
+        low, high = permitted(mode, integer_type(mode) or objects.MODE.type)
+        modes, said = (
+            sum(each.supported_bit for each in Mode if low <= each <= high),
+            f"6060h permits {low} to {high}",
+        )
     if modes and not modes & cyclic_mode(axis).mode.supported_bit:
         raise InputError(
             f"{axis.where('drive.mode')}: {axis.drive.mode} is not among the modes of {axis.drive.eds} "
-            f"(6502h is {modes:08X}h); {mode_advice(modes)}"
+            f"({said.format(modes)}); {mode_advice(modes)}"
         )
+
+
+def _value_of_6502h(od: ObjectDictionary) -> int:
+    """Supported drive modes as the EDS gives them; 0 if it does not."""
+    variable = find(od, objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub)
+    return (held(variable) if variable is not None else None) or 0
 
 
 def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
@@ -140,7 +153,7 @@ def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
     for address, consequence in (
         (objects.POSITION_DEMAND, "the last target sent stands in for it"),
         (objects.TORQUE_ACTUAL, "torque is neither recorded nor checked"),
-        (objects.SUPPORTED_MODES, "the drive is found to have a mode, or not, when it is set"),
+        (objects.SUPPORTED_MODES, "only the drive itself shows if it has the mode"),
         (objects.ERROR_CODE, "only emergency messages explain a fault"),
     ):
         variable = find(od, address.index, address.sub)
@@ -148,6 +161,8 @@ def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
             reason = f"which {axis.drive.eds} lacks"
         elif address in absent:
             reason = f"which no TPDO of {axis.drive.eds} can carry"
+        elif address == objects.SUPPORTED_MODES and not _value_of_6502h(od):
+            reason = f"for which {axis.drive.eds} gives no value"
         else:
             continue
         yield Left(address.index, address.sub, reason, consequence)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import TYPE_CHECKING, Final
 
@@ -53,6 +53,8 @@ class PlannedWrite:
     """Bits that must read back as written."""
     kept: int = 0
     """Bits that stay as the drive has them."""
+    composed: bool = False
+    """Several numbers in one. Vendors give the limits of one of them, so that those of the EDS do not count."""
     without: str = ""
     """What follows if the drive keeps a value of its own; empty if hdbridge cannot do without this one."""
     exact: bool = False
@@ -129,7 +131,8 @@ def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, why, field, without=without, exact=True)
     why = f"the drive stops by itself when node {master}, the master, is silent for {ms} ms"
     without = "only its event timer (1400h:05) stops the axis when the master dies"
-    yield _row(axis, objects.HEARTBEAT_CONSUMER, master_heartbeat(axis), why, field, without=without)
+    watched = _row(axis, objects.HEARTBEAT_CONSUMER, master_heartbeat(axis), why, field, without=without)
+    yield replace(watched, composed=True)
     key, why = "communication_error_option", "its NMT state when the master is lost"
     yield _row(axis, objects.ERROR_BEHAVIOUR, getattr(axis.drive, key), why, f"drive.{key}", without=why)
     source = axis.load_encoder.source

@@ -199,9 +199,49 @@ def test_limits_of_the_eds_are_compared_beforehand(tmp_path: Path) -> None:
         plan(profile_with(tmp_path, stating(OWN, "6072", LowLimit=0, HighLimit=900)))
 
 
+def test_limits_of_a_part_of_a_value_are_not_those_of_the_value(tmp_path: Path) -> None:
+    """Elmo's Gold drives permit 0 to 65535 for 1016h:01: the time. The node's number stands above it."""
+    axis = profile_with(tmp_path, stating(OWN, "1016sub1", LowLimit=0, HighLimit=65535))
+    assert left_to_drive(axis) == []
+    assert [row.value for row in plan(axis) if row.index == 0x1016] == [127 << 16 | 50]
+
+
 def test_limits_that_leave_no_choice_mean_none(tmp_path: Path) -> None:
     eds = stating(stating(OWN, "6007", LowLimit=0, HighLimit=0), "6072", LowLimit="", HighLimit="none")
     assert left_to_drive(profile_with(tmp_path, eds)) == []
+
+
+@pytest.mark.parametrize(
+    ("limits", "mode", "refused"),
+    [
+        ((-128, 10), "csp", None),
+        ((0, 0), "csp", None),
+        ((-1, 7), "csp", r"drive\.mode: csp is not among .*6060h permits -1 to 7\); 'mode: ip' would be"),
+        ((-9, 6), "ip", r"drive\.mode: ip is not among .*6060h permits -9 to 6\); this drive cannot be used"),
+    ],
+)
+def test_the_limits_of_6060h_count_if_6502h_gives_no_value(
+    tmp_path: Path, limits: tuple[int, int], mode: str, refused: str | None
+) -> None:
+    low, high = limits
+    limited = stating(OWN, "6060", LowLimit=low, HighLimit=high)
+    plan(profile_with(tmp_path, limited))  # 6502h says that it has both
+    edit = (MODE, f"{MODE}  mode: {mode}\n")
+    for eds in (without(limited, 0x6502), stating(limited, "6502", DefaultValue="")):
+        axis = profile_with(tmp_path, eds, edit)
+        if refused:
+            with pytest.raises(InputError, match=refused):
+                plan(axis)
+        else:
+            assert [each.index for each in left_to_drive(axis)] == [0x6502]
+
+
+def test_a_missing_mode_is_named_before_what_the_mode_would_need(tmp_path: Path) -> None:
+    """Who looks for a load encoder, or for 60C1h in another EDS, looks in vain if the drive lacks the mode."""
+    eds = stating(without(OWN, 0x60E4, 0x60C1), "6502", DefaultValue="0x25")
+    for mode in ("csp", "ip"):
+        with pytest.raises(InputError, match=rf"drive\.mode: {mode} is not among the modes"):
+            plan(profile_with(tmp_path, eds, (MODE, f"{MODE}  mode: {mode}\n")))
 
 
 @pytest.mark.parametrize(
