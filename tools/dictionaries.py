@@ -1,11 +1,11 @@
-"""The tables of docs/drives.md: what `hdbridge check` says of the dictionaries (EDS and DCF files) of a folder.
+"""The tables of docs/drives.md: answers of `hdbridge check` to the dictionaries (EDS, DCF) of a folder.
 
     python tools/dictionaries.py FOLDER
 
 The folder holds OWNER/REPOSITORY/PATH for each file, so that a row gives its public source. Each file gets a
-profile as a user would make it: `hdbridge new --from article`, the file beside the axis file, and `drive.eds`,
-`drive.mode` and `load_encoder.source` edited. The load encoder is 60E4h:01 if the dictionary has it, else a
-node of its own. The other values are the article's.
+profile as a user would make it: `hdbridge new --from article`, the file beside the axis file, and the keys
+`drive.eds`, `drive.mode` and `load_encoder.source` edited. The load encoder is 60E4h:01 if the dictionary has
+it, else a node of its own. The other values are the article's.
 """
 
 from __future__ import annotations
@@ -120,23 +120,33 @@ def add(found: Checked, mode: str, answer: dict[str, Any]) -> None:
         match = LEFT.fullmatch(line)
         if match is None:
             sys.exit(f"{found.source}: cannot read the line {line!r} of `hdbridge check`")
-        left[match[1]] = (match[2].replace(found.source.name, "it"), match[3])
+        left[match[1]] = (short(match[2], found.source.name), match[3])
     found.left[mode] = left
     found.verdicts[mode] = "if the drive has it" if SUPPORTED in left else "yes"
     for key in ("fixed mapping", "sent along", "not read"):
-        found.remarks += [f"{key}: {each.rpartition(found.source.name)[2]}" for each in answer[key]]
+        found.remarks += [
+            f"{key}: {each.rpartition(found.source.name)[2].lstrip(':')}" for each in answer[key]
+        ]
+
+
+def short(reason: str, file: str) -> str:
+    """Why an object is left to the drive, in few words; empty if the dictionary lacks it."""
+    if reason == f"which {file} lacks":
+        return ""
+    return re.sub(rf"^(which is|which|for which) | (in|of) {re.escape(file)}.*?(?= can carry|$)", "", reason)
 
 
 def name(found: Checked) -> str:
-    """Vendor and product as the file gives them."""
+    """Vendor and product as the file gives them, else its description."""
     names = (found.key("DeviceInfo", "VendorName"), found.key("DeviceInfo", "ProductName"))
-    return ", ".join(filter(None, names)) or "(not given)"
+    return ", ".join(filter(None, names)) or found.key("FileInfo", "Description") or "(not given)"
 
 
 def print_drives(checked: list[Checked]) -> None:
     """One row for each dictionary."""
     print(
-        "| vendor, product | file (revision, date): source | csp | ip | load encoder | master dies: stopped by | left to the drive |"
+        "| vendor, product | file (revision, date): source | csp | ip | load encoder | "
+        "master dies: stopped by | left to the drive |"
     )
     print("|---|---|---|---|---|---|---|")
     for each in checked:
@@ -163,7 +173,7 @@ def objects(found: Checked) -> str:
     every: dict[str, str] = {}
     for mode, left in found.left.items():
         for key, (reason, _) in left.items():
-            text = key.removesuffix(":00") + ("" if reason == "which it lacks" else f" ({reason})")
+            text = key.removesuffix(":00") + (f" ({reason})" if reason else "")
             if key not in every and every:
                 text += f" in {mode}"
             texts += [text] if key not in (*every, MASTER, TIMER, SUPPORTED) else []

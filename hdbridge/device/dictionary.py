@@ -36,6 +36,7 @@ NUMBERS: Final = {
     datatypes.REAL64: "d",
 }
 """Data types of numbers, as ``struct`` format characters; an object of any other type holds bytes."""
+_VENDORS: Final = (0x2000, 0x5FFF)
 _PDOS: Final = (0x1400, 0x1BFF)
 """PDOs exist or not: the firmware does without those that the EDS does not list."""
 
@@ -76,7 +77,8 @@ class Entry:
 
     ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
     value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is told after it was
-    stored. The firmware uses a ``hidden`` entry, and the bus does not see it.
+    stored. The firmware uses a ``hidden`` entry, and the bus does not see it. The firmware does not
+    use an entry that is not ``is_known``.
     """
 
     __slots__ = (
@@ -89,6 +91,7 @@ class Entry:
         "hidden",
         "high",
         "index",
+        "is_known",
         "low",
         "mappable",
         "name",
@@ -105,6 +108,7 @@ class Entry:
         self.name: Final[str] = variable.name
         code = NUMBERS.get(variable.data_type or 0)
         self.codec: Final = struct.Struct("<" + code) if code else None
+        self.is_known: Final = own is not None
         self.hidden = False
         self.readable: Final = "r" in variable.access_type or variable.access_type == "const"
         self.writable: Final = "w" in variable.access_type
@@ -204,8 +208,9 @@ class Entry:
 class Dictionary:
     """All entries of one node, by (index, sub-index).
 
-    The firmware works with every object of the bundled EDS. Those that ``eds_path`` does not list are hidden:
-    no SDO or PDO reaches them, and they keep the bundled default.
+    The firmware works with every object of the bundled EDS, except those whose numbers ``eds_path`` gives to
+    other objects of the vendor. Those that ``eds_path`` does not list are hidden: no SDO or PDO reaches them,
+    and they keep the bundled default.
     """
 
     def __init__(self, eds_path: Path, node_id: int) -> None:
@@ -229,6 +234,8 @@ class Dictionary:
         self._note_indices()
 
     def _add(self, variable: ODVariable, own: ODVariable | None) -> Entry:
+        if own is not None and _is_vendors(variable, own):
+            own = None
         entry = Entry(variable, own)
         if own is not None and (entry.codec is None) != (own.data_type not in NUMBERS):
             raise InputError(
@@ -274,6 +281,11 @@ class Dictionary:
         for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default
+
+
+def _is_vendors(variable: ODVariable, own: ODVariable) -> bool:
+    """A manufacturer-specific object of another type: the number is the same by chance."""
+    return _VENDORS[0] <= variable.index <= _VENDORS[1] and variable.data_type != own.data_type
 
 
 def _variables(od: ObjectDictionary) -> dict[tuple[int, int], ODVariable]:

@@ -125,7 +125,8 @@ class Firmware:
             0x2100: lambda: round(10.0 * motion.machine.temperature_c),
             0x2101: lambda: round(1000.0 * motion.machine.load_torque_nm),
         }.items():
-            entry[key, 0].bind(read)
+            if entry[key, 0].is_known:
+                entry[key, 0].bind(read)
         entry[0x60E4, 1].bind(motion.load_position)
         entry[0x60E5, 1].bind(lambda: round(motion.load_velocity_counts_s))
         entry[0x6040, 0].follower = self.control

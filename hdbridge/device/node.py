@@ -122,11 +122,12 @@ class DriveNode:
 
     def _take_period(self) -> None:
         value = self.dictionary.value
-        self._period_s = value(0x60C2, 1) / 10.0 ** -value(0x60C2, 2)
-        self._measures_period = (0x60C2, 1) not in self.dictionary
+        mantissa = value(0x60C2, 1)
+        self._period_s = (mantissa or 1) / 10.0 ** -value(0x60C2, 2)
+        self._measures_period = mantissa == 0 or (0x60C2, 1) not in self.dictionary
 
     def _measure_period(self, now_s: float) -> None:
-        """A drive without object 60C2h takes its period from SYNC."""
+        """A drive without object 60C2h, or with 0 in it, takes its period from SYNC."""
         since_s, self._sync_s = now_s - self._sync_s, now_s
         if 0.0 < since_s < LONGEST_CATCH_UP_S:
             self._period_s = since_s

@@ -125,7 +125,7 @@ def _of(row: PlannedWrite) -> str:
 
 
 def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
-    """`InputError` if the EDS says that the mode is missing: by the value of 6502h, else the limits of 6060h."""
+    """`InputError` if the EDS says that the mode is missing: by 6502h, or else by the limits of 6060h."""
     modes, said = _value_of_6502h(od), "6502h is {:08X}h"
     mode = find(od, objects.MODE.index, objects.MODE.sub)
     if not modes and mode is not None:

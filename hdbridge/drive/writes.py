@@ -54,7 +54,7 @@ class PlannedWrite:
     kept: int = 0
     """Bits that stay as the drive has them."""
     composed: bool = False
-    """Several numbers in one. Vendors give the limits of one of them, so that those of the EDS do not count."""
+    """Several numbers in one object. The limits of the EDS are ignored: vendors give those of one number."""
     without: str = ""
     """What follows if the drive keeps a value of its own; empty if hdbridge cannot do without this one."""
     exact: bool = False

@@ -237,7 +237,7 @@ def test_the_limits_of_6060h_count_if_6502h_gives_no_value(
 
 
 def test_a_missing_mode_is_named_before_what_the_mode_would_need(tmp_path: Path) -> None:
-    """Who looks for a load encoder, or for 60C1h in another EDS, looks in vain if the drive lacks the mode."""
+    """A load encoder, or an EDS with 60C1h, does not help a drive that lacks the mode."""
     eds = stating(without(OWN, 0x60E4, 0x60C1), "6502", DefaultValue="0x25")
     for mode in ("csp", "ip"):
         with pytest.raises(InputError, match=rf"drive\.mode: {mode} is not among the modes"):

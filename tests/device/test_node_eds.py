@@ -151,6 +151,31 @@ def test_what_the_eds_lacks_is_not_on_the_bus_and_the_drive_works_without_it(ben
         assert master.state == "disabled"
 
 
+def test_a_period_of_zero_is_that_of_sync(bench, motor):
+    """As Elmo's SimplIQ drives describe 60C2h."""
+    with bench(
+        (r"(\[60C2sub1\][^[]*?)DefaultValue=.*\n(?:LowLimit=.*\n)?", r"\g<1>DefaultValue=0\n")
+    ) as master:
+        assert master.read(0x60C2, 1) == 0
+        master.wait(0.05)
+        master.enable_csp()
+        target = master.cruise(40, 25)
+        master.cycle(0x0F, target)
+        assert motor.motor_counts == target
+
+
+def test_a_vendors_own_object_may_have_the_number_of_one_of_the_simulated_drives(bench, motor):
+    with bench(
+        (r"(\[2000\][^[]*DataType=)0x0009(\n[^[]*DefaultValue=).*", r"\g<1>0x0005\g<2>7"),
+        (r"(\[2100\][^[]*DataType=)0x0003", r"\g<1>0x0009"),
+        (r"(\[2101\][^[]*DataType=)0x\w+", r"\g<1>0x0006"),
+    ) as master:
+        motor.load_torque_nm = 3.0
+        assert master.read(0x2000) == 7
+        assert master.read(0x2101) == 0
+        assert master.request(b"\x40\x00\x21\x00" + bytes(4))[0] >> 5 == 2
+
+
 def test_an_object_removed_from_a_drive_is_gone(master):
     master.node.dictionary.remove(0x6085, 0)
     assert master.abort_of_read(0x6085) == NO_OBJECT
