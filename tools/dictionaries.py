@@ -69,19 +69,20 @@ def main() -> None:
     files = sorted(each for each in folder.rglob("*") if each.suffix.lower() in (".eds", ".dcf"))
     if not files:
         sys.exit(f"{folder}: has no EDS or DCF file")
-    with ThreadPoolExecutor(2) as pool:
-        checked = list(pool.map(lambda each: check(folder, each), files))
+    with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(2) as pool:
+        article = Path(scratch) / "article"
+        hdbridge("new", str(article), "--from", "article")
+        checked = list(pool.map(lambda each: check(folder, each, article), files))
     checked.sort(key=lambda each: (name(each).lower(), str(each.source)))
     print_drives(checked)
     print_left(checked)
 
 
-def check(folder: Path, file: Path) -> Checked:
-    """Check one dictionary in each mode."""
+def check(folder: Path, file: Path, article: Path) -> Checked:
+    """Check one dictionary in each mode, in a copy of the article's profile."""
     found = Checked(file.relative_to(folder), decode(file.read_bytes()))
     with tempfile.TemporaryDirectory() as scratch:
-        profile = Path(scratch) / "axis"
-        hdbridge("new", str(profile), "--from", "article")
+        profile = Path(shutil.copytree(article, Path(scratch) / "axis"))
         shutil.copy(file, profile)
         axis = (profile / "axis.yaml").read_text()
         for mode in MODES:
@@ -137,9 +138,9 @@ def short(reason: str, file: str) -> str:
 
 
 def name(found: Checked) -> str:
-    """Vendor and product as the file gives them, else its description."""
+    """Vendor and product as the file gives them."""
     names = (found.key("DeviceInfo", "VendorName"), found.key("DeviceInfo", "ProductName"))
-    return ", ".join(filter(None, names)) or found.key("FileInfo", "Description") or "(not given)"
+    return ", ".join(filter(None, names)) or "(not given)"
 
 
 def print_drives(checked: list[Checked]) -> None:
