@@ -455,7 +455,7 @@ def test_diagnose_takes_a_profile_and_says_how_to_get_a_model(folder: Path) -> N
         )
         assert result.exit_code == 0
     neither = CliRunner().invoke(app, ["diagnose", str(record), "--model", str(folder / "absent")])
-    assert "no such model file, and no profile" in str(neither.exception)
+    assert "no such model file, and no such profile" in str(neither.exception)
 
 
 @pytest.mark.parametrize("compressed", [False, True], ids=["plain", "gzip"])
