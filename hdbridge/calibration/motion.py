@@ -16,7 +16,17 @@ from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
-from hdbridge.estimation.response import STOP, Harmonics, Limits, Trial, agree, gain, harmonics, response_of
+from hdbridge.estimation.response import (
+    STOP,
+    Harmonics,
+    Limits,
+    Trial,
+    agree,
+    gain,
+    harmonics,
+    order_hz,
+    response_of,
+)
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
 from hdbridge.procedures.even_speed import EvenSpeed
@@ -48,6 +58,16 @@ class Ripple:
     """Motor orders that the filter does not correct at this speed, because they are too fast."""
 
     @property
+    def in_force_arcsec(self) -> float | None:
+        """Ripple with the filtered correction, or with that of rest if there is no filter."""
+        return self.static_arcsec if self.filtered_arcsec is None else self.filtered_arcsec
+
+    @property
+    def removed_in_force_percent(self) -> float | None:
+        """Share of the ripple that the correction in force removes."""
+        return _removed(self.none_arcsec, self.in_force_arcsec)
+
+    @property
     def removed_percent(self) -> float | None:
         """Share of the ripple that the filtered correction removes."""
         return _removed(self.none_arcsec, self.filtered_arcsec)
@@ -64,7 +84,7 @@ class MotionTest:
 
     ripples: tuple[Ripple, ...]
     response: Response | None
-    """Of the filtered correction; None if there is none that helps."""
+    """Response with the filter of the correction; None if no filter helps."""
     remarks: tuple[str, ...] = ()
 
     @property
@@ -72,8 +92,7 @@ class MotionTest:
         """Highest speed up to which the correction in force removes half of the ripple at least."""
         reached = None
         for each in sorted(self.ripples, key=lambda one: one.speed_deg_s):
-            removed = each.removed_percent
-            removed = each.removed_static_percent if removed is None else removed
+            removed = each.removed_in_force_percent
             if removed is None or removed < 50.0:
                 break
             reached = each.speed_deg_s
@@ -83,7 +102,7 @@ class MotionTest:
     def summary(self) -> str:
         """Ripple at the highest speed, without and with the correction in force, in words."""
         fastest = max(self.ripples, key=lambda each: each.speed_deg_s)
-        after = fastest.static_arcsec if fastest.filtered_arcsec is None else fastest.filtered_arcsec
+        after = fastest.in_force_arcsec
         left = "" if after is None else f" to {after:.2f}"
         return f"ripple at {fastest.speed_deg_s:g} deg/s {fastest.none_arcsec:.2f}{left} arcsec"
 
@@ -180,8 +199,7 @@ def motion_test(
     if not measure:
         return _tested(runner, model, none, static, limits)
     trials = [Trial(static)]
-    ripples = tuple(_ripples(runner, none, static, None, None))
-    highest, best = math.inf, MotionTest(ripples, None)
+    highest, best = math.inf, MotionTest(_ripples(runner, none, static), None)
     for _ in range(TRIALS):
         response = response_of(
             none, trials, runner.orders, model.ratio, axis.drive.cycle_s, limits, highest_hz=highest
@@ -189,7 +207,7 @@ def motion_test(
         if response is None:
             break
         filtered = runner.run("filtered correction", replace(model, response=response))
-        found = MotionTest(tuple(_ripples(runner, none, static, filtered, response)), response)
+        found = MotionTest(_ripples(runner, none, static, filtered, response), response)
         if found.harms_at:
             # The cause is not known, but it lies within the range of the filter.
             highest = 0.7 * response.known_to_hz
@@ -216,13 +234,13 @@ def _tested(
     """The test of the model's own response, which says if the servo does not answer so any more."""
     stored = model.response
     if stored is None:
-        return MotionTest(tuple(_ripples(runner, none, static, None, None)), None)
+        return MotionTest(_ripples(runner, none, static), None)
     filtered = runner.run("filtered correction", model)
     found = response_of(none, [Trial(static)], runner.orders, model.ratio, runner.cycle_s, limits)
     remarks: tuple[str, ...] = ()
     if found is not None and not agree(stored, found):
         remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms),)
-    return MotionTest(tuple(_ripples(runner, none, static, filtered, stored)), stored, remarks)
+    return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
 
 
 class _Runner:
@@ -270,17 +288,19 @@ def _ripples(
     runner: _Runner,
     none: tuple[Harmonics, ...],
     static: tuple[Harmonics, ...],
-    filtered: tuple[Harmonics, ...] | None,
-    response: Response | None,
-) -> Iterator[Ripple]:
-    for speed in sorted({abs(each.speed_deg_s) for each in none}):
-        yield Ripple(
+    filtered: tuple[Harmonics, ...] | None = None,
+    response: Response | None = None,
+) -> tuple[Ripple, ...]:
+    return tuple(
+        Ripple(
             speed,
             _both_ways(none, speed),
             _both_ways(static, speed),
             _both_ways(filtered, speed) if filtered else None,
             tuple(faded_orders(response, runner.orders, speed, runner.ratio)) if response else (),
         )
+        for speed in sorted({abs(each.speed_deg_s) for each in none})
+    )
 
 
 def faded_orders(
@@ -289,7 +309,7 @@ def faded_orders(
     """Motor orders that the filter does not correct at a speed."""
     cycle_s = response.cycle_ms / 1000.0
     for order in orders:
-        hertz = order * speed_deg_s * ratio / 360.0
+        hertz = float(order_hz(order, speed_deg_s, ratio))
         wanted = 1.0 / float(np.interp(hertz, response.frequency_hz, response.gain))
         given = abs(gain(response.filter, np.array([hertz]), cycle_s)[0])
         if hertz > STOP / cycle_s or given < FADED * wanted:

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hdbridge.errors import InputError
 from hdbridge.model.response import LeadFilter, Response
 from hdbridge.procedures.even_speed import EvenRun
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
@@ -99,6 +99,11 @@ class Harmonics(NamedTuple):
     """Rms about a straight line."""
 
 
+def order_hz(order: ArrayLike, speed_deg_s: float, ratio: float) -> FloatArray:
+    """Frequency of a motor order at a load speed, Hz, shape of ``order``."""
+    return np.asarray(order) * (abs(speed_deg_s) * ratio / DEG_PER_TURN)
+
+
 def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
     """Orders of the load error over the uncompensated motor target; InputError if the run is too short."""
     if len(run.samples) < 4 * (2 * len(orders) + 2):
@@ -172,7 +177,7 @@ def response_of(
     if not kept:
         return None
     known_hz = kept[-1].frequency_hz
-    fastest = max(abs(each.speed_deg_s) for each in none) * ratio / 360.0 * max(orders)
+    fastest = float(order_hz(max(orders), max(abs(each.speed_deg_s) for each in none), ratio))
     return Response(
         cycle_ms=1000.0 * cycle_s,
         following_lag_ms=round(1000.0 * lag_s, 3),
@@ -197,7 +202,7 @@ def _found(
     found: list[_Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
-            hertz = np.array(orders) * abs(before.speed_deg_s) * ratio / 360.0
+            hertz = order_hz(orders, before.speed_deg_s, ratio)
             applied = np.ones(len(orders)) if trial.filter is None else gain(trial.filter, hertz, cycle_s)
             error, effect = before.amplitudes, before.amplitudes - after.amplitudes
             if before.speed_deg_s < 0.0:  # the angle runs against the time

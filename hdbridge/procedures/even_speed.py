@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from hdbridge.errors import InputError
 from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Steps
+from hdbridge.units import DEG_PER_TURN
 
 SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
 """Speeds of the default test, as shares of the limit. At the limit a drive cuts the correction off."""
@@ -45,7 +46,7 @@ class EvenSpeed:
         travel_deg = limits.position_max_deg - limits.position_min_deg
         while cls((fastest,)).travel_deg(axis, fastest) > 0.98 * travel_deg:
             fastest *= 0.95
-            if TURNS * 360.0 / axis.ratio > 0.98 * travel_deg:
+            if TURNS * DEG_PER_TURN / axis.ratio > 0.98 * travel_deg:
                 raise InputError(
                     f"the travel of {travel_deg:g} deg is too short for a run of {TURNS:g} motor turns at "
                     "constant speed: widen position_min_deg and position_max_deg in the axis file"
@@ -56,7 +57,7 @@ class EvenSpeed:
         """Travel of one run with its ramps."""
         limits = axis.limits
         ramp_s = speed_deg_s / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
-        even_deg = max(self.window_s * speed_deg_s, TURNS * 360.0 / axis.ratio)
+        even_deg = max(self.window_s * speed_deg_s, TURNS * DEG_PER_TURN / axis.ratio)
         return even_deg + speed_deg_s * (TRANSIENT_S + ramp_s)
 
     def moves(self, axis: AxisView) -> Steps[tuple[EvenRun, ...]]:

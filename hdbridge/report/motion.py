@@ -37,10 +37,9 @@ def motion_sections(result: MotionTest) -> list[Section]:
 
 def _verdict(result: MotionTest) -> str:
     fastest = result.ripples[-1]
-    removed = fastest.removed_percent
-    removed = fastest.removed_static_percent if removed is None else removed
     text = (
-        f"At {fastest.speed_deg_s:g} deg/s the compensation removes {removed or 0.0:.0f} % of the ripple of "
+        f"At {fastest.speed_deg_s:g} deg/s the compensation removes "
+        f"{fastest.removed_in_force_percent or 0.0:.0f} % of the ripple of "
         f"{fastest.none_arcsec:.1f} arcsec."
     )
     return " ".join([text, *(f"{line[0].upper()}{line[1:]}." for line in result.remarks)])
