@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -20,6 +19,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
+    compensating_model,
     console,
     load_axis,
     notes,
@@ -74,11 +74,7 @@ def motion(
 
     files = Profile.find(profile)
     axis = load_axis(files, interface, channel, simulate=simulate)
-    chosen: Path = model or files.model
-    if model is None and not chosen.exists():
-        raise InputError(
-            f"{chosen}: there is no model to compensate with; calibrate first: hdbridge calibrate {profile}"
-        )
+    chosen = compensating_model(files, profile, model)
     if propose and not measure:
         raise InputError("--propose needs a measured response: leave --no-measure out")
     used = TransmissionModel.load(chosen)

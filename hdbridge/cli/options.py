@@ -162,6 +162,19 @@ def model_file(text: str) -> Path:
     return files.model
 
 
+def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
+    """Model file to compensate with: the one given, else the profile's; InputError if that has none.
+
+    ``otherwise`` is what can be done without a model.
+    """
+    if model is None and not files.model.exists():
+        raise InputError(
+            f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
+            f"{profile}{otherwise}"
+        )
+    return model or files.model
+
+
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
     """Refuse a simulated drive on a bus that is named: it would not be used."""
     if simulate and (interface is not None or channel is not None):

@@ -21,6 +21,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
+    compensating_model,
     console,
     load_axis,
     notes,
@@ -90,14 +91,9 @@ def step(
     axis = load_axis(files, interface, channel, simulate=simulate)
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
-    chosen: Path | None = model or files.model
-    if scheme and set(scheme) == {Scheme.NONE} and model is None:
-        chosen = None  # what compensates nothing needs no model
-    elif model is None and not files.model.exists():
-        raise InputError(
-            f"{files.model}: there is no model to compensate with; calibrate first: hdbridge calibrate "
-            f"{profile}, or step without one: --scheme none"
-        )
+    chosen: Path | None = None
+    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # compensating nothing needs no model
+        chosen = compensating_model(files, profile, model, ", or step without one: --scheme none")
 
     def tell(comparison: Comparison) -> None:
         write_json(json_file, comparison.as_dict())
