@@ -33,7 +33,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -110,20 +110,10 @@ def read(text: str) -> Page:
         elif block["kind"] == "console":
             page.commands += _session(number, lines, exact)
         elif "output" in notes:
-            last = page.commands[-1]
-            page.commands[-1] = Command(
-                last.line,
-                last.shell,
-                tuple(lines),
-                tuple(range(number, number + len(lines))),
-                last.status,
-                exact,
-            )
+            at = tuple(range(number, number + len(lines)))
+            page.commands[-1] = replace(page.commands[-1], shown=tuple(lines), at=at, exact=exact)
         if "exit status" in notes:
-            last = page.commands[-1]
-            page.commands[-1] = Command(
-                last.line, last.shell, last.shown, last.at, int(notes["exit status"]), exact
-            )
+            page.commands[-1] = replace(page.commands[-1], status=int(notes["exit status"]), exact=exact)
     return page
 
 
