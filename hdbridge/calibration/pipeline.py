@@ -56,7 +56,7 @@ def calibrate(
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
     if active and active.response and active.response.fits_cycle(axis.drive.cycle_s):
-        # The gear was measured anew, the servo was not.
+        # This calibration measured the gear again, but not the servo.
         result = replace(result, model=replace(result.model, response=active.response))
     if not result.fit.held_out.improves:
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))

@@ -150,7 +150,7 @@ class _Bus:
         self._boots = {objects.COB_HEARTBEAT + each for each in self._nodes}
         self._asked: dict[int, tuple[int, int, int]] = {}
         self._held: dict[tuple[int, int, int], int] = {}
-        """What the SDO traffic says of the objects, by node, index and sub-index."""
+        """Values of objects from the SDO traffic, by node, index and sub-index."""
         self._image: ProcessImage | None = None
         self._needed: frozenset[int] = frozenset()
         """Identifiers of the PDOs that carry the encoders."""

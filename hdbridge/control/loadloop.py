@@ -136,7 +136,7 @@ class LoadLoop:
         """Averages when the axis came to rest; during a doubt about the encoder, those before it."""
         self._doubt = ""
         self._beyond = False
-        """Whether the doubt is about the size of the error, not about the encoder."""
+        """True if the doubt is about the size of the error and not about the encoder."""
         self._jumped = self._jumped_most = self._off = 0.0
         """During a doubt about the encoder: sum of its moves at rest, the greatest sum, and the greatest
         disagreement.

@@ -40,7 +40,7 @@ _PACKAGES: Final = {
 """What python-can does not install by itself: module and package."""
 _NETWORK: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = 280
-"""Of linux/if_arp.h: the type of a CAN interface."""
+"""ARPHRD_CAN of linux/if_arp.h, the type of a CAN interface."""
 _PROCESS: Final = uuid.uuid4().hex[:12]
 _ERROR_FRAME_BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a SocketCAN error frame."""

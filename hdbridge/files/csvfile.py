@@ -42,7 +42,7 @@ _PIECE_BYTES = 1 << 20
 _SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _HEAD_BYTES = 1 << 16
 _HEAD_ROWS = 100
-"""The header is looked for among so many rows."""
+"""Number of rows in which the header is searched."""
 _SAMPLED = 20
 """Rows of data that are looked at for decimal commas."""
 _COMMENT = re.compile(rb"(?:^|(?<=[\r\n]))([ \t]*(?:#|%|//)[ \t]*)([^\r\n]*)")

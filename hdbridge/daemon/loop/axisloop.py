@@ -60,7 +60,7 @@ class AxisLoop:
         self._sampler = AxisSampler(self.cycle, self.follower)
         self._changing = self._underrun = False
         self._doubt = ""
-        """What was told last of the change of the compensation, of the stream, and of the load loop."""
+        """Last states reported of the change of compensation, the stream and the load loop."""
         self._enable_id = self._disable_id = self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False

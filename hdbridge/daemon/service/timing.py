@@ -90,7 +90,7 @@ class SimulatedClock:
 
 
 class RealTiming:
-    """A clock that passes by itself, and a pool of threads. Close it when the service ends."""
+    """A clock that runs without being stepped, and a pool of threads. Close it when the service ends."""
 
     def __init__(self, threads: int, clock: Clock | None = None) -> None:
         """So many blocking things can be under way at a time; further ones wait.

@@ -143,7 +143,7 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
 
 
 def _who(request: Request, name: str) -> str:
-    """Who asks: the name that it gives, and its user and process, which the kernel knows of a Unix socket."""
+    """Name that a client gives, with its user and process, which the kernel reports on a Unix socket."""
     peer, number = request.client or ("a client", 0)
     if not peer.startswith("uid="):
         return name or f"{peer}:{number}"
