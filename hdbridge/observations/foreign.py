@@ -117,9 +117,9 @@ def _check_wrapped(path: Path, record: Record) -> None:
     motor, load, target = record.motor_position_deg, record.load_position_deg, record.motor_target_deg
     found: dict[str, Wraps] = {}
     for channel, angle, other in (("load", load, motor), ("motor", motor, load)):
-        if wraps := find_wraps(angle, other):
+        if wraps := find_wraps(angle, other, record.starts):
             found[channel] = wraps
-    if target is not None and (wraps := find_wraps(target, load)):
+    if target is not None and (wraps := find_wraps(target, load, record.starts)):
         apart, left = (np.std(each - motor) for each in (target, unwrapped(target, wraps.period_deg)))
         if "motor" in found or left < FOLLOWS_SHARE * apart:
             found["target"] = wraps

@@ -7,6 +7,7 @@ Its size is constant: a misread sample is off by anything, and the next one is b
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ CONSTANT_SHARE: Final = 0.05
 NOMINAL_SHARE: Final = 0.02
 """Maximum deviation of a jump from the period of a counter, as a share."""
 LEAST_TIMES: Final = 3.0
-"""A jump is so many times as large as any other change of a step."""
+"""Minimum ratio of a jump to any other difference between the steps of the two angles."""
 SAME_SHARE: Final = 0.3
 """The other angle has jumped as well if it leaves no more than this share of the jump unexplained."""
 THERE_AND_BACK: Final = 2
@@ -48,15 +49,18 @@ class Wraps(NamedTuple):
     """How far the sizes may be off."""
 
 
-def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
-    """Where an angle jumps by a constant and the other angle of the axis does not, each of shape (n,).
+def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
+    """The jumps of an angle by a constant that the other angle of the axis does not make, each of shape (n,).
 
-    None if it does not. A single jump counts if it is a whole number of turns, or a power of two of counts.
+    None if there are none. A single jump counts if it is a whole number of turns or a power of two of counts.
+    A step to the first sample of a record (`starts`) is not a step of the axis.
     """
     if len(angle_deg) < 2 * WINDOW:
         return None
     step, other = np.diff(angle_deg), np.diff(other_deg)
-    excess = step - median_filter(step, WINDOW, mode="nearest")
+    between = [start - 1 for start in starts if 0 < start < len(angle_deg)]
+    step[between] = other[between] = 0.0
+    excess = step - median_filter(step, WINDOW, mode="mirror")
     slip = step - _slope(step, other) * other
     alone = np.abs(slip - excess) <= SAME_SHARE * np.abs(excess)
     size = np.where(alone, np.abs(excess), 0.0)
@@ -70,7 +74,7 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray) -> Wraps | None:
     if np.all(np.abs(sizes / turns - DEG_PER_TURN) < CONSTANT_SHARE * DEG_PER_TURN):
         sizes = sizes / turns
     period = float(np.mean(sizes))
-    calm = float(np.max(np.delete(size, large), initial=0.0))
+    calm = float(np.max(np.abs(np.delete(slip, large)), initial=0.0))
     if np.any(np.abs(sizes - period) > CONSTANT_SHARE * period) or LEAST_TIMES * calm > period:
         return None
     # An angle wraps at the same place each time, where the gear's error is the same: no mean reduces it.

@@ -355,6 +355,33 @@ def test_a_single_jump_that_is_no_period_is_no_counter(jump_deg: float) -> None:
     assert find_wraps(slipped, slow / RATIO) is None
 
 
+@pytest.mark.parametrize("scatter_deg", [0.3, 0.6])
+def test_steps_that_differ_by_jitter_are_not_a_counter(scatter_deg: float) -> None:
+    """Fast motion at 10 Hz: the two angles are sampled at different times, and two of the slips are equal."""
+    random = np.random.default_rng(5)
+    motor = np.cumsum(np.full(COUNT, -13.0) + random.normal(0.0, 0.5, COUNT))
+    load = (motor + random.normal(0.0, scatter_deg, COUNT)) / RATIO
+    motor[np.arange(COUNT) >= COUNT // 3] += 4.0 * scatter_deg
+    motor[np.arange(COUNT) >= 2 * COUNT // 3] -= 4.0 * scatter_deg
+    assert find_wraps(motor, load) is None
+
+
+@given(
+    zeros_deg=st.lists(st.floats(-500.0, 500.0), min_size=2, max_size=5),
+    wrapped=st.booleans(),
+)
+def test_zeros_that_differ_between_records_neither_make_nor_hide_a_wrap(
+    zeros_deg: list[float], wrapped: bool
+) -> None:
+    angle = np.linspace(0.0, 500.0, 100)
+    motor = np.concatenate([(angle + 180.0) % 360.0 - 180.0 if wrapped else angle for _ in zeros_deg])
+    load = np.concatenate([angle / RATIO + zero for zero in zeros_deg])
+    found = find_wraps(motor, load, tuple(range(0, len(motor), 100)))
+    assert (found is not None) == wrapped
+    if found is not None:
+        assert len(found.rows) == len(zeros_deg)
+
+
 def test_a_clock_that_wraps_is_named_with_its_period(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     path.write_text(text(time=(TIME * 1000.0 + 65_000.0) % 65_536.0))
