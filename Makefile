@@ -7,7 +7,7 @@ PROCESSORS := $(shell nproc 2>/dev/null || echo 2)
 # The tests begin hundreds of processes: without bytecode on disk, each compiles the package anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow blind bench-realtime docs clean
+.PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow coverage blind bench-realtime docs dist clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -94,6 +94,24 @@ $(VENV)/.docs: $(READY)
 docs: $(VENV)/.docs  ## the guides and the API reference as a site with search, into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "open build/site/index.html"
+
+$(VENV)/.release: $(READY)
+	$(PIP) --editable '.[release]'
+	@touch $@
+
+coverage: $(VENV)/.release compiled  ## lines and branches that the tests on the virtual bus reach, into build/coverage
+	$(UNIT) -m "not slow" -p pytest_cov --cov hdbridge --cov-branch --cov-report term:skip-covered \
+		--cov-report html:build/coverage
+
+# The wheel is tried in an environment that has nothing else; what is installed there is its bill of materials.
+dist: $(VENV)/.release  ## wheel, sdist and bill of materials (CycloneDX) into dist, the wheel tried in an empty environment
+	rm -rf dist build/dist
+	$(BIN)/python -m build --quiet --outdir dist .
+	$(PYTHON) -m venv build/dist
+	build/dist/bin/python -m pip install --quiet --disable-pip-version-check "$$(ls $(CURDIR)/dist/*.whl)[daemon]"
+	cd build/dist && bin/hdbridge new axis --from article && bin/hdbridge step axis --simulate --count 4
+	$(BIN)/cyclonedx-py environment --output-format JSON --output-file dist/hdbridge.cdx.json build/dist/bin/python
+	@ls dist
 
 clean:           ## remove the environment and what the commands made
 	rm -rf $(VENV) demo-output demo-output-[0-9]* dist build
