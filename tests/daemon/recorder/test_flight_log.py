@@ -92,11 +92,12 @@ def test_files_are_cut_by_size(tmp_path):
     assert max(sizes) < 0.4e6
 
 
-def test_the_ring_keeps_to_its_size_and_the_oldest_goes(tmp_path):
-    log, clock = flight_log(tmp_path, file_mb=0.1, size_mb=1.0)
-    run(log, clock, 40)
-    files = list(tmp_path.glob("*.mcap*"))
-    assert sum(each.stat().st_size for each in files) <= 1.0e6
+@pytest.mark.parametrize("file_mb", [0.1, 0.6])
+def test_the_ring_keeps_to_its_size_at_all_times_and_the_oldest_goes(tmp_path, file_mb):
+    log, clock = flight_log(tmp_path, file_mb=file_mb, size_mb=1.0)
+    for second in range(40):
+        run(log, clock, 1, first=second)
+        assert sum(each.stat().st_size for each in tmp_path.glob("*.mcap*")) <= 1.0e6
     log.close()
     newest = read(max(tmp_path.glob("*.mcap")))
     assert newest.machine["cycle"][-1] == 40 * SECOND
