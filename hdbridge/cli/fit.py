@@ -55,11 +55,11 @@ def command(
     `motor_target_deg` helps. Nothing is activated: a fit that shall be used goes to a profile by --out.
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
+    from hdbridge.analysis.checks import check_once
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import fit
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
     from hdbridge.model import TransmissionModel
-    from hdbridge.observations.foreign import check_once
     from hdbridge.records.recording import Recording
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None

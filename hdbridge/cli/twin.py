@@ -226,8 +226,8 @@ def _check(
 
 def _loaded(files: Profile, recordings: list[Path]) -> tuple[AxisConfig, Recording]:
     """The axis and all recordings as one; InputError where they are not of one axis, or have no command."""
+    from hdbridge.analysis.checks import check_once
     from hdbridge.axis import AxisConfig
-    from hdbridge.observations.foreign import check_once
     from hdbridge.records.recording import Recording
 
     axis = AxisConfig.load(files.axis)
