@@ -78,8 +78,7 @@ class Backlash(Linear):
     @classmethod
     def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
         """A gap that takes ``softness`` times its ideal motor angle; from 1.25 on it has an inverse."""
-        crossing = max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
-        return cls(gap_arcsec=gap_arcsec, crossing_deg=crossing)
+        return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
@@ -95,8 +94,8 @@ class Backlash(Linear):
 
         The load rests while the motor crosses; noise lets a fit make that angle smaller than it can be.
         """
-        gentlest = self.of_gap(self.gap_arcsec, ratio)
-        return gentlest if gentlest.crossing_deg > self.crossing_deg else self
+        crossing = _crossing_deg(self.gap_arcsec, ratio)
+        return self.fitted(self.coefficients(), {"crossing_deg": max(crossing, self.crossing_deg)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """A gap of one arcsec, shape (n, 1)."""
@@ -123,6 +122,11 @@ class Backlash(Linear):
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
         """A gap of 10 arcsec."""
         return cls.of_gap(10.0, ratio)
+
+
+def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> float:
+    """Motor angle that crosses a gap, ``softness`` times that of an ideal one, degrees."""
+    return max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
 
 
 class _Tracker(Tracker):

@@ -201,6 +201,14 @@ def test_violations_tell_of_parameters_that_a_fit_drove_out_of_bounds(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("factor", [-1e3, 1e3, 1e6])
+def test_tidying_what_a_fit_drove_out_of_bounds_leaves_its_violations(name, factor):
+    candidate = CATALOGUE[name].candidate(50.0)
+    effect = candidate.fitted(factor * candidate.coefficients())
+    assert bool(effect.tidied(50.0).violations()) >= bool(effect.violations())
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_effect_is_told_in_full(name):
     kind = CATALOGUE[name]
     about = kind.about
