@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdbridge.estimation.linear import solve_symmetric
+from hdbridge.analysis.linear import solve_symmetric
 
 
 def test_columns_of_nothing_beside_columns_that_are_alike_stay_at_zero() -> None:

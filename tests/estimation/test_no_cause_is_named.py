@@ -11,7 +11,7 @@ import pytest
 import hdbridge
 from hdbridge.effects import CATALOGUE
 
-ROOMS = ("estimation", "identify", "diagnose")
+ROOMS = ("analysis",)
 FILES = sorted(path for room in ROOMS for path in (Path(hdbridge.__path__[0]) / room).glob("*.py"))
 CLASSES = {kind.__name__ for kind in CATALOGUE.values()} | {
     base.__name__

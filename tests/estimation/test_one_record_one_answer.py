@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from support import plant
 
+from hdbridge.analysis import prepared
+from hdbridge.analysis.blocks import Blocks, Design, make_blocks
+from hdbridge.analysis.hypothesis import Estimator, Hypothesis
+from hdbridge.analysis.identification import usable_samples
+from hdbridge.analysis.linear import Effort, Terms
+from hdbridge.analysis.noise import NoiseModel, Precision
+from hdbridge.analysis.nuisances import nuisances_of
+from hdbridge.analysis.separable import Separable
 from hdbridge.effects import Channel, Effect, FloatArray, Hysteresis, Start, Synchronous
 from hdbridge.effects.orders import MotorOrder
-from hdbridge.estimation import observed, samples
-from hdbridge.estimation.blocks import Blocks, make_blocks
-from hdbridge.estimation.design import Design
-from hdbridge.estimation.hypothesis import Estimator, Hypothesis
-from hdbridge.estimation.noise import NoiseModel, Precision
-from hdbridge.estimation.nuisances import nuisances_of
-from hdbridge.estimation.separable import Separable
-from hdbridge.estimation.terms import Effort, Terms
-from hdbridge.identify.usable import usable_samples
 from hdbridge.records.record import Record
 
 RATIO = plant.RATIO
@@ -36,8 +35,8 @@ GIVEN: tuple[Effect, ...] = (
 
 
 class Seen(NamedTuple):
-    calibration: samples.Samples
-    diagnosis: observed.Observed
+    calibration: prepared.Samples
+    diagnosis: prepared.Observed
 
 
 @pytest.fixture(scope="module", params=["with the command", "without"])
@@ -46,8 +45,8 @@ def seen(request: pytest.FixtureRequest) -> Seen:
     columns = plant.record(plant.Truth(), plant.Plan(scale=0.4), 5, command=commanded)
     record = Record(columns)
     none = np.zeros(len(record), dtype=np.intp)
-    calibration = usable_samples(samples.Measured(record, ("sweep",), none, none), RATIO, slow_deg_s=1e9)
-    return Seen(calibration, observed.gather(record, RATIO))
+    calibration = usable_samples(prepared.Measured(record, ("sweep",), none, none), RATIO, slow_deg_s=1e9)
+    return Seen(calibration, prepared.gather(record, RATIO))
 
 
 def test_both_are_driven_by_the_same_angle_at_the_same_speed(seen: Seen) -> None:

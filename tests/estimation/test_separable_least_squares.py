@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from hdbridge.analysis.linear import FREE, Nuisances, Prior, Terms
+from hdbridge.analysis.noise import White
+from hdbridge.analysis.separable import Separable
 from hdbridge.effects import (
     Creep,
     DirectionPhase,
@@ -20,9 +23,6 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.creep import Relaxation
 from hdbridge.effects.orders import MotorOrder
-from hdbridge.estimation.noise import White
-from hdbridge.estimation.separable import Separable
-from hdbridge.estimation.terms import FREE, Nuisances, Prior, Terms
 
 TIME_S = np.arange(0.0, 120.0, 0.05)
 MOTION = Motion(400.0 * np.sin(0.11 * TIME_S) + 60.0 * np.sin(0.9 * TIME_S), TIME_S)

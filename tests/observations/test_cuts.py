@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hdbridge.analysis.cuts import observed
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.calibration import identify
-from hdbridge.diagnose import diagnose
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.cuts import observed
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.observations.kinematics import kinematics
-from hdbridge.observations.reading import reading_of
-from hdbridge.observations.reversals import reversals
+from hdbridge.analysis.driving import kinematics, reversals
+from hdbridge.analysis.readings import reading_of
 
 COUNTS = [8000, 2**14, 2**17, 2**20]
 
