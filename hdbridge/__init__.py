@@ -13,12 +13,12 @@ from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import fit
     from hdbridge.client import AsyncClient, Client
     from hdbridge.control.bench import Bench
     from hdbridge.control.compensation import Compensation, Inverse
-    from hdbridge.diagnose import diagnose
     from hdbridge.drive import Drive, open_bus
     from hdbridge.errors import (
         BusError,
@@ -90,7 +90,7 @@ _MODULES: Final = MappingProxyType(
         "Stepping": "procedures.stepping",
         "Trajectory": "procedures.trajectory",
         "TransmissionModel": "model",
-        "diagnose": "diagnose",
+        "diagnose": "analysis.diagnosis",
         "fit": "calibration",
         "open_bus": "drive",
         "simulated": "simulated",
@@ -112,7 +112,7 @@ def __dir__() -> list[str]:
 
 
 class _FrontDoor(ModuleType):
-    """Keeps `hdbridge.diagnose` the function: importing the folder of that name would put it there."""
+    """Keeps `hdbridge.simulated` the function: importing the module of that name would put it there."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (isinstance(value, ModuleType) and name in __all__):

@@ -30,8 +30,8 @@ from support import plant
 from support.trials import CAUSES, LOOPS, drawn, times
 from whatif import WhatIf
 
-from hdbridge.diagnose import diagnose
-from hdbridge.estimation.scales import Scales
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

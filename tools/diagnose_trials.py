@@ -15,7 +15,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.trials import CAUSES, NONE, PAIRS, SPECIAL, UNKNOWN, planted, verdict
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 
 
 def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], float, dict[str, object]]:

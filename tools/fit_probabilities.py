@@ -3,7 +3,7 @@
 
 Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
 formulas of tests/support/plant.py, N seeds of each cause. Each finding gives the terms of the formula
-(hdbridge/diagnose/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
+(hdbridge/analysis/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
 every term with the sign that it must have; how well it fares is told by cross-validation that leaves whole
 records out. The table that is kept is read again where it is there. Prints the coefficients for
 `Scales`.
@@ -27,9 +27,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from blind.case import record_of, unsealed
 from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
 
-from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.diagnose.probability import coefficients
-from hdbridge.estimation.scales import Scales
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.probability import coefficients
+from hdbridge.analysis.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording
 

@@ -23,9 +23,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from identify_records import draw, plan, record, recording
 
+from hdbridge.analysis.identification import FitOptions
+from hdbridge.analysis.identify import fit
 from hdbridge.calibration import measured_of
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, fit
 
 TOLERANCE = {"offset_arcsec": 0.01, "width_deg": 0.04}
 

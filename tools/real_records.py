@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.driving import CHATTER_COUNTS, steadied
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.readings import reading_of
 from hdbridge.axis import AxisConfig
-from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.kinematics import CHATTER_COUNTS
-from hdbridge.observations.reading import reading_of
-from hdbridge.observations.reversals import steadied
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from hdbridge.analysis.checks import check_once, check_records
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.pipeline import conclude
 from hdbridge.calibration.result import Calibration
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.foreign import check_once, check_records
 from hdbridge.records.given import Given, agreed_ratio, by_name
 
 

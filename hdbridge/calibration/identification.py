@@ -1,4 +1,4 @@
-"""From a recording, of the bench or anybody's, to what `hdbridge.identify` is given, and what it gives."""
+"""Joins recordings into one measurement and identifies the axis from it (`hdbridge.analysis.identify`)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hdbridge.analysis.cuts import jumps, observed
+from hdbridge.analysis.identification import FitOptions, FitResult
+from hdbridge.analysis.identify import fit
+from hdbridge.analysis.linear import counted
+from hdbridge.analysis.prepared import Measured
 from hdbridge.calibration.journal import tasks_of
 from hdbridge.effects import FloatArray, IntArray, Start
 from hdbridge.errors import InputError
-from hdbridge.estimation.samples import Measured
-from hdbridge.estimation.stretches import counted
-from hdbridge.identify import FitOptions, FitResult, fit
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.cuts import jumps, observed
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, versions_here
 

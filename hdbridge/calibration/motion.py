@@ -9,14 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.axis import AxisConfig
-from hdbridge.calibration.measure import Pace
-from hdbridge.control.bench import axis_view, compensation_for
-from hdbridge.control.rig import Rig, bench_on
-from hdbridge.drive.drive import Drive
-from hdbridge.effects.orders import MotorOrder, OrderSeries
-from hdbridge.errors import InputError
-from hdbridge.estimation.response import (
+from hdbridge.analysis.response import (
     STOP,
     Harmonics,
     Limits,
@@ -27,6 +20,13 @@ from hdbridge.estimation.response import (
     order_hz,
     response_of,
 )
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration.measure import Pace
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.rig import Rig, bench_on
+from hdbridge.drive.drive import Drive
+from hdbridge.effects.orders import MotorOrder, OrderSeries
+from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
 from hdbridge.procedures.even_speed import EvenSpeed

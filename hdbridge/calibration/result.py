@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hdbridge.analysis.identification import FitResult
 from hdbridge.calibration.motion import MotionTest
 from hdbridge.calibration.validation import Stepped, Validation
-from hdbridge.identify import FitResult
 from hdbridge.model import TransmissionModel
 from hdbridge.model.difference import diff
 from hdbridge.units import unit_of

@@ -29,7 +29,7 @@ from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
-    from hdbridge.diagnose import Diagnosis, Finding, Parameter
+    from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
     from hdbridge.records.recording import Recording
 
 WORTH_TELLING = 0.01
@@ -82,8 +82,8 @@ def run(
     With --plan and no record: which causes the planned procedures could detect, down to how many
     arcseconds, and which they could not tell apart.
     """
-    from hdbridge.diagnose import diagnose
-    from hdbridge.diagnose.planned import plan_report
+    from hdbridge.analysis.diagnosis import diagnose
+    from hdbridge.analysis.identifiability import plan_report
     from hdbridge.model import TransmissionModel
     from hdbridge.procedures.plan import Plan
     from hdbridge.records.recording import Recording

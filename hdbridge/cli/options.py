@@ -125,7 +125,7 @@ def load_recordings(
     unwrap: list[str] | None = None,
 ) -> dict[Path, Recording]:
     """Recording folders and CSV files by their path; says what was assumed of files of other programs."""
-    from hdbridge.observations.foreign import check_once
+    from hdbridge.analysis.checks import check_once
     from hdbridge.records.recording import Recording
 
     loaded = [Recording.load(each, columns=columns, units=units, unwrap=unwrap) for each in paths]

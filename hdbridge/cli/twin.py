@@ -236,7 +236,7 @@ def _check(
 
 def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
     """All recordings as one; InputError if one is not of this axis, or has no command."""
-    from hdbridge.observations.foreign import check_records
+    from hdbridge.analysis.checks import check_records
     from hdbridge.records.recording import Recording
 
     for path, each in recordings.items():

@@ -1,13 +1,13 @@
 """What the axis can do by itself to learn more: the experiments that `choose` has to choose from.
 
-Which of them separates a pair of causes is not written here but predicted (`hdbridge.diagnose.planned`).
+Which of them separates a pair of causes is not written here but predicted (`analysis.identifiability`).
 """
 
 from __future__ import annotations
 
 from typing import Any, Final
 
-from hdbridge.diagnose.experiment import depends_on
+from hdbridge.analysis.findings import depends_on
 from hdbridge.procedures.plan import Plan
 
 _CLOSER: Final = {

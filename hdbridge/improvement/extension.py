@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hdbridge.diagnose import Diagnosis, Finding
+from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.gain import Gain
 from hdbridge.effects import CATALOGUE, Channel, Effect, Wear
-from hdbridge.estimation.gain import Gain
 from hdbridge.model import TransmissionModel
 from hdbridge.units import DEG_PER_TURN
 

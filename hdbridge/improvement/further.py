@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hdbridge.diagnose import Diagnosis
-from hdbridge.diagnose.planned import plan_report
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.identifiability import plan_report
 from hdbridge.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.improvement.extension import alternatives
 from hdbridge.model import TransmissionModel

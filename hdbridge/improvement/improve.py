@@ -9,6 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import provenance, with_provenance
 from hdbridge.calibration.journal import Journal, survived_in, tasks_of
@@ -20,7 +22,6 @@ from hdbridge.control.bench import axis_view
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.realtime import left_realtime
 from hdbridge.control.rig import Rig
-from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.calibration.result import Offer
-from hdbridge.diagnose import Diagnosis
 from hdbridge.improvement.extension import Extension
 from hdbridge.improvement.further import Choice
 from hdbridge.improvement.trial import Trial

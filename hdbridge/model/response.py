@@ -2,7 +2,7 @@
 
 At rest the load answers a correction fully. In motion servo, command filter and interpolation change its
 amplitude and phase. `Response` has the measured points and the filter weights computed from them;
-`hdbridge.estimation.response` computes both.
+`hdbridge.analysis.response` computes both.
 """
 
 from __future__ import annotations

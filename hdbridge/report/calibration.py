@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge import __version__
+from hdbridge.analysis.identification import Traces
 from hdbridge.calibration import Calibration
 from hdbridge.effects import FloatArray
-from hdbridge.identify.result import Traces
 from hdbridge.model.difference import diff
 from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (

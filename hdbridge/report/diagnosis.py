@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from hdbridge import __version__
+from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.views import ResidualViews
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
-from hdbridge.diagnose import Diagnosis, Finding
-from hdbridge.diagnose.residual_views import ResidualViews
 from hdbridge.effects import CATALOGUE
 from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
 from hdbridge.report.partial_residuals import partial_residual

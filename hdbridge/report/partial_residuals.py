@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose.residual_views import coordinates
-from hdbridge.diagnose.result import Diagnosis, Finding, Traces
+from hdbridge.analysis.findings import Diagnosis, Finding, Traces
+from hdbridge.analysis.views import coordinates
 from hdbridge.effects import CATALOGUE, BoolArray, Effect, FloatArray, Part
 from hdbridge.effects.coordinate import Coordinate, time
 from hdbridge.model import TransmissionModel

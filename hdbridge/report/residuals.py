@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.diagnose import Traces
-from hdbridge.diagnose.residual_views import ResidualViews
+from hdbridge.analysis.findings import Traces
+from hdbridge.analysis.views import ResidualViews
 from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.effects.coordinate import Coordinate, Spacing
 from hdbridge.report.bins import binned

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
-from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdbridge.analysis.linear import counted as numbered
+from hdbridge.analysis.linear import sums
 from hdbridge.effects import FloatArray
-from hdbridge.estimation.stretches import counted as numbered
-from hdbridge.estimation.stretches import sums
 
 LEAST = 1e-9
 """Of the information of all legs, a share that none of them has alone."""

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, lsq_linear
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.effects import FloatArray
-from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.covariance import eigen, root_of, sandwich
 from hdbridge.twin.likelihood import FINE, rooted, surprise

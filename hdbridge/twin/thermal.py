@@ -18,9 +18,9 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.special import chdtrc
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import Channel, FloatArray
-from hdbridge.estimation.intervals import NORMAL_95
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.covariance import sandwich

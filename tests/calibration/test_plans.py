@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.planned import plan_report
+from hdbridge.analysis.identifiability import plan_report
 from hdbridge.effects import Hysteresis
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import document_from_text

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hdbridge.analysis.response import gain
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.switchover import Correction
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.errors import InputError
-from hdbridge.estimation.response import gain
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import LeadFilter, Response
 

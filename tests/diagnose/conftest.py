@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import support.plant
 
-from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

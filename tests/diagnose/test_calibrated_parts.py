@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from support.springs import with_spring
 
-from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.estimation.calibration import calibrated
-from hdbridge.estimation.intervals import NORMAL_95
-from hdbridge.estimation.scales import Scales
+from hdbridge.analysis.calibrated import calibrated
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

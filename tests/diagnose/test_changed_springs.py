@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.springs import with_spring
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

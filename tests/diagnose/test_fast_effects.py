@@ -11,8 +11,9 @@ import pytest
 from scipy.special import bdtr
 from support.filters import filtered
 
-from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.estimation.white_noise import between_lines, noise_arcsec
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.prepared import between_lines, noise_arcsec
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.diagnose.holdout import held_out_change
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.gain import Gain, held_out_change
+from hdbridge.analysis.hypothesis import Estimator, Hypothesis
+from hdbridge.analysis.prepared import gather
 from hdbridge.effects import Start, Synchronous
 from hdbridge.effects.orders import orders_from
-from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.hypothesis import Estimator, Hypothesis
-from hdbridge.estimation.observed import gather
 from hdbridge.improvement import extension_of
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record

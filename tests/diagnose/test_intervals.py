@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 from support.filters import binomial_quantile
 
-from hdbridge.diagnose import diagnose
-from hdbridge.diagnose.parameters import covariance, named_parameters, parameters_of
-from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.result import Parameter
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Parameter
+from hdbridge.analysis.hypothesis import Estimator, Hypothesis
+from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.linear import Column
+from hdbridge.analysis.parameters import covariance, named_parameters, parameters_of, precisely
+from hdbridge.analysis.prepared import gather
 from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start, VelocityWindup
 from hdbridge.effects.orders import MotorOrder
-from hdbridge.estimation.hypothesis import Estimator, Hypothesis
-from hdbridge.estimation.intervals import NORMAL_95
-from hdbridge.estimation.observed import gather
-from hdbridge.estimation.terms import Column
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.effects import Synchronous
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.model import TransmissionModel

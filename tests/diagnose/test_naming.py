@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from support.filters import filtered
 
-from hdbridge.diagnose import Diagnosis, Finding, diagnose
-from hdbridge.diagnose.acceptance import Gate
-from hdbridge.diagnose.probability import Context, weighed
+from hdbridge.analysis.acceptance import Gate
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.probability import Context, weighed
+from hdbridge.analysis.scales import Scales
 from hdbridge.effects import Hysteresis
-from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

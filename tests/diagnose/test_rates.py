@@ -12,7 +12,7 @@ import pytest
 from support.rates import least
 from support.trials import CAUSES, NONE, PAIRS, SHORT, SPECIAL, UNKNOWN, Verdict, planted, verdict
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 
 MORE = range(1, 5)
 """Seeds of the slow tests."""

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.effects import (
     CATALOGUE,
     ChannelSkew,

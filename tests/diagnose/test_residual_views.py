@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.diagnose.residual_views import ResidualViews, folds, predicted
+from hdbridge.analysis.views import ResidualViews, folds, predicted
 from hdbridge.effects import Motion
 from hdbridge.effects import coordinate as over
 from hdbridge.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing

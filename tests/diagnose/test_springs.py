@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdbridge.diagnose import Diagnosis, diagnose
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

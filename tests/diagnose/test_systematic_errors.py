@@ -12,11 +12,11 @@ import pytest
 from support.filters import filtered
 from support.rates import least
 
-from hdbridge.diagnose import Diagnosis
-from hdbridge.diagnose.acceptance import gate
-from hdbridge.diagnose.parameters import covariance, parameters_of
-from hdbridge.diagnose.precise import precisely
-from hdbridge.diagnose.result import Parameter
+from hdbridge.analysis.acceptance import gate
+from hdbridge.analysis.findings import Diagnosis, Parameter
+from hdbridge.analysis.hypothesis import Estimator, Hypothesis
+from hdbridge.analysis.parameters import covariance, parameters_of, precisely
+from hdbridge.analysis.prepared import gather
 from hdbridge.effects import (
     ChannelSkew,
     Creep,
@@ -29,8 +29,6 @@ from hdbridge.effects import (
 )
 from hdbridge.effects.creep import Relaxation
 from hdbridge.effects.orders import orders_from
-from hdbridge.estimation.hypothesis import Estimator, Hypothesis
-from hdbridge.estimation.observed import gather
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from hdbridge.diagnose import Diagnosis
+from hdbridge.analysis.findings import Diagnosis
 
 LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
 

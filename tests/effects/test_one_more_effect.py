@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import support.plant as plant
 
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.identifiability import plan_report
 from hdbridge.control.compensation import Inverse
-from hdbridge.diagnose import Diagnosis, diagnose
-from hdbridge.diagnose.planned import plan_report
 from hdbridge.effects import CATALOGUE, Effect, Moment, Start, causes, register, withdraw
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel

@@ -25,12 +25,12 @@ from foreign.draw import draw
 from foreign.servos import STRUCTURES
 
 from hdbridge import Bench, Drive
+from hdbridge.analysis.response import harmonics
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.motion import motion_test, motor_orders
 from hdbridge.control.bench import compensation_for
 from hdbridge.effects import MotorOrder, Synchronous
 from hdbridge.errors import HdbridgeError
-from hdbridge.estimation.response import harmonics
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.even_speed import EvenSpeed
 from hdbridge.sim.lockstep import simulated_bench

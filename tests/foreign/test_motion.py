@@ -7,9 +7,9 @@ from foreign.bench import foreign_bench
 from foreign.servos import STRUCTURES
 
 from hdbridge import Drive
+from hdbridge.analysis.response import HIGHEST
 from hdbridge.calibration.motion import motion_test
 from hdbridge.effects import MotorOrder, Synchronous
-from hdbridge.estimation.response import HIGHEST
 from hdbridge.model import TransmissionModel
 
 # A third of the SYNC rate is reached by order 4 at these speeds, and later by the others.

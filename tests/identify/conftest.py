@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.legs import Leg, fit
 
+from hdbridge.analysis.identification import FitOptions, FitResult
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, FitResult
 
 RATE_HZ = 50.0
 

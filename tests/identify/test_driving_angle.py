@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.observations.kinematics import kinematics
-from hdbridge.observations.reading import quantum_deg, reading_of
+from hdbridge.analysis.driving import kinematics
+from hdbridge.analysis.readings import quantum_deg, reading_of
 
 
 def turns(path):

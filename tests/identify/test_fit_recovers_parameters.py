@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.legs import Leg, fit
 
+from hdbridge.analysis.identification import FitOptions
 from hdbridge.effects import Hysteresis, MotorOrder, Start, Synchronous
-from hdbridge.identify import FitOptions
 from hdbridge.model import TransmissionModel
 
 

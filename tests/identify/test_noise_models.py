@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.legs import Leg, measured
 
-from hdbridge.estimation.blocks import make_blocks
-from hdbridge.estimation.noise import NoiseModel, Precision, fit_noise
-from hdbridge.identify.figures import outlying, standing_arcsec
-from hdbridge.identify.usable import usable_samples
+from hdbridge.analysis.blocks import make_blocks
+from hdbridge.analysis.identification import outlying, standing_arcsec, usable_samples
+from hdbridge.analysis.noise import NoiseModel, Precision, fit_noise
 
 
 def blocks_of(count, rng, motor=None, error=None, kind="sweep"):

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.identify import Order
-from hdbridge.identify.orders import select, spectrum, threshold
+from hdbridge.analysis.orders import Order, select, spectrum, threshold
 
 
 def waves(motor_deg, orders):

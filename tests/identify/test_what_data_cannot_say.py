@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.legs import Leg, fit
 
+from hdbridge.analysis.identification import FitOptions
 from hdbridge.effects import Hysteresis
 from hdbridge.errors import InputError
-from hdbridge.identify import FitOptions
 
 
 def test_without_a_reversal_hysteresis_is_left_out(bench):

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import pytest
 
+from hdbridge.analysis.findings import Finding
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import axis_view
-from hdbridge.diagnose.result import Finding
 from hdbridge.improvement import choose, untold
 from hdbridge.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.model import TransmissionModel

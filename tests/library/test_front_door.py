@@ -30,7 +30,9 @@ def test_every_name_is_there_and_says_what_it_is(name):
 
 def test_nothing_else_is_shown():
     """Whatever was loaded before: what completes `hdbridge.` is the front door."""
-    shown = python("import hdbridge.diagnose, hdbridge.axis, hdbridge; print(*dir(hdbridge))").split()
+    shown = python(
+        "import hdbridge.analysis.diagnosis, hdbridge.axis, hdbridge; print(*dir(hdbridge))"
+    ).split()
     assert [each for each in shown if not each.startswith("__")] == sorted(hdbridge.__all__)
 
 
@@ -39,7 +41,7 @@ def test_another_name_is_refused_as_python_does():
         hdbridge.Brench  # noqa: B018
 
 
-@pytest.mark.parametrize("name", ["diagnose", "simulated"])
+@pytest.mark.parametrize("name", ["simulated"])
 def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
     """The import system would put the module in its place, whichever comes first."""
     assert python(f"import hdbridge.{name}\nprint(type(hdbridge.{name}).__name__)") == "function"
@@ -47,10 +49,6 @@ def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
         python(f"import hdbridge\nhdbridge.{name}\nfrom hdbridge import {name}\nprint({name}.__name__)")
         == name
     )
-
-
-def test_the_folder_of_a_function_can_still_be_imported():
-    assert python("from hdbridge.diagnose.result import Diagnosis; print(Diagnosis.__name__)") == "Diagnosis"
 
 
 def test_every_error_stands_at_the_front_door():

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from hdbridge.analysis.checks import check_records
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.files import csvfile
-from hdbridge.observations.foreign import check_records
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.records.wraps import find_wraps

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.cli import app
-from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel

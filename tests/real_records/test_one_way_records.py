@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.effects import Hysteresis, HysteresisMemory, Synchronous
 from hdbridge.effects.orders import MotorOrder
 from hdbridge.errors import InputError

@@ -8,15 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hdbridge.calibration import Calibration, Offer
-from hdbridge.calibration.validation import Floor, Stepped, Validation
-from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
-from hdbridge.estimation.gain import Gain
-from hdbridge.estimation.intervals import Interval
-from hdbridge.estimation.noise import NoiseModel
-from hdbridge.evaluation.stepping import Scatter
-from hdbridge.identify.orders import Line, Order
-from hdbridge.identify.result import (
+from hdbridge.analysis.gain import Gain
+from hdbridge.analysis.identification import (
     FitResult,
     HeldOut,
     NoiseFigures,
@@ -25,6 +18,13 @@ from hdbridge.identify.result import (
     ResidualTest,
     Traces,
 )
+from hdbridge.analysis.intervals import Interval
+from hdbridge.analysis.noise import NoiseModel
+from hdbridge.analysis.orders import Line, Order
+from hdbridge.calibration import Calibration, Offer
+from hdbridge.calibration.validation import Floor, Stepped, Validation
+from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.evaluation.stepping import Scatter
 from hdbridge.model import TransmissionModel
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render

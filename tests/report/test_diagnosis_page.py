@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hdbridge.analysis.findings import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
+from hdbridge.analysis.gain import Gain
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Floor, Stepped, Validation
-from hdbridge.diagnose import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
 from hdbridge.effects import (
     CATALOGUE,
     Channel,
@@ -28,7 +29,6 @@ from hdbridge.effects import (
     causes,
     extended,
 )
-from hdbridge.estimation.gain import Gain
 from hdbridge.evaluation.stepping import Scatter
 from hdbridge.model import TransmissionModel
 from hdbridge.report.diagnosis import diagnosis_page

@@ -17,9 +17,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench, axis_view, compensation_for
-from hdbridge.diagnose import Diagnosis, diagnose
 from hdbridge.drive.drive import Drive
 from hdbridge.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
 from hdbridge.model import TransmissionModel

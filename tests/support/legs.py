@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge import identify
-from hdbridge.estimation.samples import Measured
-from hdbridge.identify import FitOptions, FitResult
+from hdbridge.analysis import identify
+from hdbridge.analysis.identification import FitOptions, FitResult
+from hdbridge.analysis.prepared import Measured
 from hdbridge.records.record import Record
 
 

@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from support import plant
 
-from hdbridge.diagnose import diagnose
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 

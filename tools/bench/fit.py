@@ -18,9 +18,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from identify_records import Truth, plan, record, recording
 
+from hdbridge.analysis.identification import FitOptions
+from hdbridge.analysis.identify import fit
 from hdbridge.calibration import measured_of
 from hdbridge.effects import Start
-from hdbridge.identify import FitOptions, fit
 from hdbridge.records.recording import Recording
 
 

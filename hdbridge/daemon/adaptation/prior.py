@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from hdbridge.analysis.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
+from hdbridge.analysis.linear import Column
 from hdbridge.daemon.adaptation.estimator import Estimator
 from hdbridge.daemon.adaptation.regressors import Regressors
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.effects import Effect, FloatArray
-from hdbridge.estimation.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
-from hdbridge.estimation.terms import Column
 
 DISC_ARCSEC = 10.0
 """Size that the load encoder's own errors per turn may have."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hdbridge.estimation.intervals import leaves
+from hdbridge.analysis.intervals import leaves
 from hdbridge.model import TransmissionModel
 
 Entry = Mapping[str, Any]

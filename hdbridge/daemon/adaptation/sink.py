@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hdbridge.analysis.intervals import difference, leaves
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
@@ -22,7 +23,6 @@ from hdbridge.daemon.adaptation.proposal import Entry, Proposal
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode, Standing
 from hdbridge.daemon.watch.encoder_health import Judgement
 from hdbridge.errors import OutputError
-from hdbridge.estimation.intervals import difference, leaves
 from hdbridge.model import TransmissionModel
 
 if TYPE_CHECKING:

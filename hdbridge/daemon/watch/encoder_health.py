@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hdbridge.analysis.readings import jitter_deg
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray, joined_samples
@@ -42,7 +43,6 @@ from hdbridge.daemon.watch.signs import (
     trend,
 )
 from hdbridge.model import TransmissionModel
-from hdbridge.observations.reading import jitter_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
 UNSEATED = (AxisState.UNVERIFIED, AxisState.LENT)

@@ -27,13 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
+from hdbridge.analysis.scales import Scales
 from hdbridge.daemon.adaptation.measuring import Observation
 from hdbridge.daemon.adaptation.prior import bounds_arcsec, estimator_of
 from hdbridge.daemon.adaptation.proposal import changes_between
 from hdbridge.daemon.adaptation.regressors import Regressors, Term
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.effects import FloatArray
-from hdbridge.estimation.scales import Scales
 from hdbridge.model import TransmissionModel
 
 DAY_S: Final = 86_400.0

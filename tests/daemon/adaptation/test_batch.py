@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from support.adapting import AXIS, MODEL, Sampler, truth_of
 
+from hdbridge.analysis.identification import FitOptions
+from hdbridge.analysis.identify import fit
+from hdbridge.analysis.linear import solve_symmetric
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import measured_of
 from hdbridge.control.bench import Bench
@@ -13,9 +16,6 @@ from hdbridge.daemon.adaptation.regressors import Regressors
 from hdbridge.daemon.adaptation.sink import reading_of
 from hdbridge.drive import Drive
 from hdbridge.effects import Start
-from hdbridge.estimation.linear import solve_symmetric
-from hdbridge.identify import fit
-from hdbridge.identify.options import FitOptions
 from hdbridge.procedures.moves import Settle
 from hdbridge.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hdbridge.analysis.linear import solve_symmetric
 from hdbridge.daemon.adaptation.estimator import Estimator
-from hdbridge.estimation.linear import solve_symmetric
 
 SIGMA = 0.9
 seeds = st.integers(0, 10_000)

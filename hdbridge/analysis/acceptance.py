@@ -1,0 +1,155 @@
+"""Gates that a finding has to pass before it is named: block-robust evidence, where it has to show.
+
+Chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a finding's
+score is summed over blocks of time, and its variance is taken from those sums: whatever is correlated
+within a block no longer counts as many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_side, solve_symmetric
+from hdbridge.effects import BoolArray, Effect, FloatArray
+
+BLOCKS_S = (1.0, 5.0, 20.0)
+"""Noise that wanders, or warms up, is correlated over less than one of them."""
+LEAST_BLOCKS = 30
+"""A short record is cut into so many, whatever their length: fewer tell no variance."""
+LEAST_POINTS = 20
+"""Fewer tell nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """How a finding fared."""
+
+    robust: float
+    """Smallest block-robust chi square over the block lengths."""
+    needed: float
+    reason: str = ""
+    """Why it is not named, in words; empty where it passed."""
+
+
+def robust_chi_square(
+    estimator: Estimator,
+    fitted: Fitted,
+    place: int,
+    nuisances: FloatArray | None = None,
+    rows: BoolArray | slice = slice(None),
+    only: int | None = None,
+    laws: FloatArray | None = None,
+) -> float:
+    """Of one effect of a hypothesis: its coefficients against zero, but for those that are incidental, by
+    their sandwich over blocks of time.
+
+    Everything else is refitted, and the columns ``nuisances`` (weighted) are in addition to it; only ``rows``
+    count, where given, and of the coefficients the one with the number ``only``. ``laws`` are weighted
+    columns by a standard deviation of which other laws may be wrong.
+    """
+    own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
+    effect = fitted.hypothesis.effects[place]
+    asked = evident(effect) if only is None else [only]
+    own, coefficients = [own[each] for each in asked], effect.coefficients()[asked]
+    columns = fitted.tangent if nuisances is None else np.hstack([fitted.tangent, nuisances])
+    known = np.zeros((columns.shape[1], 2))
+    known[: fitted.count()] = fitted.linearised.known
+    fit = Linearised(columns[rows], fitted.residual[rows], known)
+    return block_robust(estimator, fit, own, coefficients, rows, laws)
+
+
+def block_robust(
+    estimator: Estimator,
+    fit: Linearised,
+    own: list[int],
+    coefficients: FloatArray,
+    rows: BoolArray | slice = slice(None),
+    laws: FloatArray | None = None,
+) -> float:
+    """The same of the columns ``own`` of any fit to some rows, which stands at these ``coefficients``."""
+    time_s = estimator.time_s[rows]
+    if len(time_s) < LEAST_POINTS:
+        return 0.0
+    inverse = fit.directions @ fit.directions[own].T
+    coefficients = coefficients + fit.directions[own] @ fit.slack
+    influence = (fit.columns @ inverse) * (fit.residual - fit.basis @ fit.slack)[:, np.newaxis]
+    # The noise itself is a floor: a residual may be quieter than it by luck.
+    least = 0.25 * inverse[own] + inverse.T @ (np.maximum(fit.known[:, :1], 0.0) * inverse)
+    longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
+    if laws is not None:
+        shift = fit.taken_over(laws[rows])[own]
+        least = least + shift @ shift.T
+    spreads = [sandwich(influence, of_length(time_s, min(each, longest_s))) + least for each in BLOCKS_S]
+    return min(float(coefficients @ solve_symmetric(each, coefficients)) for each in spreads)
+
+
+def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
+    """Judge one finding."""
+    effect = fitted.hypothesis.effects[place]
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
+    laws = law_discrepancies(estimator, fitted.hypothesis.without(place))
+    robust = robust_chi_square(estimator, fitted, place, laws=laws)
+    if robust < needed:
+        if robust_chi_square(estimator, fitted, place) < needed:
+            return Gate(robust, needed, "not seen in enough independent stretches")
+        return Gate(robust, needed, "may be what the law of another cause is wrong by")
+    if effect.tracker().memory_deg > 0.0:
+        free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
+        robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
+        if robust < needed:
+            return Gate(robust, needed, "an elastic loop of another shape does as well")
+    stretch = effect.shows(estimator.motion)
+    if stretch is not None:
+        rows = stretch.rows[estimator.index]
+        others = fitted.hypothesis.without(place)
+        laws = np.hstack([laws, estimator.angle_discrepancy(others.effects, others.start)])
+        robust = min(robust, robust_chi_square(estimator, fitted, place, rows=rows, laws=laws))
+        if robust < needed:
+            return Gate(robust, needed, stretch.otherwise)
+    changes = _changes(estimator, fitted, place)
+    return Gate(robust, needed, "not the same everywhere" if changes else "")
+
+
+def evident(effect: Effect) -> list[int]:
+    """The numbers of the coefficients that are evidence of an effect."""
+    named = effect.named_coefficients()
+    return [column for each in named if each.name not in effect.incidental for column in each.columns]
+
+
+def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArray:
+    """What the laws of all effects of a hypothesis may be wrong by, weighted columns (m, k)."""
+    forms = [estimator.law_discrepancy(each, hypothesis.start) for each in hypothesis.effects]
+    return side_by_side(forms, len(estimator.index))
+
+
+def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
+    """Whether each piece of a finding is seen, and none is what a larger one gets wrong."""
+    effect = fitted.hypothesis.effects[place]
+    pieces = range(len(effect.coefficients()))
+    if not effect.inexact or len(pieces) != len(effect.pieces()):
+        return True
+    robust = [robust_chi_square(estimator, fitted, place, only=each) for each in pieces]
+    return min(robust) > max(estimator.scales.robust, effect.inexact * max(robust))
+
+
+def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
+    """Whether what has to be the same everywhere is another one along the way; see `Effect.changing`."""
+    effect, own = fitted.hypothesis.effects[place], fitted.places(place)
+    for number, piece in enumerate(effect.pieces()):
+        changing = piece.changing(estimator.motion)
+        if changing is None:
+            return False
+        refitted = [i for i in own if i == own[number] or fitted.parameters[i].shape]
+        columns = np.hstack([fitted.tangent[:, own[[number]]], estimator.weighted(changing[estimator.index])])
+        others = np.setdiff1d(np.arange(fitted.count()), refitted)
+        gram, moment = fitted.linearised.of(others).left(columns)
+        step = np.linalg.lstsq(gram, moment, rcond=1e-10)[0]
+        along = float(effect.coefficients()[number]) + np.cumsum(step)
+        scales = estimator.scales
+        differs = float(np.ptp(along)) > scales.bend * float(np.max(np.abs(along)))
+        if differs and float(moment @ step) > scales.robust:
+            return True
+    return False

@@ -1,0 +1,297 @@
+"""Samples averaged over short stretches: a million rows become some ten thousand, exactly.
+
+Columns are averaged like the observations, so a linear model of the samples is the same linear model of the
+blocks; what is lost is only what varies inside a block. Blocks are short just after a reversal, where the
+hysteresis is steep, and never reach across a turn, a gap, or samples that cannot be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+
+import numpy as np
+
+from hdbridge.analysis.linear import side_by_side
+from hdbridge.analysis.prepared import Samples
+from hdbridge.analysis.regressors import Regressors
+from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray, Start
+from hdbridge.effects.base import Memoryless
+from hdbridge.effects.path import branches
+from hdbridge.units import ARCSEC_PER_DEG
+
+TARGET_BLOCKS = 30_000
+LONGEST_S = 0.25
+FINE_DEG = 0.4
+"""Just after a reversal blocks are a twentieth of this angle plus of the angle since the reversal."""
+REST_DEG_S = 0.05
+"""Motor speed below which an axis stands."""
+AVERAGED_COUNTS_S = 200.0
+"""Faster than this a servo passes several counts before it answers, and rounding averages out."""
+LOCKED_COUNTS = 0.15
+"""Standard deviation of what rounding leaves over a leg: sampled in step with the counts that it passes, an
+encoder is read at the same few places within a count over all the travel to the next turn."""
+LEAST_LOCKED_COUNTS = 0.03
+"""At least so much there may be at any speed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Blocks of samples; arrays of shape (b,) but for those named otherwise."""
+
+    index: IntArray
+    """Usable samples, shape (u,)."""
+    first: IntArray
+    """Where each block begins in ``index``."""
+    weight: FloatArray
+    """Weight of each usable sample, shape (u,): 1, or 0 for an outlier."""
+    count: FloatArray
+    """Sum of the weights in a block."""
+    time_s: FloatArray
+    duration_s: FloatArray
+    motor_deg: FloatArray
+    travel_deg: FloatArray
+    """Travel of the motor since the first sample, both directions counted positive."""
+    extent_deg: FloatArray
+    """Travel inside the block."""
+    speed_deg_s: FloatArray
+    moving: BoolArray
+    heading: FloatArray
+    """1 or -1: the direction of motion, at rest the last one; 0 before the first."""
+    kind: IntArray
+    zero: IntArray
+    chain: IntArray
+    middle: IntArray
+    """The sample in the middle of each block."""
+    error_arcsec: FloatArray
+    leg: IntArray
+    """Number of the travel from turn to turn that a block lies on."""
+    locked_arcsec: FloatArray
+    """Standard deviation of an error that is the same over a leg, from reading the motor in whole counts."""
+    blur: FloatArray
+    """Variance of each block, arcsec squared, because turns of the driving angle are known so well only."""
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self.first)
+
+    @property
+    def sizes(self) -> IntArray:
+        """Usable samples in each block, outliers too."""
+        return np.diff(np.append(self.first, len(self.index)))
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Average of a per-sample quantity (n,) or (n, p) over each block: (b,) or (b, p)."""
+        picked = values[self.index]
+        spread = (slice(None), np.newaxis)[: picked.ndim]
+        total = np.add.reduceat(picked * self.weight[spread], self.first, axis=0)
+        return np.asarray(total / np.maximum(self.count, 1e-300)[spread])
+
+    def picked(self, index: IntArray | BoolArray) -> Blocks:
+        """Some of the blocks, each stood for by its middle sample."""
+        own = {"index", "first", "weight"}
+        kept = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name not in own}
+        middle = self.middle[index]
+        return Blocks(middle, np.arange(len(middle)), np.ones(len(middle)), **kept)
+
+
+def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
+    """Cut the usable samples into blocks; ``weight`` (one per sample, 0 or 1) leaves outliers out."""
+    index = np.flatnonzero(samples.usable)
+    motor, time = samples.motor_deg, samples.time_s
+    parts = [motor[each.rows] for each in samples.chains]
+    travels = [_travel(each) for each in parts]
+    coarsest = float(np.clip(sum(each[-1] for each in travels) / TARGET_BLOCKS, 1.0, 6.0))
+    turnings = [branches(each)[0] for each in parts]
+    travel, heading = np.concatenate(travels), np.concatenate([_heading(each) for each in parts])
+    key = np.concatenate([_cells(*each, coarsest) for each in zip(parts, turnings, strict=True)])
+    chain = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+    legs = [
+        np.searchsorted(turns[1:-1], np.arange(len(each)))
+        for each, turns in zip(parts, turnings, strict=True)
+    ]
+    before = np.cumsum([0, *(each[-1] + 1 for each in legs[:-1])])
+    leg = np.concatenate([each + first for each, first in zip(legs, before, strict=True)])
+    resting = np.abs(samples.speed_deg_s) <= REST_DEG_S
+    cut = np.diff(index, prepend=-2) != 1
+    for each in (key, samples.kind, chain, resting, np.floor(time / LONGEST_S)):
+        cut[1:] |= each[index[1:]] != each[index[:-1]]
+    first = np.flatnonzero(cut)
+    last = np.append(first[1:], len(index)) - 1
+    weights = np.ones(len(index)) if weight is None else weight[index]
+    count = np.add.reduceat(weights, first)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(values[index], first) / (last - first + 1))
+
+    weighted_error = np.add.reduceat(samples.error_arcsec[index] * weights, first) / np.maximum(count, 1e-300)
+    middle = index[(first + last) // 2]
+    speed, moving = mean(samples.speed_deg_s), ~resting[middle]
+    rounding_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
+    return Blocks(
+        index=index,
+        first=first,
+        weight=weights,
+        count=count,
+        time_s=mean(time),
+        duration_s=time[index[last]] - time[index[first]],
+        motor_deg=mean(motor),
+        travel_deg=mean(travel),
+        extent_deg=travel[index[last]] - travel[index[first]],
+        speed_deg_s=speed,
+        moving=moving,
+        heading=heading[middle],
+        kind=samples.kind[middle],
+        zero=samples.zero[middle],
+        chain=chain[middle],
+        middle=middle,
+        error_arcsec=weighted_error,
+        leg=leg[middle],
+        locked_arcsec=moving * locked_counts(speed, samples.count_deg) * rounding_arcsec,
+        blur=np.zeros(len(first)),
+    )
+
+
+def locked_counts(speed_deg_s: FloatArray, count_deg: float) -> FloatArray:
+    """What rounding leaves over a leg at a motor speed, counts (standard deviation)."""
+    rate = np.abs(speed_deg_s) / max(count_deg, 1e-12)
+    share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
+    return np.maximum(LOCKED_COUNTS * share, LEAST_LOCKED_COUNTS)
+
+
+def _travel(motor_deg: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(motor_deg)))])
+
+
+def _heading(motor_deg: FloatArray) -> FloatArray:
+    steps = np.sign(np.diff(motor_deg, prepend=motor_deg[:1]))
+    last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
+    return np.asarray(steps[last])
+
+
+def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
+    """A number per sample that changes from cell to cell of the travel since the last turn."""
+    cells = np.zeros(len(motor_deg), dtype=np.int64)
+    edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest
+    base = 0
+    for first, last in pairwise(turning):
+        since = np.abs(motor_deg[first + 1 : last + 1] - motor_deg[first])
+        near = 20.0 * np.log1p(np.minimum(since, edge) / FINE_DEG)
+        number = np.floor(near + np.maximum(since - edge, 0.0) / coarsest_deg).astype(np.int64)
+        cells[first + 1 : last + 1] = base + 1 + number
+        base = int(cells[last]) + 1
+    return cells
+
+
+# Calibration's observations: samples, their blocks, and the elastic state in which each chain begins.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """Samples, their blocks, and the elastic state in which each chain begins."""
+
+    samples: Samples
+    blocks: Blocks
+    starts: tuple[Start, ...]
+    regressors: Regressors
+
+    @classmethod
+    def of(cls, samples: Samples, blocks: Blocks, starts: Sequence[Start]) -> Design:
+        """Prepare columns for these blocks."""
+        motions = [samples.along(each) for each in samples.chains]
+        return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
+
+    def beginning(self, starts: Sequence[Start]) -> Design:
+        """The same with other states at the start."""
+        return replace(self, starts=tuple(starts))
+
+    def columns(self, effect: Effect) -> FloatArray:
+        """Regressors of an effect, block averages, shape (b, p)."""
+        return self.regressors.columns(effect, self.starts)
+
+    def told(self, effects: Sequence[Effect]) -> FloatArray:
+        """What effects say together, shape (b,)."""
+        return self.regressors.told(effects, self.starts)
+
+    def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
+        """What a reach further at the turn before would change, arcsec (b,), what share of that reach may lie
+        between two samples (b,), and which turn it is (b,).
+
+        The reach is within what a turn is known: the count, and twice what may lie between two samples.
+        Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
+        """
+        change, missed = np.zeros((2, len(self.blocks)))
+        turn = np.zeros(len(self.blocks), dtype=np.intp)
+        last = 0
+        along = zip(self.samples.chains, self.regressors.motions, self.starts, strict=True)
+        for number, (chain, motion, start) in enumerate(along):
+            turning, signs = branches(motion.motor_deg, Start.VIRGIN)
+            inside = self.blocks.chain == number
+            middles = self.blocks.middle[inside] - chain.rows.start
+            branch = np.searchsorted(turning, middles, "left")
+            turn[inside] = last + branch
+            last += len(turning) + 1
+            between = missed_deg(motion.motor_deg, np.array(turning[1:-1], dtype=np.intp))
+            reach = self.samples.count_deg + 2.0 * between
+            if not np.any(reach):
+                continue
+            share = np.concatenate([[0.0], between / np.maximum(reach, 1e-12), [0.0]])
+            missed[inside] = share[branch - 1]
+            moved_motor = motion.motor_deg.copy()
+            moved_motor[turning[1:-1]] += 0.5 * reach * np.array(signs[:-1])
+            other = replace(motion, motor_deg=moved_motor)
+            for effect in effects:
+                if not isinstance(effect.tracker(), Memoryless):
+                    change[inside] += (effect.predict(other, start) - effect.predict(motion, start))[middles]
+        return 2.0 * change, missed, turn
+
+    def blurred(self, effects: Sequence[Effect]) -> Design:
+        """The same, each block's variance raised by what rounding of the driving angle does to the effects.
+
+        Just after a turn a hysteresis may rise without bound: what is measured there says little, and should
+        not say much.
+        """
+        change, _, _ = self.turn_effects(effects)
+        return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
+
+    def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
+        """Observation minus effects per sample, minus ``rest`` per block; NaN where not usable."""
+        left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
+        result = np.full(len(left), np.nan)
+        index = self.blocks.index
+        result[index] = left[index] - np.repeat(rest, self.blocks.sizes)
+        return result
+
+
+def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
+    """Cosine and sine of each order of the motor angle, block averages, shape (blocks, 2 * orders).
+
+    Orders need not be whole numbers: 1 / N is once per load turn, k (1 + 1/N) the flexspline's.
+    """
+    angles = (np.deg2rad(each) * design.samples.motor_deg for each in orders)
+    parts = [design.blocks.mean(np.stack([np.cos(each), np.sin(each)], axis=1)) for each in angles]
+    return side_by_side(parts, len(design.blocks))
+
+
+def clusters(blocks: Blocks, number: int) -> IntArray:
+    """Blocks in about so many stretches of measured time, each of one chain; a number per block."""
+    gone = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(blocks.time_s), 0.0, 1.0))])
+    span_s = max(float(gone[-1]) / number, 1e-9)
+    cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
+    return np.concatenate([[0], np.cumsum(cut)]).astype(np.intp)
+
+
+def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
+    """How much further than at the sample of each turn the motor may have been, shape of ``turns``.
+
+    Between two samples at one speed each way the lines before and after meet so far outside. A motor that
+    rests where it turns was read there.
+    """
+
+    def step(way: int) -> FloatArray:
+        other = np.clip(turns + way, 0, len(motor_deg) - 1)
+        return np.asarray(np.abs(motor_deg[other] - motor_deg[turns]))
+
+    longest = np.minimum(step(-2), step(2))
+    return np.asarray(0.5 * np.minimum(np.abs(step(1) - step(-1)), longest))

@@ -1,0 +1,215 @@
+"""Findings within the model's own parts: the elastic law, its parameters, the orders of the motor, a spring.
+
+Calibrations are a few per cent off as a rule, and that is no finding: the change has to be larger than that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hdbridge.analysis.calibrated import CalibratedPart, calibrated, variances
+from hdbridge.analysis.findings import UNWEIGHED, Finding, Parameter, next_experiment
+from hdbridge.analysis.gain import held_out, held_out_change
+from hdbridge.analysis.hypothesis import Estimator, Fitted
+from hdbridge.analysis.linear import Column
+from hdbridge.analysis.parameters import named_parameters, parameters_of
+from hdbridge.analysis.search import Search, together
+from hdbridge.analysis.unexplained import near_reversals
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Part, Start
+from hdbridge.model import TransmissionModel
+
+
+def findings(
+    search: Search, model: TransmissionModel, fitted: Fitted, precise: Fitted, spread: FloatArray
+) -> list[Finding]:
+    """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
+    estimator = search.estimator
+    # Whatever the file's intervals are: some kelvin and weeks later a calibration is as far off as any.
+    parts = calibrated(
+        model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
+    )
+    result: list[Finding | None] = []
+    for place, given in enumerate(model.effects):
+        usual = [each for each in parts if each.place == place]
+        if given.part is Part.LOOP:
+            if estimator.data.reversals >= 2:  # a loop shows only where the axis reverses
+                same = type(given) is type(precise.hypothesis.effects[place])
+                law = _loop(estimator, fitted, precise, usual[0], given, spread) if same else None
+                result.append(law if same else _another_law(estimator, fitted, precise, place, given, spread))
+        elif given.part is Part.ORDERS:
+            result.append(_orders(estimator, precise, usual, given, spread) if usual else None)
+        else:
+            result.append(_freed(search, fitted, precise, place, given, spread))
+    return [each for each in result if each is not None]
+
+
+def _another_law(
+    estimator: Estimator, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
+) -> Finding | None:
+    """Where another elastic law does better than the ``given`` one."""
+    scales, now = estimator.scales, precise.hypothesis.effects[place]
+    causes = causes_of(given, now)
+    old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
+    peak = _apart_arcsec(estimator, old, fitted)
+    gain = old.chi_square - fitted.chi_square
+    if gain < scales.enter + scales.penalty or peak < scales.plain_arcsec or not causes:
+        return None
+    name, parameters = causes[0].name, parameters_of(estimator, precise, place, spread)
+    return Finding(
+        name, UNWEIGHED, (), parameters, held_out(estimator, fitted, old), next_experiment(name, ()), peak,
+        robust=gain, effect=causes[0],
+    )  # fmt: skip
+
+
+def _loop(
+    estimator: Estimator,
+    fitted: Fitted,
+    precise: Fitted,
+    usual: CalibratedPart,
+    given: Effect,
+    spread: FloatArray,
+) -> Finding | None:
+    """Where the loop has other parameters, or a form that neither law has."""
+    place, scales = usual.place, estimator.scales
+    change = _change(estimator, precise, place, given)
+    peak = 0.5 * float(np.ptp(change))
+    lawless = _lawless_arcsec(estimator, fitted)
+    small = peak < scales.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
+    causes = causes_of(given, precise.hypothesis.effects[place])
+    if (small and not lawless) or not causes:
+        return None
+    # A loop that obeys no law may follow another one in part.
+    laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
+    residual, near = fitted.residual / estimator.weight, near_reversals(estimator, fitted)
+    taken = float(np.mean(((residual + change - np.mean(change)) ** 2 - residual**2)[near]))
+    return _finding(
+        estimator, precise, precise.places(place), change, causes[0],
+        parameters_of(estimator, precise, place, spread), max(peak, lawless), tuple(laws) if lawless else (),
+        taken_arcsec=math.sqrt(max(taken, 0.0)), note="the baseline's own loop takes over the new parameters",
+    )  # fmt: skip
+
+
+def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
+    """How far apart two fits are at their peak, but for what is rare."""
+    apart = np.abs(one.residual - other.residual) / estimator.weight
+    return float(np.quantile(apart, 1.0 - estimator.rare))
+
+
+def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
+    """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
+    scales, free = estimator.scales, fitted.hypothesis.nuisances
+    if free is None:
+        return 0.0
+    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
+    apart = _apart_arcsec(estimator, plain, fitted)
+    gained = plain.chi_square - fitted.chi_square > scales.enter + scales.penalty * len(free.names)
+    return apart if gained and apart > scales.plain_arcsec else 0.0
+
+
+def _orders(
+    estimator: Estimator, fitted: Fitted, usual: Sequence[CalibratedPart], given: Effect, spread: FloatArray
+) -> Finding | None:
+    """Those of the orders of the motor that have changed."""
+    place, scales = usual[0].place, estimator.scales
+    now = fitted.hypothesis.effects[place]
+    columns = fitted.places(place)
+    changed: list[tuple[Effect, Effect]] = []
+    own: list[int] = []
+    known: list[FloatArray] = []
+    for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
+        before, after = old.coefficients(), new.coefficients()
+        # What is odd in the direction takes some of an order away from the mean of both directions.
+        number = round(new.waves()[0][0]) if new.waves() else 0
+        share = math.prod(each.left_in_mean(number) for each in fitted.hypothesis.effects)
+        part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
+        large = float(np.linalg.norm(after - share * before)) >= scales.floor_arcsec
+        if large and strain(fitted, part, spread) >= scales.calibrations**2:
+            changed.append((old, new))
+            own += [columns[each] for each in named.columns]
+            known.append(variances(estimator.calibrated, place, named.columns))
+    if not changed:
+        return None
+    all_of_it = now.fitted(now.coefficients() - given.coefficients())
+    seen = 0.5 * float(np.ptp(estimator.does(all_of_it, fitted.hypothesis.start)))
+    was, is_now = (together(each) for each in zip(*changed, strict=True))
+    difference = is_now.fitted(is_now.coefficients() - was.coefficients())
+    causes = causes_of(was, is_now)
+    if not causes or difference.largest_piece_arcsec() > scales.extrapolated * seen:
+        return None  # on an arc of their turn orders take any size
+    # What it has changed from was itself known to its calibration only.
+    apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
+    parameters = named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart)
+    return _finding(
+        estimator, fitted, np.array(own),
+        estimator.columns(difference, fitted.hypothesis.start) @ difference.coefficients(),
+        causes[0], parameters, difference.bound_arcsec(), tuple(each.name for each in causes[1:]),
+        note="a change of orders that the model has: its synchronous part takes it over",
+    )  # fmt: skip
+
+
+def _freed(
+    search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
+) -> Finding | None:
+    """Any other part that the data have pulled out of its calibration (`hdbridge.analysis.calibrated`)."""
+    estimator, own = search.estimator, precise.places(place)
+    if not len(own) or np.all(precise.information[own] != 0.0):
+        return None
+    change = _change(estimator, precise, place, given)
+    peak = 0.5 * float(np.ptp(change))
+    if peak < estimator.scales.floor_arcsec:
+        return None
+    aliases = tuple(search.instead_of_change(fitted, place, given))
+    return _finding(
+        estimator, precise, own, change, precise.hypothesis.effects[place],
+        parameters_of(estimator, precise, place, spread), peak, aliases,
+        left_alone=bool(aliases), note="a change of what the model has: " + (
+            "it is left as it was, for the record does not distinguish it from another cause"
+            if aliases else "its own parameters take it over"
+        ),
+    )  # fmt: skip
+
+
+def _finding(
+    estimator: Estimator,
+    fitted: Fitted,
+    own: IntArray,
+    change_arcsec: FloatArray,
+    effect: Effect,
+    parameters: Mapping[str, Parameter],
+    peak_arcsec: float,
+    aliases: tuple[str, ...],
+    **more: Any,
+) -> Finding:
+    """That the columns ``own`` of a fit have changed by ``change_arcsec``, (m,)."""
+    weighted = estimator.weight * (change_arcsec - np.mean(change_arcsec))
+    return Finding(
+        effect.name, UNWEIGHED, aliases, parameters, held_out_change(estimator, fitted, own, change_arcsec),
+        next_experiment(effect.name, aliases), peak_arcsec, robust=float(weighted @ weighted), effect=effect,
+        **more,
+    )  # fmt: skip
+
+
+def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:
+    """What a part of the model does otherwise than as it was ``given``, arcsec, (m,)."""
+    start, now = fitted.hypothesis.start, fitted.hypothesis.effects[place]
+    after = estimator.columns(now, start) @ now.coefficients()
+    return np.asarray(after - estimator.columns(given, start) @ given.coefficients())
+
+
+def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
+    """Chi square by which a part of a fit is away from its calibration, both with their errors."""
+    own = {fitted.parameters[i].name: i for i in fitted.places(part.place)}
+    seen = replace(part, parameters={name: each for name, each in part.parameters.items() if name in own})
+    at = [own[name] for name in seen.parameters]
+    return seen.strain(fitted.hypothesis.effects, spread[np.ix_(at, at)])
+
+
+def causes_of(given: Effect, now: Effect) -> list[Effect]:
+    """The causes that can have made one of the other, those that say more of it first."""
+    found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
+    return sorted(found, key=lambda each: each.changes is None)

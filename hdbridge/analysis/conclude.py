@@ -1,0 +1,421 @@
+"""The covariance of what was fitted, from the noise as it is, not as one would like it.
+
+The covariance of a fit under the noise model is the inverse information. Where the noise model is wrong the
+scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger
+1986) finds out, and wherever it is wider it is believed. What reading in counts leaves in a wave is the same
+all along a sweep, and other in the next: for waves the stretches are whole legs as well, and since there are
+few of these, all waves are taken together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from hdbridge.analysis.blocks import Blocks, Design, clusters
+from hdbridge.analysis.gain import Gain
+from hdbridge.analysis.identification import (
+    KNOWN,
+    FitResult,
+    HeldOut,
+    NoiseFigures,
+    Nuisance,
+    ResidualTest,
+    State,
+    Traces,
+    laps_arcsec,
+    standing_arcsec,
+)
+from hdbridge.analysis.intervals import NORMAL_95, Interval, intervals_of, nested_half_widths
+from hdbridge.analysis.linear import (
+    Linearised,
+    about_zeros,
+    counted,
+    inverse_symmetric,
+    sandwich,
+    steps_without,
+    sums,
+)
+from hdbridge.analysis.noise import NoiseModel, Precision
+from hdbridge.analysis.nuisances import DELAY, TEXTS, UNITS, delay_column, is_turn
+from hdbridge.analysis.orders import Family, Line, Order, System, spectrum
+from hdbridge.analysis.separable import Solution
+from hdbridge.effects import FloatArray, IntArray, Part
+from hdbridge.model import TransmissionModel
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+CLUSTERS = 100
+"""The record is cut into about so many stretches for the sandwich."""
+
+
+def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> FloatArray:
+    """Covariance of the solution's columns, shape (p, p)."""
+    model = inverse_symmetric(solution.information)
+    number = clusters(blocks, CLUSTERS)
+    # Turns are noise (each has one stretch to itself), not parameters: they have no scores of their own.
+    main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]
+    if int(number[-1]) + 1 < 2 * len(main):
+        return model
+    inner = model[np.ix_(main, main)]
+    weighted = precision.apply(solution.residual)
+    spread = sandwich(solution.jacobian[:, main] @ inner * weighted[:, np.newaxis], number)
+    widen = np.ones(len(model))
+    widen[main] = np.sqrt(np.maximum(np.diag(spread) / np.maximum(np.diag(inner), 1e-300), 1.0))
+    orders = {at for at, each in enumerate(solution.effects) if each.part is Part.ORDERS}
+    waves = [at for at, each in enumerate(solution.columns) if each.effect in orders]
+    if waves:
+        between = math.sqrt(_between_legs(solution.jacobian[:, waves], precision, solution.residual, blocks))
+        widen[waves] = np.maximum(widen[waves], between)
+    return np.asarray(model * np.outer(widen, widen))
+
+
+def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]:
+    """Intervals of one effect's parameters by the covariance of a solution's columns."""
+    mine = [at for at, column in enumerate(solution.columns) if column.effect == index]
+    columns = [solution.columns[at] for at in mine]
+    return intervals_of(solution.effects[index], columns, cov[np.ix_(mine, mine)])
+
+
+def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
+    """By how much the variance of waves, taken from leg to leg, is more than the noise model's; at least 1.
+
+    Waves (b, p) of one kind have nearly the same information and hardly share any, so that each tells of all.
+    """
+    scores = sums(waves * precision.apply(residual)[:, np.newaxis], blocks.leg)
+    own = sums(waves * precision.apply(waves), blocks.leg)
+    information = np.sum(own, axis=0)
+    legs = information**2 / np.sum(own**2, axis=0)
+    ratio = np.sum(scores**2, axis=0) / information * legs / np.maximum(legs - 1.0, 0.5)
+    return max(float(np.mean(ratio)), 1.0)
+
+
+# What is left, questioned: does it hang on the motor angle, the load angle, the direction, the time?
+
+
+SURE = 3.0
+"""Standard errors that a difference must have."""
+WORTH_ARCSEC = 0.3
+"""What is smaller than this is not reported as a failure, however sure it is."""
+LEAST_TOLD_ARCSEC = 0.005
+"""What would be told as 0.00 is left out."""
+
+
+def residual_tests(
+    residual: FloatArray,
+    blocks: Blocks,
+    precision: Precision,
+    left: Sequence[Line],
+    figures: NoiseFigures,
+) -> tuple[ResidualTest, ...]:
+    """All tests; ``left`` are the orders that are not in the fit."""
+    return (
+        _orders("motor_angle", [each for each in left if each.order.family is not Family.LOAD]),
+        _orders("load_angle", [each for each in left if each.order.family is Family.LOAD]),
+        _contrast("direction", np.sign(blocks.speed_deg_s) * blocks.moving, residual, precision, 2.0),
+        _contrast("time", _centred(blocks.time_s), residual, precision, 1.0),
+        _whiteness(figures.model),
+        _level(figures),
+    )
+
+
+def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
+    significant = [each for each in left if each.significant]
+    worst = max(significant, key=lambda each: each.amplitude_arcsec, default=None)
+    size = worst.amplitude_arcsec if worst else 0.0
+    text = f"{worst.order} of {size:.2f} arcsec is left" if worst else "no order is left"
+    return ResidualTest(name, size < WORTH_ARCSEC, size, text)
+
+
+def _contrast(
+    name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
+) -> ResidualTest:
+    """Generalised least squares of the residual on one column and the mean; size: ``scale`` columns."""
+    columns = np.stack([np.ones(len(column)), column], axis=1)
+    weighted = precision.apply(columns)
+    information = columns.T @ weighted
+    if np.linalg.cond(information) > 1e12:
+        return ResidualTest(name, True, 0.0, f"the record does not vary in {name}")
+    inverse = np.linalg.inv(information)
+    value = float((inverse @ (weighted.T @ residual))[1]) * scale
+    error = math.sqrt(max(inverse[1, 1], 0.0)) * scale
+    passed = abs(value) < max(SURE * error, WORTH_ARCSEC)
+    return ResidualTest(name, passed, abs(value), f"{value:+.2f} arcsec, standard error {error:.2f}")
+
+
+def _centred(time_s: FloatArray) -> FloatArray:
+    span = float(np.ptp(time_s))
+    return (time_s - np.mean(time_s)) / span if span else np.zeros(len(time_s))
+
+
+def _whiteness(noise: NoiseModel) -> ResidualTest:
+    size = math.hypot(noise.slow_arcsec, noise.place_arcsec)
+    wanders = [
+        f"by {arcsec:.2f} arcsec within {span}"
+        for arcsec, span in (
+            (noise.slow_arcsec, f"{noise.slow_s:.1f} s"),
+            (noise.place_arcsec, f"{noise.place_deg:.2f} deg of the motor"),
+        )
+        if arcsec >= LEAST_TOLD_ARCSEC
+    ]
+    text = f"wanders {' and '.join(wanders)}; the intervals allow for it" if wanders else "does not wander"
+    return ResidualTest("whiteness", size < WORTH_ARCSEC, size, text)
+
+
+def _level(figures: NoiseFigures) -> ResidualTest:
+    rest = figures.standing_arcsec
+    if rest is None:
+        return ResidualTest("noise_level", True, 0.0, "the axis never stood long enough to tell its noise")
+    size = math.sqrt(max(figures.fitted_arcsec**2 - rest**2, 0.0))
+    text = f"{figures.fitted_arcsec:.2f} arcsec is left, at rest the noise is {rest:.2f}"
+    return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
+
+
+# Quality on data that the fit has not seen: parts are left out, fitted without, and predicted.
+
+
+FOLDS = 4
+STRETCHES = 40
+"""Of time, of which a fold takes every fourth."""
+RECORDINGS = "recordings"
+CELL_DEG = 30.0
+SAME_WAY = 0.8
+"""A recording went where others did when so much of it lies in cells of the motor angle that they saw."""
+
+
+def held_out(
+    state: State, solution: Solution, measured_arcsec: FloatArray, inside_variance: float
+) -> HeldOut:
+    """Leave out one fold at a time, and compare with the active model, or none.
+
+    ``measured_arcsec`` (b,) is what was measured, before any delay was put right; ``inside_variance`` is what
+    samples vary inside their blocks, which no model of this kind changes.
+    """
+    design, blocks, active = state.design, state.design.blocks, state.options.active
+    fold, over = folds(design)
+    written = {place for place, each in enumerate(solution.effects) if not each.violations()}
+    shift = [at for at, each in enumerate(solution.columns) if each.effect < 0]
+    kept = shift + [at for at, each in enumerate(solution.columns) if each.effect in written]
+    rest_arcsec = blocks.error_arcsec - solution.jacobian[:, shift] @ solution.nuisances[shift]
+    added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
+    # The active model has no nuisances of its own: it is given those that suit it best.
+    own = active.effects if active else ()
+    new = [solution.effects[place] for place in sorted(written)]
+    for row, (effects, of) in enumerate(((own, shift), (new, kept))):
+        told, columns = design.told(effects), solution.jacobian[:, of]
+        fit = Linearised(columns, rest_arcsec - told, solution.known[of])
+        steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
+        for number, step in enumerate(steps):
+            out = fold == number
+            # About the zeros that the rest of the data have; about its own where one is in this fold alone.
+            lost = ~np.isin(blocks.zero, blocks.zero[~out])
+            left = fit.residual - columns @ step
+            added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
+            left = measured_arcsec - told - columns[:, len(shift) :] @ step[len(shift) :]
+            alone[row, out] = about_zeros(left, blocks.zero, blocks.count * (lost | ~out))[out]
+    used = len(fold) - np.bincount(fold)[fold] >= 2 * len(solution.columns)
+    weight = blocks.count * used
+    if not np.sum(weight):
+        return HeldOut(
+            None, None, math.nan, "nothing was held out: there is too little data to leave any out"
+        )
+    stretch = blocks.chain if over == RECORDINGS else clusters(blocks, STRETCHES)
+    number = len(np.unique(fold[used]))
+
+    def gain(left: FloatArray) -> Gain:
+        rows = np.stack([weight, *(weight * (each**2 + inside_variance) for each in left)], axis=1)
+        return Gain(over, number, *sums(rows, stretch).T)
+
+    fitted = math.sqrt(float(weight @ solution.residual**2) / float(np.sum(weight)) + inside_variance)
+    result = HeldOut(gain(alone), gain(added), fitted, "")
+    assert result.gain is not None
+    words = "improves on" if result.improves else "does not improve on"
+    against = "the active model" if active else "no model"
+    figures = f"{result.gain.before_arcsec:.2f} to {result.gain.after_arcsec:.2f} arcsec"
+    return replace(result, text=f"{words} {against}: {figures} on {over} left out")
+
+
+def folds(design: Design) -> tuple[IntArray, str]:
+    """Which fold each block is in, and what is left out in words.
+
+    Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
+    reversals) by stretches of time, so that no fold takes all there is to know about a reversal. Of several
+    short recordings of the same travel whole ones: what is left in one of them goes on from one
+    stretch to the next, and would be foretold by its neighbours.
+    """
+    blocks = design.blocks
+    lowest = float(np.min(blocks.motor_deg))
+    turns = float(np.ptp(blocks.motor_deg)) / DEG_PER_TURN
+    by_turn = np.floor((blocks.motor_deg - lowest) / DEG_PER_TURN).astype(np.intp) % FOLDS
+    by_time = clusters(blocks, STRETCHES) % FOLDS
+    if turns < 2 * FOLDS:
+        return (blocks.chain % FOLDS, RECORDINGS) if _alike(design) else (by_time, "stretches of time")
+    local = design.samples.among(blocks.kind, ("sine", "reversal"))
+    words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
+    return counted(np.where(local, by_time, by_turn)), words
+
+
+def _alike(design: Design) -> bool:
+    """Whether there are recordings of which nothing is known but that each went where others did."""
+    blocks = design.blocks
+    if np.any(design.samples.among(blocks.kind, KNOWN)) or int(blocks.chain[-1]) == 0:
+        return False
+    cell = np.floor(blocks.motor_deg / CELL_DEG).astype(np.intp)
+    for chain in range(int(blocks.chain[-1]) + 1):
+        own = blocks.chain == chain
+        if np.any(own) and np.mean(np.isin(cell[own], cell[~own])) < SAME_WAY:
+            return False
+    return True
+
+
+# Everything that is derived from the final solution, put together.
+
+
+MOST_NAMED = 4
+"""Orders that are named one by one."""
+
+
+def conclude(
+    state: State, solution: Solution, cov: FloatArray, system: System, warnings: list[str]
+) -> FitResult:
+    """The result of an identification; ``system`` is the state's, with the final noise."""
+    design, blocks, samples = state.design, state.design.blocks, state.design.samples
+    precision, chosen = state.precision(), state.selection.chosen
+    intervals = [each for index in range(len(solution.effects)) for each in of_effect(solution, index, cov)]
+    effects = tuple(each for each in solution.effects if not each.violations())
+    uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
+    inside = _inside_variance(design, solution, state.columns().columns @ solution.nuisances)
+    # Samples were put right by the delay, which no model holds.
+    measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
+    written = about_zeros(measured - design.told(effects), blocks.zero, blocks.count)
+
+    def rms(left_arcsec: FloatArray) -> float:
+        return math.sqrt(float(blocks.count @ left_arcsec**2) / float(np.sum(blocks.count)) + inside)
+
+    ones = np.ones(len(blocks))
+    figures = NoiseFigures(
+        standing_arcsec=standing_arcsec(samples),
+        laps_arcsec=laps_arcsec(samples),
+        model=state.noise,
+        residual_arcsec=rms(written),
+        fitted_arcsec=rms(solution.residual),
+        samples=int(np.sum(blocks.count)),
+        effective_samples=rms(solution.residual) ** 2 * float(ones @ precision.apply(ones)),
+    )
+    further = {
+        column.name: (value, NORMAL_95 * math.sqrt(max(variance, 0.0)))
+        for column, value, variance in zip(
+            solution.columns, solution.nuisances.tolist(), np.diag(cov).tolist(), strict=False
+        )
+    }
+    zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
+    waves = design.told([each for each in solution.effects if each.part is Part.ORDERS])
+    lines = spectrum(state.candidates, chosen, system, state.options.family_wise)
+    _describe_limits(state, lines, warnings)
+    used = blocks.count > 0  # a block all of whose samples were given no weight has no mean to be drawn
+    return FitResult(
+        model=TransmissionModel(samples.ratio, effects, uncertainty),
+        intervals=tuple(intervals),
+        zeros_arcsec=zeros,
+        nuisances=_nuisances(state, further),
+        noise=figures,
+        outliers=state.outliers,
+        orders=tuple(each for each in lines if each.order in chosen and each.order.family is Family.MOTOR),
+        spectrum=lines,
+        residual_tests=residual_tests(
+            solution.residual,
+            blocks,
+            precision,
+            [each for each in lines if each.order not in chosen],
+            figures,
+        ),
+        held_out=held_out(state, solution, measured, inside),
+        traces=Traces(
+            time_s=blocks.time_s[used],
+            motor_deg=blocks.motor_deg[used],
+            load_deg=(blocks.motor_deg / samples.ratio + blocks.error_arcsec / ARCSEC_PER_DEG)[used],
+            direction=(blocks.heading * blocks.moving)[used],
+            kind=samples.kinds,
+            kind_index=blocks.kind[used],
+            error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
+            predicted_arcsec=design.told(solution.effects)[used],
+            residual_arcsec=written[used],
+            orders_arcsec=(solution.residual + waves)[used],
+        ),
+        warnings=tuple(warnings),
+    )
+
+
+def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) -> float:
+    """Variance of the residual of samples about the mean of their block."""
+    blocks = design.blocks
+    residual = design.residual(solution.effects, nuisances)
+    off = residual[blocks.index] - np.repeat(blocks.mean(residual), blocks.sizes)
+    return float(blocks.weight @ off**2) / max(float(np.sum(blocks.count)), 1.0)
+
+
+def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tuple[Nuisance, ...]:
+    """What of all that was fitted in addition (``further``: value and half width) has a meaning."""
+    found = []
+    for name in state.nuisances:
+        if name in TEXTS and name in further:
+            value, half = further[name]
+            value += state.delay_ms if name == DELAY else 0.0
+            found.append(Nuisance(name, TEXTS[name], value, half, UNITS[name]))
+    for order in _not_the_motors(state):
+        cosine, sine = further[f"{order} cosine"], further[f"{order} sine"]
+        text = f"an error that repeats with {order}, which the model has no part for"
+        size = math.hypot(cosine[0], sine[0])
+        found.append(Nuisance(str(order), text, size, max(cosine[1], sine[1]), "arcsec"))
+    return tuple(found)
+
+
+def _not_the_motors(state: State) -> list[Order]:
+    return [each for each in state.selection.chosen if each.family is not Family.MOTOR]
+
+
+def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -> None:
+    """Warnings about what the record's angles cannot tell apart, and about samples left out."""
+    samples, outliers = state.design.samples, state.outliers
+    for alike in _families(lines):
+        warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
+    if state.selection.unresolved:
+        unresolved = _named(state.selection.unresolved)
+        warnings.append(f"{unresolved} cannot be distinguished from what else was fitted")
+    load_turns = float(np.ptp(state.design.blocks.motor_deg)) / DEG_PER_TURN / samples.ratio
+    if load_turns < 0.95:
+        warnings.append(
+            f"the record spans {load_turns:.2f} load turns: errors that repeat with the "
+            "load turn cannot be seen and may bend the rest; sweep over two"
+        )
+    if outliers.samples:
+        share = outliers.samples / len(samples)
+        warnings.append(
+            f"{outliers.samples} samples ({share:.2%}, at most {outliers.longest_run} in a row) stand out "
+            "from their neighbours and were given no weight: look for lost counts, plugs, shields"
+        )
+    for order in _not_the_motors(state):
+        warnings.append(
+            f"{order} shows in this record; the model has no part for it, a diagnosis may name it"
+        )
+
+
+def _families(lines: Sequence[Line]) -> list[list[Order]]:
+    """Orders that hang together as aliases of each other."""
+    alike = [[other.order in each.aliases for other in lines] for each in lines]
+    number = connected_components(np.array(alike).reshape(len(lines), -1))[1].tolist() if lines else []
+    families = [
+        [each.order for each, own in zip(lines, number, strict=True) if own == one]
+        for one in range(len(lines))
+    ]
+    return [each for each in families if len(each) > 1]
+
+
+def _named(orders: Sequence[Order]) -> str:
+    """Their names; of many only the first and the last."""
+    if len(orders) > MOST_NAMED:
+        return f"{orders[0]} to {orders[-1]} ({len(orders)} orders)"
+    return " and ".join(map(str, orders))

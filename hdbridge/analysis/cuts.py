@@ -1,0 +1,132 @@
+"""Where a record is no record of one motion: cuts between what was put together, readings that are none.
+
+A motor cannot be somewhere else in the next sample. Where a record says so it was put together from several,
+and nothing is known of the axis in between; or, where the next sample or two are back, they were misread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from hdbridge.analysis.readings import coarse, spread
+from hdbridge.effects import FloatArray
+from hdbridge.records.record import Record
+from hdbridge.units import ARCSEC_PER_DEG
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+FASTEST_DEG_S2 = 1e6
+"""Acceleration of a small servo motor on its peak torque (17,000 rad/s^2); with a wave generator on its shaft
+it has less."""
+JUMP_DEG = 30.0
+"""Motor angle that is no noise, no count and no lost count."""
+SPIKE_ARCSEC = 900.0
+"""No gear's error goes there and back from one sample to the next."""
+SLOWEST_S = 1.0
+"""A record needs a few samples per motor turn; nobody samples a bench once in so long."""
+MISREAD_ROWS = 2
+"""A reading that is none lasts no longer than so many samples."""
+MISREAD_SHARE = 0.01
+"""Of more samples than this something else is wrong."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """A record without readings that are none, taken apart where it is cut."""
+
+    record: Record
+    remarks: tuple[str, ...]
+    """What was left out and where it was cut, in words."""
+    cuts: tuple[int, ...] = ()
+    """The rows before which nothing is known of the axis; some of ``record.starts``."""
+
+
+def observed(record: Record, ratio: float) -> Observed:
+    """What a record says was observed; the same record where nothing is wrong with it."""
+    remarks = []
+    if repeated := sum(coarse(part.time_s, part.motor_position_deg) for part in record.parts()):
+        remarks.append(
+            f"{_name(record)}{repeated} of {len(record)} samples have the time of the one before, though the "
+            "motor has moved on: a clock coarser than the sampling; the samples are spread evenly over its "
+            "ticks"
+        )
+        times = np.concatenate([spread(part.time_s) for part in record.parts()])
+        record = replace(record, columns={**record.columns, "time_s": times})
+    kept = np.ones(len(record), dtype=np.bool_)
+    for first, end in _edges(record):
+        kept[first:end] = ~_misread(record.rows(first, end), ratio)
+    if not np.all(kept):
+        rows = np.flatnonzero(~kept)
+        remarks.append(
+            f"{_name(record)}{len(rows)} of {len(record)} samples left out, as their angles jump there and "
+            f"back (the first is number {rows[0] + 1}, at {record.time_s[rows[0]]:g} s): misread"
+        )
+        record = _picked(record, kept)
+    cuts = [int(row) + 1 for row in jumps(record.motor_position_deg, record.time_s)]
+    new = sorted(set(cuts) - set(record.starts))
+    if new:
+        step = record.motor_position_deg[new[0]] - record.motor_position_deg[new[0] - 1]
+        remarks.append(
+            f"{_name(record)}cut where the motor jumps ({step:+.0f} deg before {record.time_s[new[0]]:g} s"
+            f"{f', and {len(new) - 1} more' if len(new) > 1 else ''}): nothing is known of the axis between "
+            "the parts"
+        )
+        record = replace(record, starts=tuple(sorted({*record.starts, *new})))
+    steps = np.diff(record.time_s)
+    period_s = float(np.median(steps)) if len(steps) else 0.0
+    if period_s >= SLOWEST_S and float(np.ptp(record.motor_position_deg)) > 0.0:
+        remarks.append(
+            f"{_name(record)}time_s goes on by {period_s:g} s from sample to sample, too slow to see a motor "
+            "turn: if these are milliseconds, divide them by 1000"
+        )
+    return Observed(record, tuple(remarks), tuple(cuts))
+
+
+def _edges(record: Record) -> list[tuple[int, int]]:
+    return list(zip(record.starts, (*record.starts[1:], len(record)), strict=True))
+
+
+def _name(record: Record) -> str:
+    return f"{record.source}: " if record.source else ""
+
+
+def _picked(record: Record, kept: BoolArray) -> Record:
+    before = np.concatenate([[0], np.cumsum(kept)])
+    starts = tuple(dict.fromkeys(int(before[each]) for each in record.starts))
+    columns = {name: column[kept] for name, column in record.columns.items()}
+    return replace(record, columns=columns, starts=starts)
+
+
+def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
+    """The steps from one sample to the next that no motor can make from the speed before or after."""
+    step, time = np.diff(motor_deg), np.maximum(np.diff(time_s), 1e-6)
+    if not len(step):
+        return np.empty(0, dtype=np.intp)
+    speed = step / time
+    before = np.concatenate([[0.0], speed[:-1]])
+    after = np.concatenate([speed[1:], [0.0]])
+    excess = np.minimum(np.abs(speed - before), np.abs(speed - after)) * time
+    return np.flatnonzero((excess > JUMP_DEG) & (4.0 * excess / time**2 > FASTEST_DEG_S2))
+
+
+def _misread(record: Record, ratio: float) -> BoolArray:
+    """Samples at which one of the angles, or both, are elsewhere, and back at once."""
+    window = 2 * MISREAD_ROWS + 1
+    found = np.zeros(len(record), dtype=np.bool_)
+    if len(record) <= 2 * window:
+        return found
+    error = (record.load_position_deg - record.motor_position_deg / ratio) * ARCSEC_PER_DEG
+    found |= np.abs(error - median_filter(error, window, mode="mirror")) > SPIKE_ARCSEC
+    rows = jumps(record.motor_position_deg, record.time_s).tolist()
+    for out, back in pairwise(rows):
+        away = record.motor_position_deg[out + 1] - record.motor_position_deg[out]
+        returned = record.motor_position_deg[back + 1] - record.motor_position_deg[out]
+        if back - out <= MISREAD_ROWS and abs(returned) < 0.5 * abs(away):
+            found[out + 1 : back + 1] = True
+    return found if np.mean(found) <= MISREAD_SHARE else np.zeros(len(record), dtype=np.bool_)

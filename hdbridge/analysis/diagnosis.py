@@ -1,0 +1,385 @@
+"""From a measurement and a model to a diagnosis: the steps in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hdbridge.analysis import changes
+from hdbridge.analysis.acceptance import gate
+from hdbridge.analysis.calibrated import calibrated
+from hdbridge.analysis.checks import check_once, check_records, zeros_apart_arcsec
+from hdbridge.analysis.cuts import observed
+from hdbridge.analysis.extend import as_named, extended_model, supported
+from hdbridge.analysis.findings import (
+    UNWEIGHED,
+    Diagnosis,
+    Figures,
+    Finding,
+    Traces,
+    for_unexplained,
+    next_experiment,
+)
+from hdbridge.analysis.gain import held_out
+from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.analysis.identifiability import identifiability
+from hdbridge.analysis.linear import about_zeros
+from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
+from hdbridge.analysis.prepared import gather
+from hdbridge.analysis.probability import Context, weighed
+from hdbridge.analysis.scales import Scales
+from hdbridge.analysis.search import (
+    Search,
+    as_calibrated,
+    lookalikes,
+    waves_alike,
+    with_measured,
+)
+from hdbridge.analysis.unexplained import (
+    LESS,
+    Rest,
+    does_more,
+    doubtful_loops,
+    is_unexplained,
+    many_of_one,
+    of_the_loop,
+    rest,
+    unfitted,
+)
+from hdbridge.effects import Channel, Effect, FloatArray, Part, Start, unmet
+from hdbridge.effects.base import missing_error
+from hdbridge.effects.kinematics import direction_of
+from hdbridge.effects.torque import beyond_limit
+from hdbridge.model import TransmissionModel
+from hdbridge.records.given import Given, agreed_ratio, by_name
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Recording
+
+FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
+
+
+def diagnose(
+    recording: Given,
+    model: TransmissionModel,
+    *,
+    independent_zeros: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+    scales: Scales | None = None,
+) -> Diagnosis:
+    """Say how the model differs from one or several recordings, and why; ``.as_dict()`` is the document.
+
+    ``independent_zeros`` says that the encoders' zeros were lost between them. ``progress`` receives what is
+    being done, in words. ``scales`` are the numbers that
+    decide, where they shall be others. InputError where a
+    recording is too short, was made by no axis of the model's ratio, or lacks a channel that the model needs.
+    """
+    recordings = by_name(recording)
+    agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
+    check_once(list(recordings), [each.record for each in recordings.values()])
+    check_records({name: each.record for name, each in recordings.items()}, model.ratio)
+    whole = Recording.joined(list(recordings.values()))
+    record, legs = whole.record, whole.segments
+    remarks = (
+        () if independent_zeros else _of_zeros(observed(record, model.ratio).record.parts(), model.ratio)
+    )
+    lacking = unmet(model.effects, record.motion().available() | {Channel.LOAD_ANGLE})
+    for name, channels in lacking.items():
+        if channels:
+            raise missing_error(name, channels)
+    progress("preparing the record")
+    data = gather(
+        record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
+    )
+    estimator = Estimator(data, scales or Scales())
+    estimator.calibrated = calibrated(
+        model.effects,
+        model.uncertainty,
+        lambda effect: estimator.columns(effect, Start.VIRGIN),
+        estimator.scales,
+    )
+    search = Search(estimator, model.effects)
+    first = unfitted(estimator, model.effects)
+    held = beyond_limit(model.effects, data.full.motion)
+    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
+    estimator.data = data
+    progress("searching for causes")
+    found = search.run()
+    progress("judging what was found")
+    diagnosis = _Judge(search, model, bool(first)).of(found)
+    return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+
+
+def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
+    """A remark where the zeros of the recordings do not agree."""
+    apart = zeros_apart_arcsec(parts, ratio)
+    if apart is None:
+        return ()
+    return (
+        f"the zeros of the records are {apart:.0f} arcsec apart, more than their own errors: if the "
+        "encoders' zeros were lost between them, say so (on the command line: --independent-zeros)",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    fitted: Fitted
+    """Without a loop of free form."""
+    findings: list[Finding]
+    left: Rest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judge:
+    search: Search
+    model: TransmissionModel
+    unfitted: bool
+    """Whether the model lacks most of what the axis has."""
+    considered: list[str] = field(default_factory=list)
+    """What is not named, with the reason."""
+
+    @property
+    def estimator(self) -> Estimator:
+        return self.search.estimator
+
+    def of(self, fitted: Fitted) -> Diagnosis:
+        """The diagnosis, from where the search has ended."""
+        estimator, given = self.estimator, self.model.effects
+        base = len(given)
+        fitted = self.search.eliminated(fitted, self._stopped, self.considered)
+        fitted = self.search.eliminated(fitted, self._shadow, self.considered)
+        fitted = with_measured(self.search, fitted)
+        fitted = as_calibrated(estimator, fitted, given)
+        judged = self._likely_only(fitted)
+        fitted, findings = judged.fitted, judged.findings
+        known = {each.cause for each in findings} | {each.split(":")[0] for each in self.considered}
+        refused = self.search.told_refusals(fitted)
+        self.considered.extend(each for each in refused if each.split(":")[0] not in known)
+        findings = self._with_unexplained(findings, judged.left)
+        refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
+        fitted = as_named(estimator, fitted, given, {each.cause for each in findings})
+        spread = covariance(estimator, fitted)
+        alone = {each.cause for each in findings if each.left_alone}
+        sound = supported(estimator, fitted, given, alone)
+        fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
+        named = {each.cause for each in findings if not each.within}
+        chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
+        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
+        # Of the model as it was given with the start that suits it best.
+        each_start = (self._left_by(given, start) for start in Start)
+        before = min(each_start, key=lambda error: float(error @ error))
+        after = self._left_by(extended.effects, fitted.hypothesis.start)
+        measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
+        return Diagnosis(
+            baseline=_figures(before),
+            refitted=_figures(refitted.residual / estimator.weight),
+            extended=_figures(after),
+            noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
+            findings=tuple(findings),
+            identifiability=identifiability(estimator, fitted, given),
+            by_kind=self._by_kind(before, after),
+            remarks=estimator.data.remarks,
+            model=extended,
+            traces=Traces(
+                measured_arcsec=measured,
+                model_arcsec=measured - before,
+                extended_arcsec=measured - after,
+                motion=estimator.motion,
+                rows=estimator.index,
+                samples=estimator.data.full.motion,
+                runs=estimator.data.runs,
+                start=fitted.hypothesis.start,
+            ),
+            considered=tuple(dict.fromkeys(self.considered)),
+            scales=estimator.scales,
+        )
+
+    def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
+        """Of what a gate stops the weakest; without any, what cannot be as it has come out."""
+        places = range(len(self.model.effects), len(fitted.hypothesis.effects))
+        gates = {place: gate(self.estimator, fitted, place) for place in places}
+        stopped = [place for place, each in gates.items() if each.reason]
+        if stopped:
+            place = min(stopped, key=lambda each: gates[each].robust / gates[each].needed)
+            return place, gates[place].reason
+        data = self.estimator.data
+        for place in places:
+            effect = fitted.hypothesis.effects[place]
+            if reason := effect.implausible(data) or effect.unidentifiable(data):
+                return place, reason
+        return None
+
+    def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
+        """Of names that do less than what is left unexplained in addition, and may be a shadow of that, the
+        one that does least.
+        """
+        estimator, base = self.estimator, len(self.model.effects)
+        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # what is fast casts no shadow
+        if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
+            return None
+        share = {
+            place: does_more(estimator, fitted, place)
+            for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
+            # What is left has no such line, and casts no shadow there; or any axis has it.
+            if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
+        }
+        place = min(share, key=lambda each: share[each], default=-1)
+        if place < 0 or share[place] > estimator.scales.shadow:
+            return None
+        return place, LESS
+
+    def _likely_only(self, fitted: Fitted) -> _Judged:
+        """The findings, without those that are not likely enough to be named, which leave the fit too, and
+        without those that any axis has.
+        """
+        base = len(self.model.effects)
+        while True:
+            judged, words = self._judged(fitted)
+            likely = [
+                each for each in judged.findings if each.probability >= self.estimator.scales.named_from
+            ]
+            doubted = [each for each in judged.findings if each not in likely]
+            self.considered.extend(f"{each.cause}: more likely something else" for each in doubted)
+            effects = {id(each.effect) for each in doubted}
+            kept = [
+                each
+                for i, each in enumerate(fitted.hypothesis.effects)
+                if i < base or id(each) not in effects
+            ]
+            if len(kept) == len(fitted.hypothesis.effects):
+                break  # what is left of them are changes of the baseline, which it keeps
+            fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
+        usual = {each.cause for each in likely if _ordinary(each)}
+        self.considered.extend([*words, *(f"{cause}: no more than usual" for cause in sorted(usual))])
+        return replace(judged, findings=[each for each in likely if each.cause not in usual])
+
+    def _judged(self, fitted: Fitted) -> tuple[_Judged, list[str]]:
+        """What a hypothesis finds, how sure that is, and in words what of it is not named."""
+        estimator, base = self.estimator, len(self.model.effects)
+        precise = precisely(estimator, fitted)
+        spread = covariance(estimator, precise)
+        findings = [
+            replace(self._finding(fitted, place), parameters=parameters_of(estimator, precise, place, spread))
+            for place in range(base, len(fitted.hypothesis.effects))
+        ]
+        findings += changes.findings(self.search, self.model, fitted, precise, spread)
+        findings.sort(key=lambda each: -each.robust)
+        excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
+        # A model cannot hold a free-form loop: figures are without it.
+        fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
+        left = rest(estimator, fitted)
+        unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
+        doubtful = doubtful_loops(estimator, findings, left) if unknown else []
+        if doubtful:  # what they do is left, too
+            findings = [each for each in findings if each not in doubtful]
+            left = rest(estimator, self._with_given_loop(fitted))
+        words = [f"{each.cause}: {LESS}" for each in doubtful]
+        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
+        if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+            most = estimator.scales.one_way
+            findings = [replace(each, probability=min(each.probability, most)) for each in findings]
+        return _Judged(fitted, findings, left), words
+
+    def _with_given_loop(self, fitted: Fitted) -> Fitted:
+        given = self.model.effects
+        hypothesis, loops = fitted.hypothesis, {i for i, each in enumerate(given) if each.part is Part.LOOP}
+        for place in loops:
+            hypothesis = hypothesis.instead(place, given[place])
+        with self.search.held(loops):
+            return self.estimator.fit(hypothesis)
+
+    def _finding(self, fitted: Fitted, place: int) -> Finding:
+        effect = fitted.hypothesis.effects[place]
+        without = self.estimator.fit(fitted.hypothesis.without(place))
+        aliases = self._aliases(fitted, without, place)
+        return Finding(
+            cause=effect.name,
+            probability=UNWEIGHED,
+            aliases=aliases,
+            parameters={},
+            gain=held_out(self.estimator, fitted, without),
+            experiment=next_experiment(effect.name, aliases),
+            peak_arcsec=self.search.peak(fitted, place),
+            robust=without.chi_square - fitted.chi_square,
+            effect=effect,
+            gate=gate(self.estimator, fitted, place),
+        )
+
+    def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
+        """Other causes that do nearly as well in its place."""
+        effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
+        alike = lookalikes(effect, self.estimator.data.ratio)
+        names = [
+            *self.search.as_well(fitted, without, effect.name),
+            *waves_alike(self.estimator, [effect], fitted.hypothesis.start),
+            *(kind.name for kind, _ in alike if kind.channels - available),
+            *(each.name for each in confounded(self.estimator, fitted, place)),
+        ]
+        return tuple(dict.fromkeys(names))
+
+    def _with_unexplained(self, findings: list[Finding], left: Rest) -> list[Finding]:
+        scales = self.estimator.scales
+        many = many_of_one(findings, scales)
+        if many is None and not is_unexplained(self.estimator, left):
+            return findings
+        size, lives = left.peak_arcsec, left.lives_in
+        if many is not None:
+            size = max(each.peak_arcsec for each in many)
+            effect = many[0].effect
+            if effect is not None and effect.waves():
+                lives = effect.coordinate(self.estimator.motion, self.estimator.data.ratio).name
+            findings = [each for each in findings if each not in many]
+        unknown = Finding(
+            cause="unexplained",
+            probability=min(1.0 / (1.0 + (scales.floor_arcsec / max(size, 1e-9)) ** 2), scales.surest),
+            aliases=(),
+            parameters={},
+            gain=None,
+            left_arcsec=left.arcsec,
+            experiment=FIT_FIRST if self.unfitted else for_unexplained(lives),
+            peak_arcsec=size,
+            lives_in=lives,
+            note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
+        )
+        loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
+        if many is None and loops and of_the_loop(self.estimator, left):
+            # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
+            note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
+            told = replace(loops[0], note=note, lives_in=lives)
+            return [told if each is loops[0] else each for each in findings]
+        largest = max((each.peak_arcsec for each in findings), default=0.0)
+        return [*findings, unknown] if largest > size else [unknown, *findings]
+
+    def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
+        """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
+        estimator = self.estimator
+        left = estimator.observed - estimator.told(effects, start)
+        return about_zeros(left, estimator.zero, estimator.weight**2)
+
+    def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
+        estimator = self.estimator
+        points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
+        masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
+        if len(masks) == 1:  # without legs by whether it stands, is slow or fast
+            speed = np.abs(points.speed_deg_s)
+            slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
+            either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}
+            masks = {name: each[estimator.index] for name, each in either.items()}
+        masks |= {"forward": direction > 0, "backward": direction < 0}
+        return {
+            name: (_figures(given[rows], about_zero=True), _figures(after[rows], about_zero=True))
+            for name, rows in masks.items()
+            if np.count_nonzero(rows) > 10
+        }
+
+
+def _ordinary(finding: Finding) -> bool:
+    """Whether any axis has as much of it."""
+    return finding.effect is not None and finding.peak_arcsec < finding.effect.ordinary_arcsec
+
+
+def _figures(values: FloatArray, about_zero: bool = False) -> Figures:
+    rms = float(np.sqrt(np.mean(values**2)))
+    return Figures(rms, 3.0 * (rms if about_zero else float(np.std(values))))

@@ -1,0 +1,79 @@
+"""The extended model: the refitted baseline and what was found, with uncertainty and provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hdbridge.analysis.hypothesis import Estimator, Fitted
+from hdbridge.analysis.intervals import intervals_of, nested_half_widths
+from hdbridge.effects import Effect, FloatArray, Part, conflicts, extended, in_place
+from hdbridge.model import TransmissionModel
+
+
+def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:
+    """The fit with the ``given`` law of the loop, where another one does better but was not named."""
+    for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
+        if type(old) is not type(new) and new.changes is not None and new.name not in named:
+            return estimator.fit(fitted.hypothesis.instead(place, *in_place(new, [type(old)])))
+    return fitted
+
+
+def supported(
+    estimator: Estimator, fitted: Fitted, given: Sequence[Effect], alone: Container[str] = ()
+) -> tuple[Effect, ...]:
+    """The hypothesis's effects, but those of the baseline as ``given`` where the record cannot tell them.
+
+    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record;
+    a change of those to be left ``alone`` may be another cause's doing.
+    """
+    start = fitted.hypothesis.start
+    one_way = estimator.data.reversals < 2
+    result = list(fitted.hypothesis.effects)
+    for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
+        if new.name in alone or (new.part is Part.LOOP and one_way):
+            result[place] = old
+        elif old.part is Part.ORDERS and len(old.coefficients()):
+            change = new.fitted(new.coefficients() - old.coefficients())
+            seen = 0.5 * float(np.ptp(estimator.does(change, start)))
+            if change.largest_piece_arcsec() > estimator.scales.extrapolated * seen:
+                result[place] = old
+    return tuple(result)
+
+
+def extended_model(
+    model: TransmissionModel,
+    fitted: Fitted,
+    places: Sequence[int],
+    spread: FloatArray,
+    reason: str,
+    base: int,
+) -> TransmissionModel:
+    """``model`` with the fitted baseline (`supported`) and the findings at ``places`` of the hypothesis.
+
+    What else the hypothesis holds was fitted in addition to them and is not written: it was not named.
+    """
+    ratio = model.ratio
+    effects: tuple[Effect, ...] = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])
+    uncertainty: dict[str, dict[str, Any]] = {}
+    chosen = [*range(base), *places]
+    for place in places:
+        effect = fitted.hypothesis.effects[place].tidied(ratio)
+        if effect.violations():
+            continue
+        effects = extended(effects, effect)
+    if conflicts(effects, model.ratio):
+        effects = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])
+    kept = {each.name for each in effects}
+    for place in chosen:
+        effect = fitted.hypothesis.effects[place]
+        if effect.name in kept:
+            own = fitted.places(place)
+            intervals = intervals_of(effect, [fitted.parameters[i] for i in own], spread[np.ix_(own, own)])
+            seen = [each for each in intervals if each.half_width > 0.0]
+            uncertainty[effect.name] = nested_half_widths(effect.tidied(ratio), seen)
+    provenance = {**model.provenance, "reason": reason}
+    return replace(model, effects=effects, uncertainty=uncertainty, provenance=provenance, path=None)

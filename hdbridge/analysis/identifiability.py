@@ -1,0 +1,152 @@
+"""What a record, measured or only planned, could say about each cause: detection limits and look-alikes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from hdbridge.analysis.findings import Identifiability
+from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.analysis.linear import Effort, orthonormal
+from hdbridge.analysis.prepared import gather
+from hdbridge.analysis.screening import candidates
+from hdbridge.analysis.search import lookalikes, waves_alike
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Start, causes
+from hdbridge.model import TransmissionModel
+from hdbridge.procedures.moves import AxisView, MotionLimits
+from hdbridge.procedures.plan import Plan
+from hdbridge.procedures.rehearsal import legs_of
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Segment
+from hdbridge.units import ARCSEC_PER_DEG
+
+# What a record could show: these numbers decide what is said of that, and no name.
+ENOUGH = 8_000
+"""Points that are enough to distinguish shapes."""
+NOT_APART = 0.95
+"""Canonical correlation from which on two causes cannot be distinguished."""
+SHARE_LEFT = 1e-4
+"""Share of a column's squares below which nothing is left of it."""
+WORST_ARCSEC = 30.0
+"""A cause whose limit is higher than this counts as not detectable."""
+INFLATION = 2.5
+"""By how much correlated noise and unknown shapes raise a limit above that of white noise and a known
+shape."""
+
+
+def identifiability(
+    estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
+) -> dict[str, Identifiability]:
+    """For each cause of the catalogue."""
+    best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
+    stride = -(-len(estimator.index) // ENOUGH)
+    # Leaving points out changes what a basis spans over them: made orthonormal anew.
+    basis = orthonormal(fitted.linearised.basis[::stride])
+    weight = estimator.weight[::stride, np.newaxis]
+    for candidate in candidates(estimator.data, base, screened=False):
+        columns = estimator.columns(candidate, fitted.hypothesis.start)
+        low, high = np.quantile(columns, [estimator.rare, 1.0 - estimator.rare], axis=0)
+        columns, span = columns[::stride], high - low
+        seen = span > 1e-12
+        if not np.any(seen):
+            continue
+        unit = weight * columns[:, seen] / (0.5 * span[seen])  # one arcsec at its peak
+        rest = unit - basis @ (basis.T @ unit)
+        squares = np.sum(rest**2, axis=0)
+        size, share = np.sqrt(stride * np.max(squares)), np.max(squares / np.sum(unit**2, axis=0))
+        if candidate.name not in best or size > best[candidate.name][0]:
+            best[candidate.name] = float(size), float(share), rest, candidate
+    spans = {name: orthonormal(rest) for name, (_, _, rest, _) in best.items()}
+    result: dict[str, Identifiability] = {}
+    for cause in causes():
+        if cause not in best:
+            result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
+            continue
+        size, share, rest, example = best[cause]
+        if share < SHARE_LEFT or size <= 0.0:
+            result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
+            continue
+        limit = max(
+            INFLATION * math.sqrt(estimator.scales.penalty * rest.shape[1] + estimator.scales.enter) / size,
+            estimator.scales.floor_arcsec,
+        )
+        own = [*type(example).proposals(estimator.data, ())]  # any of them may be the one
+        waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
+        alike = [
+            name
+            for name in best
+            if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
+        ]
+        result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
+    for candidate in candidates(estimator.data, ()):
+        # What is not measured may look like what is.
+        each = result[candidate.name]
+        for kind, _ in lookalikes(candidate, estimator.data.ratio):
+            if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
+                result[candidate.name] = replace(each, aliases=(*each.aliases, kind.name))
+    return result
+
+
+def _missing(estimator: Estimator, cause: str) -> str:
+    lacking = CATALOGUE[cause].channels - estimator.data.points.motion.available()
+    if lacking:
+        return "not recorded: " + ", ".join(sorted(each.value for each in lacking))
+    return "nothing in this record or model to see it by"
+
+
+def _correlation(one: FloatArray, other: FloatArray) -> float:
+    """Smallest canonical correlation of the smaller space with the larger: all of it has to look alike."""
+    values = np.linalg.svd(one.T @ other, compute_uv=False)
+    return float(np.min(values)) if len(values) else 0.0
+
+
+# Before anything is measured: what a plan's procedures could detect, and what they could not tell apart.
+
+
+PERIOD_S: Final = 0.04
+NOISE_ARCSEC: Final = 0.5
+"""White noise that is assumed of a planned record, of one sample every `PERIOD_S`."""
+LIMITS: Final = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
+"""Limits of the load that are assumed where no axis says."""
+
+
+def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIMITS) -> dict[str, Any]:
+    """Per cause what the plan could say; the part ``identifiability`` of a diagnosis, and how long it
+    takes.
+    """
+    view = AxisView(model.ratio, limits)
+    tasks = plan.tasks(view)
+    places: list[float] = []
+    legs: list[Segment] = []
+    for task in tasks.tasks:
+        for move, path in legs_of(task.procedure, view, places[-1] if places else 0.0):
+            count, first = max(1, round(path.duration_s / PERIOD_S)), len(places)
+            places += [path.at(path.duration_s * i / count) for i in range(1, count + 1)]
+            end_s = (len(places) - 1) * PERIOD_S
+            legs.append(Segment(kind=move.kind, start_s=first * PERIOD_S, end_s=end_s, notes={}))
+    time = np.arange(len(places), dtype=np.float64) * PERIOD_S
+    motor = np.array(places) * model.ratio
+    start = Start.FORWARD
+    motion = Motion(motor, time_s=time)
+    error = model.predict(motion, start)
+    rng = np.random.default_rng(0)
+    load = motor / model.ratio + (error + NOISE_ARCSEC * rng.standard_normal(len(time))) / ARCSEC_PER_DEG
+    record = Record(
+        {"time_s": time, "motor_position_deg": motor, "load_position_deg": load, "motor_target_deg": motor}
+    )
+    data = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
+    estimator = Estimator(data)
+    fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
+    found = identifiability(estimator, fitted, model.effects)
+    return {
+        "schema": "hdbridge.plan-diagnosis/1",
+        "plan": plan.name,
+        "duration_s": float(time[-1]),
+        "noise_arcsec": NOISE_ARCSEC,
+        "identifiability": {name: each.as_dict() for name, each in found.items()},
+        "notes": list(tasks.notes),
+    }

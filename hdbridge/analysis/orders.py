@@ -1,0 +1,224 @@
+"""Which orders a record shows, by least squares at the true angles.
+
+Samples are never even in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26 times: a
+Fourier transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the true angles
+each order stands where it is, or is reported as one that the record cannot tell from another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from hdbridge.analysis.linear import seen_directions, solve_symmetric
+from hdbridge.effects import FloatArray
+
+NOT_APART = 0.95
+"""Correlation above which two orders cannot be distinguished in a record."""
+
+System = tuple[FloatArray, FloatArray]
+"""J' K^-1 J and J' K^-1 y of [candidates' cosine and sine pairs | all that is in the fit anyway]."""
+
+
+class Family(Enum):
+    """What an order belongs to."""
+
+    MOTOR = "motor"
+    """k: the wave generator, the motor encoder."""
+    LOAD = "load"
+    """k / N: load encoder, circular spline or flexspline pitch."""
+    FLEXSPLINE = "flexspline"
+    """k (1 + 1/N): the wave generator as the flexspline sees it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An order of the motor angle."""
+
+    family: Family
+    number: int
+    per_motor_turn: float
+
+    @classmethod
+    def motor(cls, number: int) -> Order:
+        """Periods per motor turn."""
+        return cls(Family.MOTOR, number, float(number))
+
+    @classmethod
+    def load(cls, number: int, ratio: float) -> Order:
+        """Periods per load turn."""
+        return cls(Family.LOAD, number, number / ratio)
+
+    @classmethod
+    def flexspline(cls, number: int, ratio: float) -> Order:
+        """Periods per turn of the wave generator against the flexspline."""
+        return cls(Family.FLEXSPLINE, number, number * (1.0 + 1.0 / ratio))
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"{self.family.value} order {self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What the selection found."""
+
+    chosen: tuple[Order, ...]
+    unresolved: tuple[Order, ...]
+    """Candidates that this record cannot distinguish from the zero, the hysteresis or an order already in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One order, all else in the fit allowed for: what it is, or would add."""
+
+    order: Order
+    amplitude_arcsec: float
+    phase_deg: float
+    """Of amplitude * cos(order * motor angle + phase)."""
+    standard_error_arcsec: float
+    """Of the cosine and of the sine coefficient (the larger)."""
+    threshold_arcsec: float
+    """An amplitude that noise alone reaches at any of the orders in one record of a hundred."""
+    aliases: tuple[Order, ...] = ()
+    """Orders that this record cannot tell from it."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than noise."""
+        return self.amplitude_arcsec > self.threshold_arcsec and not self.aliases
+
+    @property
+    def fall_in_chi_square(self) -> float:
+        """What the fit loses without it."""
+        return (self.amplitude_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
+
+    @property
+    def threshold(self) -> float:
+        """The fall that `threshold_arcsec` would be."""
+        return (self.threshold_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
+
+
+def threshold(candidates: int, family_wise: float) -> float:
+    """Fall in chi square (two coefficients) that the best of so many reaches by chance this often."""
+    return -2.0 * math.log(family_wise / max(candidates, 1))
+
+
+class _Left(NamedTuple):
+    """What the others in a fit leave of one order."""
+
+    share: float
+    """Of its information."""
+    fall: float
+    """In chi square."""
+    cosine: float
+    sine: float
+    error: float
+    """Standard error of the coefficients, the larger."""
+
+    @property
+    def apart(self) -> bool:
+        return self.share >= 1.0 - NOT_APART**2
+
+    @property
+    def amplitude(self) -> float:
+        return math.hypot(self.cosine, self.sine)
+
+
+class _Candidates:
+    """Orders that may be in a fit; what is in it anyway is eliminated once."""
+
+    def __init__(self, number: int, system: System) -> None:
+        information, right = system
+        own, rest = slice(0, 2 * number), slice(2 * number, len(right))
+        explained = solve_symmetric(information[rest, rest], information[rest, own])
+        self._information = information[own, own] - information[own, rest] @ explained
+        self._right = right[own] - explained.T @ right[rest]
+        self._alone = np.diag(information)
+        self.number = number
+
+    def left(self, index: int, inside: Collection[int]) -> _Left:
+        """What is left of a candidate by the others that are ``inside``."""
+        own = [2 * index, 2 * index + 1]
+        others = [2 * each + part for each in inside if each != index for part in (0, 1)]
+        cross = self._information[np.ix_(others, own)]
+        explained = solve_symmetric(self._information[np.ix_(others, others)], cross)
+        left = self._information[np.ix_(own, own)] - cross.T @ explained
+        moment = self._right[own] - explained.T @ self._right[others]
+        cosine, sine = solve_symmetric(left, moment).tolist()
+        seen = np.diag(left) / np.maximum(self._alone[own], 1e-300)
+        floor = np.maximum(np.diag(left), 1e-9 * self._alone[own])
+        error = float(np.max(1.0 / np.sqrt(floor)))
+        return _Left(float(np.min(seen)), float(moment @ [cosine, sine]), cosine, sine, error)
+
+
+def select(
+    candidates: Sequence[Order], system: System, family_wise: float = 0.01, smallest_arcsec: float = 0.1
+) -> Selection:
+    """Forward selection with look-back.
+
+    An order enters when it lowers chi square by more than `threshold`, which all candidates together pass by
+    chance 1 in 100, and its amplitude is at least ``smallest_arcsec``; it leaves again when later ones take
+    its place.
+    """
+    waves = _Candidates(len(candidates), system)
+    needed = threshold(len(candidates), family_wise)
+    inside: list[int] = []
+
+    def outside() -> dict[int, _Left]:
+        return {at: waves.left(at, inside) for at in range(len(candidates)) if at not in inside}
+
+    for _ in range(2 * len(candidates)):
+        passing = {
+            at: each.fall
+            for at, each in outside().items()
+            if each.apart and each.fall > needed and each.amplitude >= smallest_arcsec
+        }
+        if not passing:
+            break
+        inside.append(max(passing, key=lambda at: passing[at]))
+        for at in inside[:-1]:
+            still = waves.left(at, inside)
+            if not still.apart or still.fall <= needed or still.amplitude < 0.5 * smallest_arcsec:
+                inside.remove(at)
+    return Selection(
+        tuple(candidates[at] for at in sorted(inside)),
+        tuple(candidates[at] for at, each in outside().items() if not each.apart),
+    )
+
+
+def spectrum(
+    orders: Sequence[Order], chosen: Collection[Order], system: System, family_wise: float = 0.01
+) -> tuple[Line, ...]:
+    """Each order's line; of the orders those ``chosen`` are in the fit."""
+    waves = _Candidates(len(orders), system)
+    root = math.sqrt(threshold(len(orders), family_wise))
+    inside = [at for at, each in enumerate(orders) if each in chosen]
+    alike = _aliases(orders, system[0])
+    lines = []
+    for at, order in enumerate(orders):
+        found = waves.left(at, inside)
+        phase = math.degrees(math.atan2(-found.sine, found.cosine))
+        lines.append(
+            Line(order, found.amplitude, phase, found.error, found.error * root, tuple(alike[order]))
+        )
+    return tuple(lines)
+
+
+def _aliases(orders: Sequence[Order], information: FloatArray) -> dict[Order, list[Order]]:
+    """For each order those whose largest canonical correlation with it is above `NOT_APART`."""
+    pairs = {order: [2 * at, 2 * at + 1] for at, order in enumerate(orders)}
+    roots = {order: seen_directions(information[np.ix_(own, own)]) for order, own in pairs.items()}
+    result: dict[Order, list[Order]] = {order: [] for order in orders}
+    for one, other in combinations(orders, 2):
+        between = roots[one].T @ information[np.ix_(pairs[one], pairs[other])] @ roots[other]
+        if np.linalg.norm(between, 2) > NOT_APART:
+            result[one].append(other)
+            result[other].append(one)
+    return result

@@ -1,0 +1,68 @@
+"""How sure a name is: a logistic formula of what speaks for it and against it.
+
+Its coefficients stand in `Scales`. They are fitted, with a ridge and each with the sign that it must have, by
+tools/fit_probabilities.py on the findings of two blind suites and of records from formulas, whose causes are
+known; what came of it in cross-validation stands in docs/diagnosis.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from hdbridge.analysis.acceptance import Gate
+from hdbridge.analysis.findings import Finding
+from hdbridge.analysis.scales import Scales
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What speaks against all findings of a record."""
+
+    left_arcsec: float
+    """Root mean square that is left beyond the noise."""
+    excess: float
+    """Chi square per point of the whole fit."""
+    unexplained: bool
+
+
+def coefficients(scales: Scales) -> dict[str, float]:
+    """Log odds per unit of each term, by the terms' names."""
+    return {
+        "constant": scales.odds,
+        "strength": scales.odds_strength,
+        "rank": scales.odds_rank,
+        "size": scales.odds_size,
+        "excess": scales.odds_excess,
+        "unexplained": scales.odds_unexplained,
+    }
+
+
+def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
+    """The terms of the formula, by their names; ``largest`` is the chi square of the largest finding."""
+    gate = finding.gate or Gate(finding.robust, scales.robust)
+    return {
+        "constant": 1.0,
+        "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
+        "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
+        "size": math.log(max(finding.peak_arcsec, 1e-3) / max(scales.floor_arcsec, context.left_arcsec)),
+        "excess": math.log(min(max(context.excess, 1.0), scales.large)),
+        "unexplained": float(context.unexplained),
+    }
+
+
+def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> list[Finding]:
+    """The findings with the probability that each (or one of its aliases) is there."""
+    largest = max((each.robust for each in findings), default=0.0)
+    terms = [features(each, largest, context, scales) for each in findings]
+    return [
+        replace(each, probability=probability(own, scales), terms=own)
+        for each, own in zip(findings, terms, strict=True)
+    ]
+
+
+def probability(terms: Mapping[str, float], scales: Scales) -> float:
+    """By the terms of the formula."""
+    score = sum(each * terms[name] for name, each in coefficients(scales).items())
+    return min(1.0 / (1.0 + math.exp(-score)), scales.surest)

@@ -1,0 +1,81 @@
+"""Columns of effects over all samples of a record, averaged as its observations are."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from hdbridge.analysis.linear import side_by_side
+from hdbridge.analysis.separable import unit
+from hdbridge.effects import Channel, Effect, FloatArray, Motion, Start
+
+KEPT = 64
+"""What is asked for again and again is kept; so many, for they are large."""
+
+Starts = tuple[Start, ...]
+"""The elastic state in which each motion begins."""
+
+
+class Regressors:
+    """Regressors of any effect along motions that follow one another; rows are means over samples."""
+
+    def __init__(
+        self, motions: Sequence[Motion], mean: Callable[[FloatArray], FloatArray], rows: int
+    ) -> None:
+        """``mean`` averages a quantity of every sample, (n,) or (n, p), over each of the ``rows``."""
+        self.motions = tuple(motions)
+        self._mean, self._rows = mean, rows
+        self._constant: dict[object, FloatArray] = {}
+        self._recent: OrderedDict[tuple[Effect, Starts], FloatArray] = OrderedDict()
+
+    def columns(self, effect: Effect, starts: Starts) -> FloatArray:
+        """Regressors of an effect, arcsec, shape (rows, p); not to be written to."""
+        if not (effect.shape or effect.carries or effect.curved) and not _counts(effect):
+            # The same in every fit.
+            pieces = [self._of_piece(unit(each), starts) for each in effect.pieces()]
+            return pieces[0] if len(pieces) == 1 else side_by_side(pieces, self._rows)
+        # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
+        # depend on those, and these are fields of them.
+        key = (unit(effect), starts)
+        if key in self._recent:
+            self._recent.move_to_end(key)
+            return self._recent[key]
+        self._recent[key] = columns = self._made(effect, starts)
+        if len(self._recent) > KEPT:
+            self._recent.popitem(last=False)
+        return columns
+
+    def told(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
+        """What effects say together, arcsec, shape (rows,)."""
+        parts = (self.columns(each, starts) @ each.coefficients() for each in effects)
+        return np.asarray(sum(parts, start=np.zeros(self._rows)))
+
+    def predicted(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
+        """The same for every sample, shape (n,)."""
+        along = zip(self.motions, starts, strict=True)
+        return np.concatenate(
+            [sum((each.predict(*one) for each in effects), start=np.zeros(len(one[0]))) for one in along]
+        )
+
+    def along(self, motions: Sequence[Motion]) -> None:
+        """Go on with motions that differ from the present ones in the predicted load angle only."""
+        self.motions = tuple(motions)
+        for each in [each for each in self._recent if _counts(each[0])]:
+            del self._recent[each]
+
+    def _of_piece(self, piece: Effect, starts: Starts) -> FloatArray:
+        key = (piece, starts if piece.tracker().memory_deg else None)
+        if key not in self._constant:
+            self._constant[key] = self._made(piece, starts)
+        return self._constant[key]
+
+    def _made(self, effect: Effect, starts: Starts) -> FloatArray:
+        parts = [effect.columns(*one) for one in zip(self.motions, starts, strict=True)]
+        return self._mean(parts[0] if len(parts) == 1 else np.concatenate(parts))
+
+
+def _counts(effect: Effect) -> bool:
+    """Whether it depends on the predicted load angle, which a fit exchanges."""
+    return Channel.LOAD_ANGLE in effect.channels

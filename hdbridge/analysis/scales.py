@@ -1,0 +1,131 @@
+"""The numbers that decide what a diagnosis names, in one table, each with its unit and where it comes from.
+
+A fit has no opinion: these have. They are handed to a diagnosis and stand in its JSON, so that an answer
+says by which numbers it was reached. At its ``neutral`` value a number decides nothing; tools/ablation.py
+sets each to it in turn and counts what that costs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+FITTED = "tools/fit_probabilities.py"
+
+
+def _scale(value: float, unit: str, neutral: float, source: str) -> Any:
+    return field(default=value, metadata={"unit": unit, "neutral": neutral, "source": source})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """The deciding numbers of a diagnosis; `described` gives their units and sources."""
+
+    # What a cause has to earn.
+    penalty: float = _scale(
+        11.5, "chi square per parameter", 0.0, "Schwarz 1978: the logarithm of 100,000 points"
+    )
+    enter: float = _scale(
+        30.0, "chi square per cause", 0.0, "2 log of 3e6 places, shapes and kinds that are looked at"
+    )
+    floor_arcsec: float = _scale(0.5, "arcsec at its peak", 0.0, "smaller ones are of no use to an axis")
+    rare: float = _scale(
+        20.0,
+        "samples of 10,000 or more in which an effect is larger than said",
+        0.0,
+        "a tooth is passed in hundreds, jumps and peaks of a channel are fewer",
+    )
+    robust: float = _scale(
+        25.0, "chi square of block sums", 0.0, "five standard deviations in independent stretches"
+    )
+    robust_more: float = _scale(
+        6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
+    )
+
+    # Looking again.
+    few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
+    large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
+    slow: float = _scale(
+        0.8,
+        "share of a large rest that one more than few may leave",
+        math.inf,
+        "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
+    )
+    leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
+    extrapolated: float = _scale(
+        2.0,
+        "largest piece over what is seen",
+        math.inf,
+        "pieces that cancel, an order on an arc",
+    )
+    wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
+    bend: float = _scale(
+        0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
+    )
+    alias: float = _scale(
+        0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
+    )
+
+    # Loops of another shape, and changes of the model's own parts.
+    calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "what kelvins and weeks change")
+    calibrated_shape: float = _scale(
+        0.06, "share of a width, of an exponent above one", 0.06, "as a coefficient, and it shows less"
+    )
+    calibrated_arcsec: float = _scale(0.1, "arcsec at a coefficient's peak", 0.1, "reading of an encoder")
+    calibrations: float = _scale(
+        4.0, "standard deviations of calibration and fit", 0.0, "6 in 100,000 by chance"
+    )
+
+    # Names that look alike.
+    in_step: float = _scale(
+        0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
+    )
+    noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
+    foot_lines: float = _scale(
+        50.0,
+        "lines of the record's resolution",
+        0.0,
+        "k lines off, a wave switched on has 1 / (pi k) of its amplitude: of 78 arcsec the floor",
+    )
+
+    # What is left.
+    plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
+    shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
+    episodes: float = _scale(
+        0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
+    )
+    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
+    near: float = _scale(
+        0.4,
+        "share of the largest piece",
+        math.inf,
+        "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
+    )
+
+    # How sure a name is (`hdbridge.analysis.probability`): 128 names, 115 of them right.
+    odds: float = _scale(-2.80, "log odds", 0.0, FITTED)
+    odds_strength: float = _scale(1.88, "log odds per log of robust evidence over the needed", 0.0, FITTED)
+    odds_rank: float = _scale(0.42, "log odds per decade of the largest one's chi square", 0.0, FITTED)
+    odds_size: float = _scale(1.22, "log odds per log of peak over what is left", 0.0, FITTED)
+    odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
+    odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
+    strong: float = _scale(
+        12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
+    )
+    surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
+    named_from: float = _scale(0.3, "probability", 0.0, "of the names below it one in eleven was right")
+    one_way: float = _scale(
+        0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
+    )
+
+    def described(self) -> dict[str, dict[str, float | str]]:
+        """Name, value, unit and source of each, for machines."""
+        return {
+            each.name: {
+                "value": getattr(self, each.name),
+                "unit": each.metadata["unit"],
+                "source": each.metadata["source"],
+            }
+            for each in fields(self)
+        }

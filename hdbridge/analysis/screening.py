@@ -1,0 +1,281 @@
+"""Screening: every candidate's score on the residual, with the whole present hypothesis projected out.
+
+One matrix product for all columns: with Q an orthonormal basis of the hypothesis's tangent and C a
+candidate's columns, C'C - (Q'C)'(Q'C) is what is left of it, and its score is the chi square that it would
+gain. So a grid of hundreds of shapes costs no more than one fit. A column of which less than `SHARE_LEFT` is
+left is not in the record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdbridge.analysis.hypothesis import Estimator, Fitted
+from hdbridge.analysis.readings import median_deviation
+from hdbridge.analysis.separable import shape_value
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
+from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER
+from hdbridge.units import DEG_PER_TURN
+
+SHARE_LEFT = 1e-4
+
+
+def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:
+    """What the catalogue proposes for a record and the model ``base``, over grids of shapes; all whose
+    channels are there. Their coefficients are of no account.
+
+    To be ``screened`` are those that would be an addition to the model, and that a grid covers; else all.
+    """
+    kinds = [CATALOGUE[each] for each in causes()]
+    if screened:
+        kinds = [each for each in kinds if each.changes is None and each.sought is None]
+    return [each for kind in kinds for each in proposed(kind, observations, base)]
+
+
+def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
+    """What a kind proposes for a record and the model ``base``, where its channels are there."""
+    available = observations.motion.available()
+    return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What a candidate promises."""
+
+    effect: Effect
+    gain: float
+    """Chi square that it would take away, linearised."""
+    freedom: int
+    """Directions of it that the hypothesis leaves."""
+    share: float
+    """Largest share of a column's square that the hypothesis leaves."""
+
+
+class Screen:
+    """The weighted columns of all candidates, made once."""
+
+    def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start) -> None:
+        self._candidates = tuple(candidates)
+        blocks = [estimator.weighted(estimator.columns(each, start)) for each in candidates]
+        self._slices: list[slice] = []
+        at = 0
+        for block in blocks:
+            self._slices.append(slice(at, at + block.shape[1]))
+            at += block.shape[1]
+        self._matrix = np.hstack(blocks) if blocks else np.empty((len(estimator.index), 0))
+        self._grams = [block.T @ block for block in blocks]
+
+    def scores(self, fitted: Fitted) -> list[Score]:
+        """Each candidate's, in their order."""
+        fit, matrix = fitted.linearised, self._matrix
+        shadow = fit.basis.T @ matrix
+        moment = matrix.T @ fit.residual - shadow.T @ fit.slack
+        return [
+            _score(effect, np.diag(gram), gram - shadow[:, part].T @ shadow[:, part], moment[part])
+            for effect, gram, part in zip(self._candidates, self._grams, self._slices, strict=True)
+        ]
+
+
+def score_of(effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
+    """The score of one candidate from its weighted columns."""
+    return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
+
+
+def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
+    """From the squares of its columns, and what a hypothesis leaves of their Gram matrix and moment."""
+    seen = size > 0.0
+    if not np.any(seen):
+        return Score(effect, 0.0, 0, 0.0)
+    scale = np.sqrt(size[seen])
+    left = gram[np.ix_(seen, seen)] / np.outer(scale, scale)
+    share = float(np.max(np.diag(left)))
+    values, vectors = np.linalg.eigh(left)
+    kept = values > SHARE_LEFT
+    if not np.any(kept):
+        return Score(effect, 0.0, 0, share)
+    inner = vectors[:, kept].T @ (moment[seen] / scale)
+    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
+
+
+# Matched filters: forms whose place no grid covers, each found over all places at once (`Sought`).
+
+
+BINS = 1 << 17
+DEFECT_BINS = 3600
+HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
+"""Grids on which places are looked for; a fit moves what was found. None of the numbers here decides a name:
+what is found has to earn its place as any cause does (`Scales`).
+"""
+LEAST_LINES = 256
+"""Periods per turn of the coarsest encoder that is interpolated."""
+LINE_OVER_MEAN = 12.0
+"""Power of a line that is worth a fit: it gains twice that in chi square, half of what a cause must earn."""
+LOWEST_HZ = 0.3
+"""Below it a line is a motion's own."""
+PEAKS = 3
+"""So many of the highest lines are fitted."""
+
+
+def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
+    """Of each kind that is sought, those that promise most on what a fit leaves."""
+    residual, load_deg = fast_residual(estimator, fitted)
+    estimator.with_load_angle(load_deg)
+    present = fitted.hypothesis.effects
+    result: list[Effect] = []
+    shapes: Iterator[tuple[float, ...]]
+    for kind in CATALOGUE.values():
+        match kind.sought:
+            case Sought.STEP:
+                shapes = step(estimator, fitted)
+            case Sought.BUMP:
+                shapes = bump(estimator, fitted)
+            case Sought.TONE:
+                shapes = tones(estimator, residual, [each for each in present if each.sought is Sought.TONE])
+            case Sought.LINE:
+                lines = load_lines(estimator, residual, load_deg)
+                result += [each for at in lines for each in kind.at_lines(at)]
+                continue
+            case _:
+                continue
+        example = kind.candidate(estimator.data.ratio)
+        one = np.ones(len(example.coefficients()))
+        names = [each.name for each in kind.shape]
+        for each in shapes:
+            shape = dict(zip(names, each, strict=True))
+            result.append(example.fitted(one, shape))
+    return result
+
+
+def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
+    """The time (s) of the best single step, at any sample; exact, with the hypothesis projected out."""
+    weight, basis = estimator.weight, fitted.linearised.basis
+    after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
+    square = np.cumsum((weight**2)[::-1])[::-1]
+    left = square.copy()
+    for column in basis.T:
+        left -= np.cumsum((weight * column)[::-1])[::-1] ** 2
+    edge = max(len(weight) // 500, 5)
+    usable = left > 1e-3 * np.minimum(square, square[0] - square + 1e-300)
+    usable[:edge] = usable[-edge:] = False
+    if not np.any(usable):
+        return
+    gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
+    place = int(np.argmax(gain))
+    data = estimator.data
+    first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
+    yield (float(data.full.time_s[first]),)
+
+
+def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
+    """Centre and half width (degrees of the load) of the best bump; it may not cover most of the travel."""
+    ratio = estimator.data.ratio
+    load = estimator.motion.motor_deg[estimator.index] / ratio
+    place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
+    weight = estimator.weight
+
+    def binned(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(place, values, DEFECT_BINS), dtype=np.float64)
+
+    moments = binned(weight * fitted.residual)
+    squares = binned(weight**2)
+    shadows = np.stack([binned(weight * each) for each in fitted.linearised.basis.T])
+    best: tuple[float, float, float] | None = None
+    for half in HALF_WIDTHS_DEG:
+        kernel = np.fft.rfft(_bump(half))
+        square_kernel = np.fft.rfft(_bump(half) ** 2)
+
+        def over(values: FloatArray, kernel: np.ndarray[tuple[int], np.dtype[np.complex128]]) -> FloatArray:
+            return np.asarray(np.fft.irfft(np.fft.rfft(values, axis=-1) * kernel, DEFECT_BINS, axis=-1))
+
+        total = over(squares, square_kernel)
+        left = total - np.sum(over(shadows, kernel) ** 2, axis=0)
+        good = left > np.maximum(0.02 * total, 1e-6 * float(np.max(total)))
+        gain = np.where(good, over(moments, kernel) ** 2 / np.maximum(left, 1e-300), 0.0)
+        at = int(np.argmax(gain))
+        if best is None or gain[at] > best[0]:
+            best = (float(gain[at]), at * DEG_PER_TURN / DEFECT_BINS, half)
+    if best is not None and best[0] > 0.0:
+        yield best[1:]
+
+
+def _bump(half_deg: float) -> FloatArray:
+    away = np.arange(DEFECT_BINS) * (DEG_PER_TURN / DEFECT_BINS)
+    away = np.minimum(away, DEG_PER_TURN - away)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.minimum(away / half_deg, 1.0)))
+
+
+def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
+    """Residual of every sample, and the predicted load angle there; zero where it is not usable."""
+    full = estimator.data.full
+    predicted = estimator.predicted(fitted)
+    residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
+    # What is slow is none of the business of those who ask for this, and would leak into their peaks.
+    window = 9
+    smooth = np.convolve(residual, np.ones(window) / window, mode="same")
+    spread = 6.0 * median_deviation(residual - smooth) + 1e-9
+    load = full.motion.motor_deg / estimator.data.ratio + predicted / 3600.0
+    return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
+
+
+def tones(
+    estimator: Estimator, residual: FloatArray, present: Sequence[Effect] = ()
+) -> Iterator[tuple[float]]:
+    """Frequencies (Hz) of the highest lines over absolute time, apart from the feet of those ``present``.
+
+    A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
+    """
+    data = estimator.data
+    time_s = data.full.time_s
+    slot = np.round((time_s - time_s[0]) / data.period_s).astype(np.int64)
+    length = int(slot[-1]) + 1
+    if length > 4 * len(time_s) + 1000 or length < 64:
+        return
+    size = 1 << int(np.ceil(np.log2(length)) + 2)
+    grid = np.bincount(slot, residual, length)
+    power = np.abs(np.fft.rfft(grid, size)) ** 2
+    frequency = np.arange(len(power)) / (size * data.period_s)
+    # Less than two periods of it are a bend, not a frequency. Moves that are alike bend alike: only what lies
+    # about one zero counts together.
+    unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
+    power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
+    lobe = max(4, size // length * 4)
+    for each in present:
+        own_hz = shape_value(each, each.shape[0].name)
+        power[np.abs(frequency - own_hz) < estimator.scales.foot_lines / (length * data.period_s)] = 0.0
+    for at in _highest(power, lobe, 0.0):
+        yield (float(frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]),)
+
+
+def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
+    """Places of the highest peaks above ``least``, highest first, none within a ``lobe`` of another."""
+    left = power.copy()
+    for _ in range(PEAKS):
+        at = int(np.argmax(left))
+        if left[at] <= least:
+            return
+        yield at
+        left[max(at - lobe, 0) : at + lobe + 1] = 0.0
+
+
+def _off_centre(height: FloatArray, at: int) -> float:
+    """Where the top of a peak lies next to its highest sample, in samples: that of the parabola through
+    three.
+    """
+    if not 0 < at < len(height) - 1:
+        return 0.0
+    left, middle, right = (float(each) for each in height[at - 1 : at + 2])
+    bend = left - 2.0 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+
+
+def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray) -> Iterator[int]:
+    """Periods per turn of the highest lines over one load turn, beyond the orders of the mesh."""
+    place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
+    power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
+    ratio = estimator.data.ratio
+    power[: int(max(LEAST_LINES, 1.05 * HIGHEST_MOTOR_ORDER * (ratio + 1)))] = 0.0
+    least = LINE_OVER_MEAN * float(np.mean(power[power > 0.0])) if np.any(power > 0.0) else 0.0
+    yield from _highest(power, 3, least)

@@ -1,0 +1,474 @@
+"""The search for causes: screen everything, fit the best few with everything, take the best, look again.
+
+What a cause has to earn stands in `Scales`; the elastic law is chosen again after each of
+the first picks. What was picked and no longer earns its keep among the others goes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Iterator, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
+from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.analysis.linear import orthonormal, unknown
+from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
+from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
+
+MOST = 6
+BEST = 3
+"""So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
+ANEW = 3
+"""So often the law of the loop is chosen anew after a pick."""
+
+
+class Search:
+    """One search on one estimator."""
+
+    def __init__(self, estimator: Estimator, base: Sequence[Effect]) -> None:
+        self.estimator = estimator
+        self.scales = estimator.scales
+        self.base = len(base)
+        """How many effects of each hypothesis are the baseline's."""
+        self._base = tuple(base)
+        self._screens: dict[object, Screen] = {}
+        self.refusals: dict[str, str] = {}
+        """Causes that were refused though the evidence spoke for them, with the reason in words."""
+        law = next((each for each in self._base if each.part is Part.LOOP), None)
+        if law is not None:
+            estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
+
+    def run(self) -> Fitted:
+        """Find causes, best first, and keep those that earn their keep among the others."""
+        fitted = self._with_best_law(self._with_best_sign(self._begin()))
+        for number in range(MOST):
+            found = self._best_addition(fitted)
+            if number < ANEW and fitted.hypothesis.nuisances is None:
+                loose = self._with_free_loop(fitted, found)
+                if loose is not None:
+                    fitted = self._with_best_law(loose)
+                    continue
+            if found is None:
+                break
+            left = found.chi_square
+            slow = left > self.scales.slow * fitted.chi_square
+            fitted = found
+            if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
+                break  # piece by piece at something that is none of them
+            if number < ANEW:
+                fitted = self._with_best_law(fitted)
+        if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
+            fitted = self._swapped(fitted)
+        return self._with_best_law(self.eliminated(fitted, self._least, []))
+
+    def _begin(self) -> Fitted:
+        fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
+        return min(fits, key=lambda each: each.chi_square)
+
+    def _with_best_sign(self, known: Fitted) -> Fitted:
+        """Let the load lag where the model has it lead, or the other way round, where that explains more than
+        a loop of the model's sign with the best cause added to it (play lags, too).
+        """
+        loops = [each for each in known.hypothesis.effects if each.part is Part.LOOP]
+        if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
+            return known  # not held at zero: it has the model's sign
+        self.estimator.loop_sign *= -1.0
+        other = self._begin()
+        self.estimator.loop_sign *= -1.0
+        rival = self._best_addition(known) or known
+        if self.cost(other) + self.scales.enter < self.cost(rival):
+            self.estimator.loop_sign *= -1.0
+        return self._begin()
+
+    def _with_best_law(self, fitted: Fitted) -> Fitted:
+        """The model's law of the loop or one that can stand in its place, whichever fits better."""
+        for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
+            laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
+            if laws:
+                trials = [self.estimator.fit(fitted.hypothesis.instead(place, law)) for law in laws]
+                return min((fitted, *trials), key=lambda each: each.chi_square)
+        return fitted
+
+    def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
+        """With a hysteresis of any shape added to the law, where that does more than the best cause."""
+        free = self.estimator.free_loop(fitted.hypothesis.start)
+        loose = self.estimator.fit(replace(fitted.hypothesis, nuisances=free))
+        added = loose.free() - fitted.free()
+        gain = fitted.chi_square - loose.chi_square - self.scales.penalty * added - self.scales.enter
+        rival = 0.0 if found is None else fitted.chi_square - found.chi_square
+        return loose if gain > max(rival, 0.0) else None
+
+    # --- another look
+
+    def _swapped(self, fitted: Fitted) -> Fitted:
+        """With the best one in the place of each finding that is taken out, and the law chosen anew.
+
+        What a finding has gained with further pieces cost an entry for each when they were added, and does so
+        here: what takes its place has entered only once.
+        """
+        for place in range(self.base, len(fitted.hypothesis.effects)):
+            if place >= len(fitted.hypothesis.effects):
+                break  # what took another's place has become part of one that was there
+            further = self._additions(fitted.hypothesis.effects[place]) - 1
+            most = self.cost(fitted) + self.scales.enter * further
+            without = self._with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
+            other = self._best_addition(without)
+            if other is not None and self.cost(other) < most:
+                fitted = other
+        return fitted
+
+    def _additions(self, effect: Effect) -> int:
+        """How often a search has added to a finding: orders come one by one, or those of a cause together."""
+        offered = next(iter(type(effect).proposals(self.estimator.data, ())), effect)
+        return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
+
+    def eliminated(
+        self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], told: list[str]
+    ) -> Fitted:
+        """Without the cause that is ``worst`` (its place, and why it goes), one after the other; the others
+        fitted again.
+
+        What went is appended to ``told`` in words.
+        """
+        while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
+            place, why = found
+            told.append(f"{fitted.hypothesis.effects[place].name}: {why}")
+            fitted = self.estimator.fit(fitted.hypothesis.without(place))
+        return fitted
+
+    def _least(self, fitted: Fitted) -> tuple[int, str] | None:
+        """What no longer earns its keep among the others."""
+        effects = fitted.hypothesis.effects
+        gains = {
+            place: self._lacking(fitted, place).chi_square - fitted.chi_square
+            for place in range(self.base, len(effects))
+        }
+        toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
+        place = min(gains, key=lambda each: gains[each] - toll[each])
+        small = self.peak(fitted, place) < self.scales.floor_arcsec
+        # What the law of a large one gets wrong looks like a small one of its kind.
+        alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
+        share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
+        needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
+        return None if gains[place] > needed and not small else (place, "")
+
+    def _lacking(self, fitted: Fitted, place: int) -> Fitted:
+        """A fit that lacks an effect, but for what is incidental to it and may be there without it."""
+        effect, hypothesis = fitted.hypothesis.effects[place], fitted.hypothesis.without(place)
+        columns = sorted(set(range(len(effect.coefficients()))) - set(evident(effect)))
+        if columns:
+            stays = self.estimator.columns(effect, hypothesis.start)[:, columns]
+            more = unknown(stays, [f"{effect.name} {each}" for each in columns])
+            known = hypothesis.nuisances
+            hypothesis = replace(hypothesis, nuisances=more if known is None else known.and_also(more))
+        return self.estimator.fit(hypothesis)
+
+    # --- one more cause
+
+    def _best_addition(self, fitted: Fitted) -> Fitted | None:
+        """With the best cause more, refitted; None where none earns its keep.
+
+        What is refused may be another beside what is found next, so nothing is refused for good.
+        """
+        scores, refused = self._scores(fitted), set[object]()
+        while shortlist := self._shortlist(fitted, [each for each in scores if _key(each) not in refused]):
+            best: tuple[float, Fitted] | None = None
+            for score in shortlist:
+                cause = score.effect.name
+                trial = self._with(fitted, score)
+                toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
+                net = self._gain(fitted, trial, cause) - toll
+                none = net <= 0.0 or self._too_small(trial, cause)
+                reason = "" if none else self._refusal(trial, cause)
+                if reason:
+                    self.refusals[cause] = reason
+                if none or reason:
+                    refused.add(_key(score))
+                elif best is None or net > best[0]:
+                    best = (net, trial)
+            if best is not None:
+                return best[1]
+        return None
+
+    def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
+        """By how much what was added to a fit as the last of its name has lowered chi square."""
+        place = _last(trial, cause)
+        incidental = trial.hypothesis.effects[place].incidental
+        lacking = self._lacking(trial, place).chi_square if incidental else math.inf
+        return min(lacking, fitted.chi_square) - trial.chi_square
+
+    def _too_small(self, trial: Fitted, cause: str) -> bool:
+        """Whether what was added is of no use to an axis."""
+        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
+
+    def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
+        """Why what was added to a fit as the last of its name is not named, in words.
+
+        It has to be physical and really seen; an alias need not be identifiable.
+        """
+        place = _last(trial, cause)
+        effect = trial.hypothesis.effects[place]
+        reason = self.refusal(effect, as_alias)
+        most = self.scales.extrapolated * self.peak(trial, place)
+        if not reason and effect.largest_piece_arcsec() > most:
+            reason = "the record shows too little of it to say how large it is"
+        elif (
+            not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
+        ):
+            # What happens in time may be placed anywhere: where it is not seen as it has to be, it is
+            # another cause's, which would not be found with it in the fit.
+            reason = gate(self.estimator, trial, place).reason
+            if not reason and not all_pieces_seen(self.estimator, trial, place):
+                reason = "a part of it may be what a larger one gets wrong"
+        return reason
+
+    def refusal(self, effect: Effect, as_alias: bool = False) -> str:
+        """Why an effect as it has come out is not named, in words; of an alias only why it cannot be."""
+        if violations := effect.violations():
+            return f"parameters that it cannot have ({violations[0]})"
+        data = self.estimator.data
+        return effect.implausible(data) or ("" if as_alias else effect.unidentifiable(data))
+
+    def told_refusals(self, fitted: Fitted) -> list[str]:
+        """The refusals that matter: of what may stand for a cause that was named, and of what would still
+        earn its keep beside the ``fitted`` hypothesis by its evidence alone, linearised.
+        """
+        if not self.refusals:
+            return []
+        causes = {each.name for each in fitted.hypothesis.effects[self.base :]}
+        asked = {alias for cause in causes for alias in aliases_of(cause)}
+        asked |= {
+            each.effect.name
+            for each in self._scores(fitted)
+            if each.gain > self.scales.penalty * each.freedom + self.scales.enter
+        }
+        told = asked - causes
+        return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
+
+    def peak(self, fitted: Fitted, place: int) -> float:
+        """Half the span of what an effect does in this record, arcsec, but for what is rare at either end."""
+        hypothesis = fitted.hypothesis
+        return self.estimator.half_span(self.estimator.does(hypothesis.effects[place], hypothesis.start))
+
+    def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
+        """The best candidate of each of the best causes, and of each number of parameters that it may have.
+
+        One of more parameters gains more only once its shapes are fitted.
+        """
+        passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
+        scores = [
+            each
+            for each in scores
+            if each.effect.name not in passed
+            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
+        ]
+        net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
+        best: dict[tuple[str, int], Score] = {}
+        for each in sorted(scores, key=lambda each: -net[id(each)]):
+            if net[id(each)] > self.scales.enter:
+                best.setdefault((each.effect.name, each.freedom), each)
+        causes = list(dict.fromkeys(cause for cause, _ in best))[:BEST]
+        return [each for (cause, _), each in best.items() if cause in causes]
+
+    def _scores(self, fitted: Fitted) -> list[Score]:
+        screen = self._screen(fitted)
+        scores = screen.scores(fitted)
+        for effect in filtered(self.estimator, fitted):
+            columns = self.estimator.columns(effect, fitted.hypothesis.start)
+            scores.append(score_of(effect, self.estimator.weighted(columns), fitted))
+        return scores
+
+    def _screen(self, fitted: Fitted) -> Screen:
+        base = fitted.hypothesis.effects[: self.base]
+        key = (fitted.hypothesis.start, tuple(type(each) for each in base))
+        if key not in self._screens:
+            offered = candidates(self.estimator.data, base)
+            self._screens.clear()
+            self._screens[key] = Screen(self.estimator, offered, fitted.hypothesis.start)
+        return self._screens[key]
+
+    def cost(self, fitted: Fitted) -> float:
+        """Chi square and what the parameters have to earn."""
+        return fitted.chi_square + self.scales.penalty * fitted.free()
+
+    def instead_of_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
+        """Other causes that explain as well what a changed part of the model explains, with that part as
+        ``given``.
+        """
+        with self.held({place}):
+            without = self.estimator.fit(fitted.hypothesis.instead(place, given))
+            return self.as_well(fitted, without, given.name)
+
+    @contextmanager
+    def held(self, places: Set[int]) -> Iterator[None]:
+        """Some parts of the model as they were given, whatever the data say of them."""
+        known = self.estimator.calibrated
+        self.estimator.calibrated = tuple(each.as_given() if each.place in places else each for each in known)
+        try:
+            yield
+        finally:
+            self.estimator.calibrated = known
+
+    def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
+        """Other causes that do nearly as well in the place of one, best first; ``without`` is the fit that
+        lacks it.
+        """
+        # Where more is left than noise, neither is the whole truth, and a margin counts for less.
+        excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
+        margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
+        most = self.cost(fitted) + margin
+        best: dict[str, Fitted] = {}
+        for score in self._shortlist(without, self._scores(without), cause):
+            name = score.effect.name
+            trial = self._with(without, score)
+            if self.cost(trial) >= (self.cost(best[name]) if name in best else most):
+                continue
+            if self._gain(without, trial, name) < self.scales.enter:
+                continue
+            if not (self._too_small(trial, name) or self._refusal(trial, name, as_alias=True)):
+                best[name] = trial
+        return sorted(best, key=lambda each: best[each].chi_square)
+
+    def _with(self, fitted: Fitted, score: Score) -> Fitted:
+        """With one of the candidates more."""
+        return self.estimator.fit(joined(fitted.hypothesis, score.effect, self.base))
+
+
+def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
+    """A hypothesis with one more effect, as part of a finding where the two are of one."""
+    for place in range(base, len(hypothesis.effects)):
+        both = hypothesis.effects[place].joined(effect)
+        if both is not None:
+            return hypothesis.instead(place, both)
+    return hypothesis.plus(effect)
+
+
+def _last(fitted: Fitted, cause: str) -> int:
+    """Place of the last effect of a name."""
+    effects = fitted.hypothesis.effects
+    return next(i for i in range(len(effects) - 1, -1, -1) if effects[i].name == cause)
+
+
+def _key(score: Score) -> object:
+    """What distinguishes one candidate from another: its kind, its coefficients, its degrees of freedom."""
+    effect = score.effect
+    if effect.sought is not None:
+        return effect.name
+    return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)
+
+
+# Second looks at a name whose look-alike is the better one: what follows a measured channel, and what
+
+
+def with_measured(search: Search, fitted: Fitted) -> Fitted:
+    """What looks like a measured channel's effect, and follows the channel, is that effect.
+
+    A wave takes any phase, a wind-up only that of the torque: where it does as well but for what the noise of
+    the channel takes from it, the wave would be a coincidence. Together the wave makes up for that noise, and
+    takes most of what is the other's.
+    """
+    estimator, scales, base = search.estimator, search.scales, search.base
+    hypothesis = fitted.hypothesis
+    for place, effect in enumerate(hypothesis.effects[base:], base):
+        for kind, piece in lookalikes(effect, estimator.data.ratio):
+            others = [each for each in effect.pieces() if each != piece]
+            without = hypothesis.instead(place, together(others)) if others else hypothesis.without(place)
+            tried = [without]
+            if not any(type(each) is kind for each in without.effects[base:]):
+                # Each of its shapes: a spring that bends is not what a straight one leaves.
+                own = proposed(kind, estimator.data, hypothesis.effects[:base])
+                tried = [without.plus(each) for each in own]
+            for trial in sorted((estimator.fit(each) for each in tried), key=search.cost):
+                driven = [each for each in trial.hypothesis.effects if type(each) is kind]
+                if any(each.violations() for each in driven):
+                    continue
+                start = trial.hypothesis.start
+                lost = sum(estimator.channel_noise(each, start) @ each.coefficients() ** 2 for each in driven)
+                if trial.chi_square - fitted.chi_square < scales.enter + scales.noisy * float(lost):
+                    return trial
+                break
+    return fitted
+
+
+def together(pieces: Sequence[Effect]) -> Effect:
+    """One effect of several pieces of it."""
+    whole = pieces[0]
+    for each in pieces[1:]:
+        both = whole.joined(each)
+        assert both is not None, "pieces of one effect join"
+        whole = both
+    return whole
+
+
+def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
+    """Kinds that look like a piece of an effect where their channel was not measured, and the piece."""
+    result = []
+    for name in aliases_of(effect.name):
+        look = CATALOGUE[name].unmeasured(ratio) if name in CATALOGUE else None
+        if look is None or look.name != effect.name:
+            continue
+        names = look.named_coefficients()
+        result += [(CATALOGUE[name], each) for each in effect.pieces() if each.named_coefficients() == names]
+    return result
+
+
+def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -> Iterator[str]:
+    """Other kinds of waves that have hardly parted from any of some effects of one kind, in all the record.
+
+    Over the same angle it is enough that both may have the orders. On an arc of a turn different orders
+    cancel each other, so what counts there is how large they are, not what they do.
+    """
+    data, most = estimator.data, estimator.scales.in_step
+    effects = [each for each in effects if each.waves()]
+    if not effects:
+        return
+    angle = effects[0].coordinate(data.motion, data.ratio).name
+    for name in aliases_of(effects[0].name):
+        kind = CATALOGUE.get(name)
+        own = [] if kind is None else [*kind.proposals(data, ())]
+        near = [each for each in own if each.waves() and each.part is not Part.LOOP]
+        if not near:
+            continue
+        if near[0].coordinate(data.motion, data.ratio).name == angle:
+            orders = {turns for each in near for turns, _, _ in each.waves()}
+            if any(_share_in(each, orders) > most for each in effects):
+                yield name
+            continue
+        seen = orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
+        for each in effects:
+            does = estimator.columns(each, start) @ each.coefficients()
+            does -= np.mean(does)
+            if float(np.sum((seen.T @ does) ** 2)) > most * float(does @ does):
+                yield name
+                break
+
+
+def _share_in(effect: Effect, orders: Container[float]) -> float:
+    """Of its waves, the share of the squares that is in some orders."""
+    squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
+    return sum(each for turns, each in squares.items() if turns in orders) / max(
+        sum(squares.values()), 1e-300
+    )
+
+
+def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
+    """What can be told by several conventions, by the one that leaves the ``given`` model as it was.
+
+    As it was, where there is none; see `Effect.retold`.
+    """
+    effects = fitted.hypothesis.effects
+    for place in range(len(given), len(effects)):
+        told = effects[place].retold(effects, given, estimator.data)
+        if told is None:
+            continue
+        trial = estimator.fit(replace(fitted.hypothesis, effects=told))
+        if (
+            trial.chi_square < fitted.chi_square + estimator.scales.enter
+            and not trial.hypothesis.effects[place].violations()
+        ):
+            return trial
+    return fitted

@@ -1,0 +1,437 @@
+"""Shapes, the parameters that an effect is not linear in: their values, their steps, their derivatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+
+import numpy as np
+
+from hdbridge.analysis.linear import FREE, Column, Columns, Effort, Terms, side_by_side, solve_symmetric
+from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
+from hdbridge.effects.base import Shape
+from hdbridge.effects.described import Moves
+
+LOGARITHM = 0.7
+RANGE = 0.15
+"""A step goes no further than this: in the logarithm of a shape, or in shares of its range."""
+DIFFERENCE = 1e-3
+"""Step of a derivative: of the logarithm of a shape, or of its range."""
+LINEAR = 0.3
+"""A step that changes more than this share of what the effect does is too long to differentiate with."""
+
+
+def unit(effect: Effect) -> Effect:
+    """What the columns of an effect depend on: all but its coefficients, where it is linear in them."""
+    return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
+
+
+def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = False) -> FloatArray:
+    """Derivative of what an effect does by one of its shapes, shape (m,); one-sided at a bound."""
+    coefficients = effect.coefficients()
+    here = shape_value(effect, shape.name)
+    told = _told(columns(effect), coefficients)
+    size = float(told @ told)
+    length = DIFFERENCE
+
+    def change(sign: float) -> tuple[FloatArray, float]:
+        there = (
+            here * np.exp(sign * length)
+            if shape.logarithmic
+            else here + sign * length * (shape.upper - shape.lower)
+        )
+        there = float(np.clip(there, shape.lower, shape.upper))
+        moved_by = np.log(there / here) if shape.logarithmic else there - here
+        if not moved_by:
+            return np.zeros(len(told)), 0.0
+        there_told = _told(columns(effect.fitted(coefficients, {shape.name: there})), coefficients)
+        there_told -= told
+        return there_told, moved_by
+
+    up, rise = change(1.0)
+    while rise and float(up @ up) > LINEAR**2 * size and length > 1e-9:
+        length *= 0.1
+        up, rise = change(1.0)
+    if rise and not central:
+        up /= rise
+        return up
+    down, fall = change(-1.0)
+    return np.asarray((up - down) / (rise - fall)) if rise != fall else np.zeros(len(told))
+
+
+def _told(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Their product; of one column by a product of numbers, ten times faster than one of matrices."""
+    return columns[:, 0] * coefficients[0] if columns.shape[1] == 1 else columns @ coefficients
+
+
+def moved(
+    effects: Sequence[Effect], where: Sequence[tuple[int, Shape]], step: FloatArray
+) -> tuple[Effect, ...]:
+    """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""
+    result = list(effects)
+    for (place, shape), move in zip(where, step.tolist(), strict=True):
+        here = shape_value(result[place], shape.name)
+        if shape.logarithmic:
+            there = here * float(np.exp(np.clip(move, -LOGARITHM, LOGARITHM)))
+        else:
+            reach = RANGE * (shape.upper - shape.lower)
+            there = here + min(max(move, -reach), reach)
+        there = min(max(there, shape.lower), shape.upper)
+        result[place] = result[place].fitted(result[place].coefficients(), {shape.name: there})
+    return tuple(result)
+
+
+def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
+    """The shapes that may be moved; one that stands outside its range is of no account, and stays."""
+    return [
+        each
+        for each in effect.shape
+        if each.moves in moves and each.lower <= shape_value(effect, each.name) <= each.upper
+    ]
+
+
+def shape_value(effect: Effect, name: str) -> float:
+    """A shape parameter; where it is not a field, that of the first of its parts."""
+    if name in type(effect).model_fields:
+        return float(getattr(effect, name))
+    parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
+    return float(parts[0][name])
+
+
+def on_scale(effect: Effect, shape: Shape | Column) -> float:
+    """A shape parameter as it is stepped and known beforehand: its logarithm where it has one."""
+    value = shape_value(effect, shape.name)
+    return math.log(value) if shape.logarithmic else value
+
+
+def leaves(effect: Effect, shape: Shape, move: float) -> bool:
+    """Whether a shape stands on the edge of its range and the step points outwards."""
+    here = shape_value(effect, shape.name)
+    return bool((here <= shape.lower and move < 0) or (here >= shape.upper and move > 0))
+
+
+# Separable non-linear least squares over any effects (variable projection), for calibration and diagnosis.
+
+
+DAMPING = 1e-4
+TRIES = 6
+"""So often a step that does not help is shortened."""
+EXCHANGES = 3
+"""So often what effects carry of each other is exchanged though that makes the fit worse at first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fixed:
+    """Columns that stay while shapes move: the nuisances, then those of the effects in ``places``."""
+
+    places: tuple[int, ...]
+    units: tuple[Effect, ...]
+    matrix: FloatArray
+    weighted: FloatArray
+    gram: FloatArray
+    right: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """Coefficients at some shapes."""
+
+    given: tuple[Effect, ...]
+    """What the columns are those of."""
+    effects: tuple[Effect, ...]
+    """With the coefficients that were found."""
+    fixed: _Fixed
+    moving: tuple[int, ...]
+    """Places of the effects whose columns are in ``matrix``, in their order."""
+    matrix: FloatArray
+    gram: FloatArray
+    """Of all linear columns, those in ``fixed`` first, and what is known beforehand."""
+    coefficients: FloatArray
+    inside: BoolArray
+    """False for coefficients that are held at zero."""
+    chi_square: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The minimum, and what intervals and tests need of it."""
+
+    effects: tuple[Effect, ...]
+    nuisances: FloatArray
+    """Coefficients of the columns that are no effect's, shape (q,)."""
+    chi_square: float
+    """With what was known beforehand."""
+    columns: tuple[Column, ...]
+    """The nuisances', the effects' coefficients (first of those without free shape), then shapes."""
+    residual: FloatArray
+    """Shape (m,)."""
+    at_bound: tuple[tuple[int, str], ...]
+    """Shapes that ended on the edge of their range: effect, name."""
+    _fit: Separable
+    _point: _Point
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivatives by all columns, shape (m, p)."""
+        linear = side_by_side([self._point.fixed.matrix, self._point.matrix], len(self.residual))
+        linear[:, ~self._point.inside] = 0.0
+        if linear.shape[1] == len(self.columns):
+            return linear
+        return np.concatenate([linear, self._fit.tangents(self.effects, central=True)[1]], axis=1)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Jacobian' K^-1 Jacobian and what was known beforehand, shape (p, p)."""
+        kept = self._point.inside
+        size = len(kept)
+        cross = self.jacobian.T @ self._fit.terms.weighting.apply(self.jacobian[:, size:])
+        linear = self._point.gram * np.outer(kept, kept)
+        shapes = cross[size:] + np.diag(self.known[size:, 0])
+        return np.block([[linear, cross[:size]], [cross[:size].T, shapes]])
+
+    @cached_property
+    def known(self) -> FloatArray:
+        """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
+        mean, information = self._fit.terms.known(self.columns).T
+        shapes = [on_scale(self.effects[each.effect], each) for each in self.columns if each.shape]
+        value = np.concatenate([self._point.coefficients, shapes])
+        return np.stack([information, information * (mean - value)], axis=1)
+
+    def free(self) -> int:
+        """Parameters that do anything in the data."""
+        linear = self._point.inside & (np.diag(self._point.gram) > 0.0)
+        idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
+        # Of a spring that the record does not load far enough, neither a zone nor where it begins is seen.
+        partly = {each.effect for each, seen in zip(self.columns, linear, strict=False) if not seen}
+        shapes = [
+            each.effect not in partly or bool(np.any(self.jacobian[:, at]))
+            for at, each in enumerate(self.columns)
+            if each.shape and each.effect not in idle
+        ]
+        return int(np.count_nonzero(linear)) + sum(shapes)
+
+
+class Separable:
+    """Fits of effects to the same data; what does not depend on shapes is kept from one to the next."""
+
+    def __init__(self, terms: Terms) -> None:
+        self.terms = terms
+        self._right = terms.weighting.apply(terms.observed)
+        self._total = float(terms.observed @ self._right)
+        self._fixed: _Fixed | None = None
+
+    def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
+        """The minimum near where the effects stand; never worse than there."""
+        effort = effort or Effort()
+        here = best = self._at(refreshed(effects))
+        damping, exchanged = DAMPING, 0
+        for _ in range(effort.steps - 1):
+            enough = effort.enough(here.chi_square)
+            where, tangents = self.tangents(here.effects)
+            system = self._system(here, where, tangents)
+            step, promised = self._step(here, where, system, damping)
+            small = promised < enough
+            if small and self._stands(here, refreshed(here.effects)):
+                break
+            for _ in range(TRIES):
+                there = self._at(refreshed(moved(here.effects, where, step)))
+                better = there.chi_square < here.chi_square
+                if better or small or not np.any(step):
+                    break
+                damping = max(damping, 1e-3) * 10.0
+                step, _ = self._step(here, where, system, damping)
+            gained = here.chi_square - there.chi_square
+            if not better:
+                # Only what is carried has changed: to exchange it may lead downhill at the second step.
+                exchanged += 1
+                if not small or exchanged > EXCHANGES:
+                    break
+                here = there
+                continue
+            damping /= 5.0
+            here = there
+            if here.chi_square < best.chi_square:
+                best = here
+            if 0.0 <= gained < enough:
+                break
+        return self._solution(best)
+
+    def tangents(
+        self, effects: Sequence[Effect], central: bool = False
+    ) -> tuple[list[tuple[int, Shape]], FloatArray]:
+        """Derivatives of the effects by their free shapes: which, and columns (m, s).
+
+        Logarithmic shapes are differentiated by their logarithm.
+        """
+        where = [
+            (place, each)
+            for place, effect in enumerate(effects)
+            for each in free_shapes(effect, self.terms.moves)
+        ]
+        result = np.empty((len(where), len(self.terms.observed))).T
+        for at, (place, shape) in enumerate(where):
+            result[:, at] = tangent(self.terms.columns, effects[place], shape, central)
+        return where, result
+
+    def _at(self, effects: Sequence[Effect]) -> _Point:
+        """Coefficients for given shapes."""
+        terms = self.terms
+        fixed = self._fixed_of(effects)
+        moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
+        matrix = side_by_side([terms.columns(effects[place]) for place in moving], len(terms.observed))
+        split, size = len(fixed.gram), len(fixed.gram) + matrix.shape[1]
+        gram, right = np.empty((size, size)), np.empty(size)
+        gram[:split, :split], right[:split] = fixed.gram, fixed.right
+        if matrix.shape[1]:
+            gram[:split, split:] = fixed.weighted.T @ matrix
+            gram[split:, :split] = gram[:split, split:].T
+            gram[split:, split:] = matrix.T @ terms.weighting.apply(matrix)
+            right[split:] = matrix.T @ self._right
+        columns = self._linear(effects, fixed.places, moving)
+        mean, information = terms.known(columns).T
+        signs = {place: terms.sign(effect) for place, effect in enumerate(effects)}
+        sign = np.array([signs.get(each.effect, 0.0) for each in columns])
+        gram[np.arange(size), np.arange(size)] += information
+        right = right + information * mean
+        inside = np.ones(size, dtype=np.bool_)
+        while True:
+            coefficients = np.zeros(size)
+            coefficients[inside] = solve_symmetric(gram[np.ix_(inside, inside)], right[inside])
+            below = inside & (sign * coefficients < 0.0)
+            if not np.any(below):
+                break
+            inside &= ~below
+        # Not by the normal equations, which a ridge satisfies only nearly.
+        chi_square = self._total + float(information @ mean**2)
+        chi_square += float(coefficients @ (gram @ coefficients) - 2.0 * (right @ coefficients))
+        chi_square += self._of_shapes(effects)
+        result = list(effects)
+        at = len(terms.nuisances.names)
+        for place in (*fixed.places, *moving):
+            count = len(effects[place].coefficients())
+            result[place] = effects[place].fitted(coefficients[at : at + count])
+            at += count
+        return _Point(
+            tuple(effects), tuple(result), fixed, moving, matrix, gram, coefficients, inside, chi_square
+        )
+
+    def _fixed_of(self, effects: Sequence[Effect]) -> _Fixed:
+        """Columns that can stay: of effects without free shape, as long as they are what they were."""
+        units = {
+            place: unit(effect)
+            for place, effect in enumerate(effects)
+            if not free_shapes(effect, self.terms.moves)
+        }
+        old = self._fixed
+        if old is not None:
+            same = all(
+                place in units and units[place] == each
+                for place, each in zip(old.places, old.units, strict=True)
+            )
+            if same:
+                return old
+            # What was exchanged once is exchanged again at the next step.
+            known = set(old.units)
+            places = tuple(place for place, each in units.items() if each in known) or tuple(units)
+        else:
+            places = tuple(units)
+        parts = [self.terms.nuisances.columns, *(self.terms.columns(effects[place]) for place in places)]
+        matrix = side_by_side(parts, len(self.terms.observed))
+        weighted = self.terms.weighting.apply(matrix)
+        self._fixed = _Fixed(
+            places,
+            tuple(units[place] for place in places),
+            matrix,
+            weighted,
+            matrix.T @ weighted,
+            matrix.T @ self._right,
+        )
+        return self._fixed
+
+    def _linear(self, effects: Sequence[Effect], *places: tuple[int, ...]) -> list[Column]:
+        """The linear columns, the nuisances' first."""
+        columns = [Column(-1, name) for name in self.terms.nuisances.names]
+        for place in chain(*places):
+            columns += [Column(place, str(number)) for number in range(len(effects[place].coefficients()))]
+        return columns
+
+    def _of_shapes(self, effects: Sequence[Effect]) -> float:
+        """What the shapes cost for being other than was known beforehand."""
+        total = 0.0
+        for (place, name), known in self.terms.prior.items():
+            shape = next((each for each in effects[place].shape if each.name == name), None)
+            if shape is not None:
+                total += known.information * (on_scale(effects[place], shape) - known.mean) ** 2
+        return total
+
+    def _system(
+        self, here: _Point, where: list[tuple[int, Shape]], tangents: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Matrix and slope of the shapes, with everything linear eliminated."""
+        if not where:
+            return np.empty((0, 0)), np.empty(0)
+        weighted = self.terms.weighting.apply(tangents)
+        cross = np.concatenate([here.fixed.matrix.T @ weighted, here.matrix.T @ weighted])[here.inside]
+        inner = tangents.T @ weighted
+        slope = tangents.T @ self._right - cross.T @ here.coefficients[here.inside]
+        known = [self.terms.prior.get((place, each.name), FREE) for place, each in where]
+        mean, information = np.array(known).T
+        inner += np.diag(information)
+        slope += information * (mean - [on_scale(here.effects[place], each) for place, each in where])
+        gram = here.gram[np.ix_(here.inside, here.inside)]
+        return inner - cross.T @ solve_symmetric(gram, cross), slope
+
+    def _step(
+        self,
+        here: _Point,
+        where: list[tuple[int, Shape]],
+        system: tuple[FloatArray, FloatArray],
+        damping: float,
+    ) -> tuple[FloatArray, float]:
+        """Step of the shapes, none of which leaves its range, and the fall in chi square that it promises."""
+        inner, slope = system
+        free = np.ones(len(where), dtype=np.bool_)
+        step = np.zeros(len(where))
+        while np.any(free):
+            step[:] = 0.0
+            part = inner[np.ix_(free, free)]
+            damped = part + damping * np.diag(np.diag(part)) + 1e-12 * np.eye(len(part))
+            step[free] = solve_symmetric(damped, slope[free])
+            blocked = np.array(
+                [
+                    leaves(here.effects[place], shape, move)
+                    for (place, shape), move in zip(where, step.tolist(), strict=True)
+                ]
+            )
+            if not np.any(blocked & free):
+                break
+            free &= ~blocked
+        step[~free] = 0.0
+        return step, float(slope @ step)
+
+    def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
+        """Whether what effects carry of each other is what they were fitted with."""
+        return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
+
+    def _solution(self, here: _Point) -> Solution:
+        columns, edge = self._linear(here.effects, here.fixed.places, here.moving), []
+        for place, effect in enumerate(here.effects):
+            for each in free_shapes(effect, self.terms.moves):
+                columns.append(Column(place, each.name, True, each.logarithmic))
+                if shape_value(effect, each.name) in {each.lower, each.upper}:
+                    edge.append((place, each.name))
+        split = here.fixed.matrix.shape[1]
+        told = here.fixed.matrix @ here.coefficients[:split] + here.matrix @ here.coefficients[split:]
+        return Solution(
+            here.effects,
+            here.coefficients[: len(self.terms.nuisances.names)],
+            here.chi_square,
+            tuple(columns),
+            np.asarray(self.terms.observed - told),
+            tuple(edge),
+            self,
+            here,
+        )

@@ -1,0 +1,23 @@
+"""Systems that are singular: what no column shows stays at zero, whatever rounding says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdbridge.analysis.linear import solve_symmetric
+
+
+def test_columns_of_nothing_beside_columns_that_are_alike_stay_at_zero() -> None:
+    """The second spring constant of a record whose torque stays below the first break, and two orders that
+    are one on a short arc.
+    """
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        columns = rng.standard_normal((200, 9)) @ rng.standard_normal((9, 9))
+        columns[:, 2] = columns[:, 1]
+        columns[:, [3, 5]] = 0.0
+        right = columns.T @ rng.standard_normal(200)
+        for each in (right, np.column_stack([right, 3.0 * right])):
+            solved = solve_symmetric(columns.T @ columns, each)
+            assert np.all(solved[[3, 5]] == 0.0)
+            assert np.all(np.isfinite(solved))

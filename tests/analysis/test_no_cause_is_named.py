@@ -1,0 +1,52 @@
+"""What fits and what diagnoses knows no cause: what is particular to one stands in its own file."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hdbridge
+from hdbridge.effects import CATALOGUE
+
+ROOMS = ("analysis",)
+FILES = sorted(path for room in ROOMS for path in (Path(hdbridge.__path__[0]) / room).glob("*.py"))
+CLASSES = {kind.__name__ for kind in CATALOGUE.values()} | {
+    base.__name__
+    for kind in CATALOGUE.values()
+    for base in kind.__mro__
+    if base.__module__.startswith("hdbridge.effects.") and base.__module__ != "hdbridge.effects.base"
+}
+
+
+def words(path: Path) -> Iterator[str]:
+    """Names that the code uses, and its strings; no comments and no docstrings."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    said = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name) | ast.Attribute(attr=name) | ast.alias(name=name):
+                yield name
+            case ast.Constant(value=str(text)) if id(node) not in said:
+                yield from (word.strip(".,:;()'") for word in text.split())
+
+
+def test_there_is_something_to_look_at() -> None:
+    assert len(FILES) > 20
+    assert {"OrderSeries", "ElasticLoop", "Linear"} - CLASSES == {"Linear"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda each: f"{each.parent.name}/{each.stem}")
+def test_no_cause_and_no_class_of_one_is_named(path: Path) -> None:
+    used = set(words(path))
+    assert not used & CLASSES
+    # "creep" and "wear" are words too: what gives a name of the catalogue away is that it stands alone.
+    assert not {name for name in CATALOGUE if name in used and "_" in name}
+    alone = {
+        node.value
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    assert not alone & set(CATALOGUE)

@@ -1,0 +1,77 @@
+"""How finely an angle was read, and how often it turned, whatever wrote it down."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdbridge.analysis.driving import kinematics, reversals
+from hdbridge.analysis.readings import reading_of
+
+COUNTS = [8000, 2**14, 2**17, 2**20]
+
+
+def bench(rng: np.random.Generator) -> np.ndarray:
+    """Sweeps, sines and small reversals, in motor degrees at 50 Hz, and rests between them."""
+    ramp = np.linspace(0.0, 7300.0, 1500)
+    time_s = np.arange(1500) / 50.0
+    sines = [a * np.sin(2.0 * np.pi * time_s / 10.0) for a in (180.0, 45.0, 5.0)]
+    stairs = np.concatenate([np.linspace(0, d, 60) for d in (-4.0, 4.0, -2.0, 2.0)])
+    way = np.concatenate([ramp, ramp[::-1], *sines, stairs, np.full(500, stairs[-1])])
+    return way + 0.01 * rng.random()
+
+
+def kept(angle: np.ndarray, digits: int) -> np.ndarray:
+    """As a file of so many significant digits has it."""
+    return np.array([float(f"{each:.{digits}g}") for each in angle.tolist()])
+
+
+def turns(measured: np.ndarray, target: np.ndarray | None) -> int:
+    reading = reading_of(measured)
+    time_s = np.arange(len(measured)) / 50.0
+    return reversals(kinematics(measured, target, time_s, reading)[0], reading.jitter_deg)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    counts=st.sampled_from(COUNTS),
+    digits=st.integers(7, 17),
+    home_deg=st.floats(-20_000.0, 20_000.0),
+    noise=st.sampled_from([0.0, 0.5]),
+    commanded=st.booleans(),
+)
+def test_the_number_of_reversals_does_not_depend_on_digits_counts_or_home(
+    counts: int, digits: int, home_deg: float, noise: float, commanded: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    true, count = bench(rng), 360.0 / counts
+    read = np.round(true / count + noise * rng.normal(size=len(true))) * count + home_deg
+    target = kept(true + home_deg, digits) if commanded else None
+    assert turns(kept(read, digits), target) == turns(true, None) == 24
+
+
+@pytest.mark.parametrize("counts", COUNTS[:3])
+@pytest.mark.parametrize("digits", [9, 10, 12, 17])
+def test_a_count_is_seen_through_the_digits_of_a_file(counts: int, digits: int) -> None:
+    count = 360.0 / counts
+    read = kept(np.round(bench(np.random.default_rng(2)) / count) * count + 4321.0, digits)
+    if count > 6.0 * 10.0 ** (5 - digits):
+        assert reading_of(read).count_deg == pytest.approx(count, rel=1e-4)
+
+
+@pytest.mark.parametrize("noise_deg", [0.0, 0.002, 0.05])
+def test_where_no_count_is_seen_the_jitter_says_how_fine_a_reading_is(noise_deg: float) -> None:
+    rng = np.random.default_rng(3)
+    true = bench(rng)
+    reading = reading_of(true + noise_deg * rng.normal(size=len(true)))
+    assert reading.count_deg == 0.0
+    assert reading.jitter_deg == pytest.approx(noise_deg, rel=0.15, abs=1e-4)
+
+
+def test_what_settles_by_less_than_the_narrowest_loop_does_not_reverse() -> None:
+    settles = np.concatenate([np.linspace(0.0, 360.0, 200), [360.07, 360.0, 360.05], np.full(20, 360.0)])
+    assert reversals(settles, 0.0) == 0
+    back = np.concatenate([settles, np.linspace(360.0, 359.0, 20)])
+    assert reversals(back, 0.0) == 1
