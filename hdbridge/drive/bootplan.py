@@ -1,4 +1,4 @@
-"""The boot-up's writes fitted to a drive: objects that its EDS lacks or fixes are left to it. Pure."""
+"""Fits the boot-up's writes to a drive: objects that its EDS lacks or fixes are left to the drive. Pure."""
 
 from __future__ import annotations
 
@@ -22,34 +22,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """An object that is left to the drive, why, and what follows."""
+    """Object that is left to the drive, with the reason and the consequence."""
 
     index: int
     sub: int
     reason: str
-    """For example: which drive.eds lacks."""
+    """Relative clause for messages, for example ``which drive.eds lacks``."""
     consequence: str
     field: str = ""
-    """Field of the axis file that would have decided its value."""
+    """Field of the axis file that would have set the value."""
 
     def __str__(self) -> str:
-        """``605Dh:00, which drive.eds lacks: how a halt brakes``."""
+        """For example ``605Dh:00, which drive.eds lacks: how a halt brakes``."""
         return f"{self.index:04X}h:{self.sub:02X}, {self.reason}: {self.consequence}"
 
 
 def plan(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[PlannedWrite]:
-    """All writes of a boot-up in order, for the drive and a load encoder that is a node of its own.
+    """Returns all writes of a boot-up in order, for the drive and for a load encoder with its own node id.
 
-    ``od`` is the drive's object dictionary, by default that of the axis's own EDS. Objects that are left to
-    the drive are not in the list, and PDOs that are not used are disabled. Raises `InputError` with the line
-    of the axis file if a value cannot be expressed in its object, or the EDS does not permit it, lacks what
-    the control cycle or the axis file needs, or says that the drive does not have the mode.
+    ``od`` is the drive's object dictionary, by default that of the axis's EDS. Objects that are left to the
+    drive are omitted, and unused PDOs are disabled. Raises `InputError` with the line of the axis file if a
+    value cannot be expressed in its object, or if the EDS forbids it, lacks an object that the control cycle
+    or the axis file needs, or excludes the mode.
     """
     return _sorted(axis, od)[0]
 
 
 def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[Left]:
-    """The objects that `plan` leaves to the drive, and those that the control cycle does without."""
+    """Returns the objects that `plan` leaves to the drive, and missing ones that the control cycle can do
+    without.
+    """
     od = dictionary_of(axis) if od is None else od
     if od is None:
         return []
@@ -57,7 +59,7 @@ def left_to_drive(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[
 
 
 def sent_along(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[str]:
-    """The objects that the master sends only because they are in a fixed mapping of the drive."""
+    """Describes the objects that the master sends only because the drive's fixed mappings contain them."""
     own = {(each.index, each.sub) for each in (objects.CONTROLWORD, objects.MODE, cyclic_mode(axis).target)}
     od = dictionary_of(axis) if od is None else od
     found = []
@@ -71,7 +73,7 @@ def sent_along(axis: AxisConfig, od: ObjectDictionary | None = None) -> list[str
 
 
 def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[PlannedWrite], list[Left]]:
-    """The rows that are for the boot-up, and those that are left to the drive."""
+    """Splits all rows into those that the boot-up writes and the objects that are left to the drive."""
     od = dictionary_of(axis) if od is None else od
     if od is not None:
         _check_mode(axis, od)
@@ -93,7 +95,10 @@ def _sorted(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[list[Planned
 
 
 def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> str | None:
-    """Why the drive keeps a value of its own; None if the boot-up sees to it. `InputError` if it must not."""
+    """Returns the reason to leave an object to the drive, or None if the boot-up sets it.
+
+    Raises `InputError` if the drive must not keep its own value.
+    """
     if row.node_id != axis.drive.node_id or not (row.without or row.exact):
         return None
     variable, eds = find(od, row.index, row.sub), axis.drive.eds
@@ -113,7 +118,7 @@ def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> 
             )
         return reason
     low, high = permitted(variable, kind)
-    if low <= row.value <= high or row.kept or row.composed:  # the limits mean a part of the value
+    if low <= row.value <= high or row.kept or row.composed:  # The limits apply to only a part of the value.
         return None
     if row.exact or axis.states(row.field):
         raise InputError(f"{axis.where(row.field)}: {_of(row)}; {eds} permits {low} to {high}")
@@ -125,7 +130,7 @@ def _of(row: PlannedWrite) -> str:
 
 
 def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
-    """`InputError` if the EDS says that the mode is missing: by 6502h, or else by the limits of 6060h."""
+    """Raises `InputError` if the EDS excludes the mode, by 6502h or else by the limits of 6060h."""
     modes, said = _value_of_6502h(od), "6502h is {:08X}h"
     mode = find(od, objects.MODE.index, objects.MODE.sub)
     if not modes and mode is not None:
@@ -142,13 +147,13 @@ def _check_mode(axis: AxisConfig, od: ObjectDictionary) -> None:
 
 
 def _value_of_6502h(od: ObjectDictionary) -> int:
-    """Supported drive modes as the EDS gives them; 0 if it does not."""
+    """Returns the supported drive modes (6502h) given by the EDS; 0 if it gives none."""
     variable = find(od, objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub)
     return (held(variable) if variable is not None else None) or 0
 
 
 def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
-    """What the control cycle and the boot-up would read, and the drive does not have."""
+    """Yields the objects that the control cycle and the boot-up would read but the drive cannot provide."""
     absent = layouts(axis, od).absent
     for address, consequence in (
         (objects.POSITION_DEMAND, "the last target sent stands in for it"),

@@ -1,8 +1,8 @@
-"""From an unknown node to a drive that is known, configured and OPERATIONAL (but not enabled).
+"""Boot-up: takes an unknown node to a verified, configured drive in OPERATIONAL, with power off.
 
-Nothing is believed: the identity is compared, the scaling is compared, and every object is read before it is
-written, and read back after. The first thing that is not as expected ends the boot-up with an error that
-names the object, unless it may be left to the drive.
+Nothing is assumed. Identity and scaling are compared with the axis file; every object is read before it is
+written and read back afterwards. The first mismatch ends the boot-up with an error that names the object,
+unless the object may be left to the drive.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
-"""How long a node may take from a reset to its boot-up message before it is asked directly."""
+"""Time from a reset to the boot-up message, after which the node is queried directly; s."""
 SDO_AFTER_BOOT_UP_S: Final = 3.5
-"""How long a node may take from its boot-up message to its first SDO answer."""
+"""Time from the boot-up message to the first SDO answer that a node is allowed; s."""
 STATE_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.02
 _WRITE_ONLY: Final = 0x0601_0001
@@ -54,29 +54,30 @@ _MAPPINGS_PER_KIND: Final = 0x200
 
 @dataclass(frozen=True, slots=True)
 class BootReport:
-    """What the boot-up found and did."""
+    """Result of a boot-up: what was found and written."""
 
     node_id: int
     identity: dict[str, int]
     names: dict[str, str]
-    """Device name and versions (1008h, 1009h, 100Ah), where the drive tells them."""
+    """Device name and versions (1008h, 1009h, 100Ah), if the drive provides them."""
     modes: tuple[Mode, ...]
-    """Modes of operation that the drive has, of those that are used here; all if it does not say (6502h)."""
+    """Supported modes of operation among those used here; all of them if the drive does not report 6502h."""
     state: State
     held: tuple[PlannedWrite, ...] = ()
-    """What the drive now holds as planned."""
+    """Planned values that the drive now holds."""
     written: tuple[PlannedWrite, ...] = ()
-    """Those of ``held`` that had to be written."""
+    """The subset of ``held`` that had to be written."""
     left: frozenset[tuple[int, int]] = frozenset()
-    """Index and sub-index of the objects that it did not take, and that were left to it."""
+    """Index and sub-index of the objects whose value the drive refused and was allowed to keep."""
     notes: tuple[str, ...] = field(default=())
-    """What is worth knowing but no reason to refuse."""
+    """Remarks for the user that are no reason to refuse the drive."""
 
 
 class BootUp:
-    """One boot-up. ``clients`` has an SDO client for the drive, and one for a separate load encoder.
+    """One boot-up.
 
-    ``others_heard`` are other nodes that have shown themselves before.
+    ``clients`` maps node ids to SDO clients: the drive's, and that of a separate load encoder.
+    ``others_heard`` are other nodes that have been heard before.
     """
 
     def __init__(
@@ -99,9 +100,10 @@ class BootUp:
         self._notes: list[str] = []
 
     def run(self, *, reset: bool) -> BootReport:
-        """All of it, in order. Raises `DriveError` (or a kind of it) at the first thing that is wrong.
+        """Runs all steps in order.
 
-        `InputError` before anything is sent where the EDS lacks what there is no doing without.
+        Raises `DriveError` or a subclass at the first mismatch, and `InputError` before anything is sent if
+        the EDS lacks an indispensable object.
         """
         planned = plan(self._axis, self._sdo.od)
         for node_id in self._clients:
@@ -122,7 +124,7 @@ class BootUp:
         return self._report(identity, modes)
 
     def look(self) -> BootReport:
-        """Compare a drive that runs already with its axis file; writes nothing and changes no state.
+        """Compares a running drive with its axis file; writes nothing and changes no state.
 
         Raises as `run` does.
         """
@@ -161,7 +163,7 @@ class BootUp:
         return frame.time_s <= deadline_s
 
     def _reach(self, node_id: int, *, reset: bool) -> None:
-        """Get a node into PRE-OPERATIONAL, and be sure that it is there."""
+        """Brings a node into PRE-OPERATIONAL and verifies that it answers."""
         status = self._monitor.watch(node_id)
         since = status.counts
         if reset:
@@ -179,7 +181,7 @@ class BootUp:
         status = self._monitor.watch(node_id)
         self._nmt(NmtCommand.START, node_id)
         if node_id == self._axis.drive.node_id and not drive_heartbeat_ms(self._axis, self._sdo.od):
-            return  # nothing says that it has started but the TPDOs that are to come
+            return  # Without a heartbeat, only the TPDOs that follow show that it has started.
         deadline_s = self._link.now() + STATE_TIMEOUT_S + 2e-3 * self._axis.drive.heartbeat_ms
         status.nmt_state = None
         while status.nmt_state != NmtState.OPERATIONAL and self._receive_until(deadline_s):
@@ -191,14 +193,14 @@ class BootUp:
                 f"look at its error display and at {self._axis.where('drive.heartbeat_ms')}"
             )
 
-    # -- what it is ---------------------------------------------------------------------------------------
+    # -- verification -------------------------------------------------------------------------------------
 
     def _refuse(self, complaints: list[Complaint]) -> None:
         if complaints:
             raise IdentityError(complaints[0].text)
 
     def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
-        """The objects that the EDS lists."""
+        """Reads those objects that the EDS lists."""
         return {each: self._sdo.fetch(each) for each in addresses if self._sdo.has(each.index, each.sub)}
 
     def _check_device_type(self) -> None:
@@ -221,7 +223,7 @@ class BootUp:
         return tuple(mode for mode in Mode if not bits or bits & mode.supported_bit)
 
     def _check_scaling(self) -> None:
-        """User units per motor turn, by every object that says something about them."""
+        """Compares counts per motor turn, from every object that defines them, with the axis file."""
         self._refuse(scaling_complaints(self._axis, self._readings(scaling_addresses(self._axis))))
         rated = self._readings((objects.RATED_TORQUE,))
         self._notes += torque_notes(self._axis, rated.get(objects.RATED_TORQUE))
@@ -233,13 +235,13 @@ class BootUp:
                 try:
                     names[key] = self._sdo.read_text(index)
                 except SdoError:
-                    continue  # a name is only for people
+                    continue  # names are for display only
         return names
 
-    # -- what is done to it -------------------------------------------------------------------------------
+    # -- configuration ------------------------------------------------------------------------------------
 
     def _power_off(self) -> None:
-        """A drive that an earlier master left with power on is switched off before anything is changed."""
+        """Switches off a drive that an earlier master left with power on, before anything is changed."""
         off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
         state = decode(self._sdo.fetch(objects.STATUSWORD))
         if state in off:
@@ -262,7 +264,9 @@ class BootUp:
             pass
 
     def _configure(self, rows: list[PlannedWrite]) -> None:
-        """Bring one PDO to what its rows say, if it is not there: a drive may have it so, and fixed."""
+        """Configures one PDO unless it already is as planned; its configuration may be correct
+        and read-only.
+        """
         lasting = [row for row in rows if not row.passing]
         wrong = [row for row in lasting if not self._is_held(row)]
         if not wrong:
@@ -278,7 +282,7 @@ class BootUp:
             self._settle(row)
 
     def _is_held(self, row: PlannedWrite) -> bool:
-        """The drive holds the value already; False if it cannot be read."""
+        """Returns True if the drive already holds the value; False if the object is write-only."""
         try:
             found = self._read(row)
         except SdoError as error:
@@ -286,7 +290,7 @@ class BootUp:
         return found is not None and row.holds(found)
 
     def _read(self, row: PlannedWrite) -> int | None:
-        """What the drive holds; None for an object that can only be written."""
+        """Returns the present value; None for a write-only object."""
         sdo = self._clients[row.node_id]
         variable = find(sdo.od, row.index, row.sub)
         if variable is not None and not is_readable(variable):
@@ -299,7 +303,7 @@ class BootUp:
             raise
 
     def _settle(self, row: PlannedWrite) -> None:
-        """See to it that an object holds its value: read it, write it if it differs, read it back."""
+        """Makes an object hold its value: reads it, writes it if it differs, reads it back."""
         if not self._is_held(row):
             try:
                 self._write(row)
@@ -315,17 +319,19 @@ class BootUp:
             self._held.append(row)
 
     def _may_keep(self, row: PlannedWrite, error: DriveError) -> bool:
-        """The drive may keep a value that nobody chose but hdbridge, and one that is read-only."""
+        """Returns True if the drive may keep its own value: a default the user did not set, or a read-only
+        object.
+        """
         if not row.without or row.exact:
             return False
         cause = error.__cause__
         if isinstance(cause, SdoError) and not isinstance(cause, SdoAbortError):
-            return False  # it does not answer
+            return False  # no answer at all
         read_only = isinstance(cause, SdoAbortError) and cause.code == _READ_ONLY
         return read_only or not self._axis.states(row.field)
 
     def _write(self, row: PlannedWrite) -> None:
-        """Write one object and compare what the drive then holds."""
+        """Writes one object and compares the value read back."""
         sdo = self._clients[row.node_id]
         value = row.value
         try:
@@ -352,7 +358,7 @@ class BootUp:
 
 
 def _maps(row: PlannedWrite) -> bool:
-    """Whether the object is a mapping parameter of a PDO."""
+    """Returns True for a mapping parameter of a PDO."""
     return any(base <= row.index < base + _MAPPINGS_PER_KIND for base in _MAPPINGS)
 
 
@@ -364,17 +370,18 @@ def await_sdo(
     since: tuple[int, int, int] = (0, 0, 0),
     others_heard: Iterable[int] = (),
 ) -> int:
-    """The device type (1000h) of a node, which may answer SDO only seconds after its boot-up message.
+    """Waits for the first SDO answer of a node and returns its device type (1000h).
 
-    Raises `DriveError` if it does not answer, with what was heard of it since its status had the
-    counts ``since``, else with ``where`` the axis file names it. An abort is an answer (`SdoAbortError`).
+    A node may answer only seconds after its boot-up message. Raises `DriveError` if it does not answer; the
+    message reports what was heard of the node since its status had the counts ``since``. ``where`` is the key
+    of the axis file that defines the node. An abort counts as an answer (`SdoAbortError`).
     """
     status = monitor.watch(client.node_id)
     while True:
         try:
             return client.fetch(objects.DEVICE_TYPE)
         except SdoAbortError:
-            raise  # it answered: it is there
+            raise  # an abort is an answer, so the node is there
         except SdoError as error:
             booted_s = status.boot_up_s
             booted = status.boot_ups > since[0]

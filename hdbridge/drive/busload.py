@@ -1,13 +1,13 @@
-"""How much of the bus the cycle of its axes takes at worst. Pure.
+"""Worst-case bus load of the control cycle. Pure.
 
-The longest that a frame of s data bytes can become on the wire, with every stuff bit that the bit-stuffing
-rule allows and the three bits of interframe space, is
+The maximum length on the wire of a frame with s data bytes, including all stuff bits that the bit-stuffing
+rule allows and three bits of interframe space, is
 
-    g + 8 s + 13 + floor((g + 8 s - 1) / 4) bits,    g = 34 with 11-bit identifiers
+  g + 8 s + 13 + floor((g + 8 s - 1) / 4) bits,    g = 34 with 11-bit identifiers
 
 (R. I. Davis, A. Burns, R. J. Bril, J. J. Lukkien: Controller Area Network (CAN) schedulability analysis:
-Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g are the bits of the header and of the
-checksum that are subject to stuffing; the other 13 are not.
+Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g counts the bits of the header and of
+the checksum that are subject to stuffing; the other 13 are not.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 MAXIMUM_LOAD: Final = 0.8
-"""Share of the cycle that its frames may take: the rest is for repeated frames, and for what others send."""
+"""Maximum share of the cycle taken by its frames. The rest is for retransmissions and other nodes."""
 _STUFFED: Final = 34
 _UNSTUFFED: Final = 13
 _LARGEST: Final = 8
@@ -32,7 +32,9 @@ _HEARTBEAT_BYTES: Final = 1
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Most bits that a data frame with an 11-bit identifier takes, its interframe space included."""
+    """Returns the maximum length of a data frame with an 11-bit identifier, interframe space
+    included; bits.
+    """
     if not 0 <= data_bytes <= _LARGEST:
         raise InputError(f"a CAN frame has 0 to {_LARGEST} data bytes, not {data_bytes}")
     stuffed = _STUFFED + 8 * data_bytes
@@ -40,14 +42,14 @@ def frame_bits(data_bytes: int) -> int:
 
 
 FRAME_BITS: Final = tuple(frame_bits(length) for length in range(_LARGEST + 1))
-"""`frame_bits` by the number of data bytes."""
+"""`frame_bits` indexed by the number of data bytes."""
 
 
 def cycle_bits(axes: Sequence[AxisConfig]) -> float:
-    """Most bits of one cycle of these axes on one bus, on average over the cycles.
+    """Returns the worst-case bits per cycle of these axes on one bus, averaged over the cycles.
 
-    SYNC, the TPDOs and the RPDO of each axis, the optional channels as often as they come, the heartbeats of
-    the nodes and of the master, and one SDO request with its answer.
+    Counts SYNC, the TPDOs and RPDOs of each axis, the optional channels at their rates, the heartbeats of the
+    nodes and of the master, and one SDO request with its answer.
     """
     bits = float(frame_bits(0) + 2 * frame_bits(_SDO_BYTES))
     heartbeat = frame_bits(_HEARTBEAT_BYTES)
@@ -64,9 +66,10 @@ def cycle_bits(axes: Sequence[AxisConfig]) -> float:
 
 
 def bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
-    """Share of each cycle that its frames take at worst; None where no bit rate is known.
+    """Returns the worst-case share of each cycle that its frames take; None if no bit rate is known.
 
-    ``bitrate_bps`` is by default that of the axis files. InputError where these differ in it or in the cycle.
+    ``bitrate_bps`` is by default that of the axis files. Raises `InputError` if these disagree on the bit
+    rate or on the cycle time.
     """
     rate = bitrate_bps if bitrate_bps is not None else _common_bitrate(axes)
     if rate is None or not axes:
@@ -75,7 +78,7 @@ def bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> floa
 
 
 def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -> float | None:
-    """`bus_load`; InputError where it is above `MAXIMUM_LOAD`, with what would fit."""
+    """Returns `bus_load`; raises `InputError` with a workable alternative if it exceeds `MAXIMUM_LOAD`."""
     load = bus_load(axes, bitrate_bps)
     if load is None or load <= MAXIMUM_LOAD:
         return load
@@ -98,7 +101,7 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
 
 
 def _load_at(axes: Sequence[AxisConfig], rate: int, cycle_s: float) -> float:
-    """The load if the cycle lasted so long."""
+    """Returns the load at another cycle time."""
     return cycle_bits([_with_cycle(axis, 1e3 * cycle_s) for axis in axes]) / (rate * cycle_s)
 
 
@@ -116,7 +119,7 @@ def _common_bitrate(axes: Sequence[AxisConfig]) -> int | None:
 
 
 def _common(values: Iterable[tuple[AxisConfig, float]], field: str) -> float:
-    """The one value of a field on all axes; InputError where two differ."""
+    """Returns the value of a field that all axes share; raises `InputError` if two differ."""
     pairs = list(values)
     first, value = pairs[0]
     for axis, other in pairs[1:]:

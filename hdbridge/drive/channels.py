@@ -1,9 +1,9 @@
-"""The optional channels on line: load torque and temperature, scaled, checked, held and given up. Pure.
+"""Optional channels of a running axis (load torque, temperature): scaling, range check, hold and loss. Pure.
 
-A channel is worth less than the encoders: without it the axis still stands where it should, but for the part
-of the compensation that depends on it. So a reading that is missing or not believed is no reason to stop.
-The last good one is held, for as long as the axis file says; then the channel is lost, and has no value until
-readings come again.
+A channel matters less than the encoders. Without it the axis still holds its position, except for the part of
+the compensation that depends on it, so a missing or implausible reading is no reason to stop. The last good
+reading is held for the time given in the axis file. After that the channel is lost and has no value until
+readings return.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class ChannelFollower:
-    """One channel: `accept` takes its readings, `step` ends each cycle, ``value`` is what to go by."""
+    """One channel. `accept` takes its readings, `step` ends each cycle, ``value`` is the reading in force."""
 
     __slots__ = (
         "_age", "_at_zero", "_every", "_greatest", "_hold", "_least", "_overdue", "_per_count", "_unit",
@@ -27,32 +27,36 @@ class ChannelFollower:
     )  # fmt: skip
 
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
-        """``key`` is that of the axis file."""
+        """``key`` is the channel's key in the axis file."""
         self.key = key
         self._per_count, self._at_zero, least, greatest = channel.scale
         self._unit = BY_KEY[key].unit
-        # The ends of a signed type, and the top of any, are what a sensor says that is broken or saturated.
+        # A broken or saturated sensor reports the ends of a signed type, or the top of an unsigned one.
         kind = IntegerType.named(channel.source.type)
         ends = sorted((self._of(kind.minimum + kind.signed), self._of(kind.maximum - 1)))
         self._least, self._greatest = max(least, ends[0]), min(greatest, ends[1])
         self._every = channel.every_cycles
-        # A frame that is not waited for may come a cycle later or earlier than the last one did.
+        # A frame that the cycle does not wait for may arrive one cycle early or late.
         self._overdue = 1 if self._every == 1 else self._every + 1
         self._hold = int(channel.hold_ms / cycle_ms)
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is known: the cycle begins, or has rested."""
+        """Discards all readings, at the start of the cycle and after a pause."""
         self.value: float | None = None
-        """The last good reading in the unit of the channel; None before the first, and while it is lost."""
+        """Last good reading in the unit of the channel; None before the first reading and while the channel
+        is lost.
+        """
         self.lost = False
-        """None has come for so long that none is waited for."""
+        """True if no good reading has come for longer than the hold time, so that none is
+        awaited any more.
+        """
         self.why = "none came"
-        """What there is to say about the value, where there is none or it is an old one."""
+        """Reason why there is no new value, for messages."""
         self._age = 0
 
     def accept(self, counts: int) -> None:
-        """A reading has come."""
+        """Takes a reading; one outside the plausible range is rejected."""
         value = self._of(counts)
         if self._least <= value <= self._greatest:
             self.value = value
@@ -65,9 +69,9 @@ class ChannelFollower:
             )
 
     def step(self) -> tuple[Fault, str] | None:
-        """The cycle's readings are in: what is wrong with the channel, in words as well, or None.
+        """Ends a cycle; returns the channel's fault and its description, or None.
 
-        Said once per reading that is overdue, and once when the channel is lost.
+        Reports each overdue reading once, and the loss of the channel once.
         """
         age = self._age
         self._age = age + 1

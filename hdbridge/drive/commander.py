@@ -1,7 +1,7 @@
-"""Commanding the drive by SDO, outside the control cycle: walk its states, wait for its statusword.
+"""Commands the drive by SDO, outside the control cycle: walks its states and waits for its statusword.
 
-While it waits it does the master's duties: it takes in heartbeats and emergencies, and it sends the
-master's own heartbeat, because the drive stops when that stays away.
+While it waits it keeps up the master's duties: it processes heartbeats and emergencies and sends the master's
+own heartbeat, without which the drive stops.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import RESET, DriveError, TransitionError
 
 STEP_TIMEOUT_S: Final = 1.0
-"""How long a drive may take for one transition, or for a change of mode."""
+"""Maximum duration of one state transition or change of mode; s."""
 BRAKE_TIMEOUT_S: Final = 3.0
 POLL_S: Final = 0.005
 _STILL_COUNTS: Final = 2
@@ -31,7 +31,7 @@ _FAILED_STATES: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
 class Commander:
-    """The statusword and the controlword of one drive, by SDO."""
+    """SDO access to the statusword and the controlword of one drive."""
 
     def __init__(self, link: Link, monitor: NetworkMonitor, sdo: SdoClient, image: ProcessImage) -> None:
         self.link = link
@@ -43,27 +43,27 @@ class Commander:
 
     @property
     def name(self) -> str:
-        """The drive, for messages."""
+        """Name of the drive, for messages."""
         return f"node {self.sdo.node_id} on {self.link.name}"
 
     def statusword(self) -> int:
-        """Read the statusword."""
+        """Reads the statusword."""
         self._beat()
         return self.sdo.fetch(objects.STATUSWORD)
 
     def state(self) -> State:
-        """Read the state; the image's power walk sees it too."""
+        """Reads the state and updates the image's power walk with it."""
         statusword = self.statusword()
         self.image.statusword = statusword
         return self.image.power.observe(statusword)
 
     def control(self, controlword: int) -> None:
-        """Write the controlword."""
+        """Writes the controlword."""
         self._beat()
         self.sdo.store(objects.CONTROLWORD, controlword)
 
     def pause(self, duration_s: float) -> None:
-        """Let time pass: receive what comes and send the master's heartbeat when it is due."""
+        """Waits; receives frames and sends the master's heartbeat when it is due."""
         end_s = self.link.now() + duration_s
         while True:
             self._beat()
@@ -74,7 +74,6 @@ class Commander:
                 return
 
     def _beat(self) -> None:
-        """Send the master's heartbeat when it is due."""
         now_s = self.link.now()
         if now_s >= self._heartbeat_due_s:
             self.link.send(self.image.heartbeat_id, bytes((NmtState.OPERATIONAL,)))
@@ -83,8 +82,9 @@ class Commander:
     def wait_for(
         self, what: str, done: Callable[[int], bool], timeout_s: float, *, allow_fault: bool = False
     ) -> int:
-        """Poll the statusword until ``done`` of it; `DriveError` on a fault, `TransitionError` in "
-        "time-out.
+        """Polls the statusword until ``done(statusword)`` is true and returns it.
+
+        Raises `DriveError` on a fault unless ``allow_fault``, and `TransitionError` on time-out.
         """
         deadline_s = self.link.now() + timeout_s
         while True:
@@ -102,7 +102,7 @@ class Commander:
             self.pause(POLL_S)
 
     def fault_words(self) -> str:
-        """Error code and last emergency of a drive that is in fault."""
+        """Returns error code and last emergency of a drive in fault, as text."""
         code = self.sdo.fetch(objects.ERROR_CODE) if self.sdo.has(objects.ERROR_CODE.index) else None
         last = self.monitor.watch(self.sdo.node_id).last_error
         details = [
@@ -112,14 +112,14 @@ class Commander:
         return ", ".join(filter(None, details)) or "no error code is known"
 
     def fault(self, when: str) -> DriveError:
-        """The error to raise for a drive that is in fault."""
+        """Returns the error to raise for a drive in fault."""
         return DriveError(
             f"{self.name}: fault {when} ({self.fault_words()}); remove the cause (the drive's manual "
             f"explains the code), then reset the fault: {RESET}"
         )
 
     def walk(self, target: State) -> None:
-        """Walk to a state, one controlword at a time, each confirmed by the statusword."""
+        """Walks to a state, one controlword at a time, each confirmed by the statusword."""
         state = self.state()
         self.image.power.go(target)
         if state is State.NOT_READY_TO_SWITCH_ON:
@@ -135,7 +135,7 @@ class Commander:
         self.wait_for(f"state '{state.value}'", lambda word: decode(word) is state, STEP_TIMEOUT_S)
 
     def set_mode(self, mode: Mode) -> None:
-        """Set the mode of operation and wait until 6061h shows it."""
+        """Sets the mode of operation and waits until 6061h shows it."""
         self.sdo.store(objects.MODE, mode)
         deadline_s = self.link.now() + STEP_TIMEOUT_S
         while (shown := self.sdo.fetch(objects.MODE_DISPLAY)) != mode:
@@ -148,7 +148,9 @@ class Commander:
             self.pause(POLL_S)
 
     def preload_target(self) -> int:
-        """Make the target the actual position, so that enabling moves nothing; the motor counts."""
+        """Sets the target to the actual position, so that enabling causes no motion; returns it in motor
+        counts.
+        """
         actual = self.sdo.fetch(objects.POSITION_ACTUAL)
         self.sdo.store(objects.TARGET_POSITION, wrap_int32(actual))
         found = self.sdo.fetch(objects.TARGET_POSITION)
@@ -160,7 +162,7 @@ class Commander:
         return actual
 
     def wait_for_standstill(self, timeout_s: float = BRAKE_TIMEOUT_S) -> bool:
-        """Wait until the position stays within two counts; whether it did."""
+        """Waits until the position stays within two counts; returns False on time-out."""
         deadline_s = self.link.now() + timeout_s
         last = self.sdo.fetch(objects.POSITION_ACTUAL)
         while self.link.now() < deadline_s:
@@ -172,7 +174,7 @@ class Commander:
         return False
 
     def quick_stop(self) -> State:
-        """Quick stop, and wait until the drive has taken it; the state in which it then is."""
+        """Commands a quick stop and waits until the drive reacts; returns the resulting state."""
         self.image.power.quick_stop()
         self.control(0x0002)
         stopped = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, *_FAILED_STATES)

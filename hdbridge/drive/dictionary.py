@@ -1,4 +1,4 @@
-"""A drive's object dictionary as its EDS describes it: its objects, their types, and what they hold."""
+"""The drive's object dictionary according to its EDS: objects, types and values."""
 
 from __future__ import annotations
 
@@ -26,24 +26,26 @@ INTEGER_TYPES: Final = {
     datatypes.UNSIGNED32: IntegerType.UINT32,
     datatypes.UNSIGNED64: IntegerType.UINT64,
 }
-"""By the number that the EDS has for them (CiA 301, table 44)."""
+"""Integer types by their number in the EDS (CiA 301, table 44)."""
 _TYPES: Final = {datatypes.BOOLEAN: IntegerType.UINT8, **INTEGER_TYPES}
 
 
 def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
-    """The object dictionary of an EDS file; `InputError` if it cannot be read."""
+    """Returns the object dictionary of an EDS file; raises `InputError` if it cannot be read."""
     return read_eds(path, node_id).dictionary
 
 
 def dictionary_of(axis: AxisConfig) -> ObjectDictionary | None:
-    """The dictionary of the axis's drive, not to be changed; None if the axis was not read from a file."""
+    """Returns the dictionary of the axis's drive (shared, read only); None if the axis was not read from a
+    file.
+    """
     return shared_eds(axis.eds_path, axis.drive.node_id).dictionary if axis.is_from_file else None
 
 
 def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:
-    """An object that the EDS lists.
+    """Returns an object that the EDS lists, or None.
 
-    canopen's own look-up invents members of an array from its first one.
+    canopen's own look-up would invent missing array members from the first one.
     """
     entry = od.get(index)
     if isinstance(entry, ODVariable):
@@ -52,21 +54,21 @@ def find(od: ObjectDictionary, index: int, sub: int) -> ODVariable | None:
 
 
 def integer_type(variable: ODVariable) -> IntegerType | None:
-    """Integer type of an object; None if it is not an integer."""
+    """Returns the integer type of an object; None if it is not an integer."""
     return _TYPES.get(variable.data_type or 0)
 
 
 def is_writable(variable: ODVariable) -> bool:
-    """The EDS permits writing the object."""
+    """Returns True if the EDS permits writing the object."""
     return "w" in variable.access_type
 
 
 def is_readable(variable: ODVariable) -> bool:
-    """The EDS permits reading the object."""
+    """Returns True if the EDS permits reading the object."""
     return "r" in variable.access_type or variable.access_type == "const"
 
 
 def held(variable: ODVariable) -> int | None:
-    """What the object holds by the EDS: its value in a DCF, else its default. None if neither is given."""
+    """Returns the object's value according to the EDS: its value in a DCF, else its default, else None."""
     value = variable.value if variable.value is not None else variable.default
     return value if isinstance(value, int) else None

@@ -1,4 +1,4 @@
-"""A CiA-402 drive from the commissioning side: boot it, enable it, move it, and never leave it enabled.
+"""Commissioning interface of a CiA-402 drive: boot it, enable it, move it, and never leave it enabled.
 
     with open_bus(axis.bus) as bus, Drive(bus, axis) as drive:
         drive.boot()
@@ -45,7 +45,7 @@ _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_
 
 
 class Positions(NamedTuple):
-    """Where the axis is, by both encoders."""
+    """Positions of the axis from both encoders."""
 
     motor_counts: int
     load_counts: int
@@ -54,10 +54,10 @@ class Positions(NamedTuple):
 
 
 class Drive:
-    """One drive on one bus. A context manager: on every way out the drive is stopped and disabled.
+    """One drive on one bus. As a context manager it stops and disables the drive on every exit.
 
-    The bus stays the caller's and open. ``od`` replaces the EDS of the axis file (for a test, or a DCF).
-    ``force`` speaks even where another master is heard on the bus.
+    The bus belongs to the caller and stays open. ``od`` replaces the EDS of the axis file (for a test, or a
+    DCF). With ``force``, frames are sent even if another master is heard on the bus.
     """
 
     def __init__(
@@ -88,13 +88,14 @@ class Drive:
         self._may_speak = force or self.link.private
         self._heard: frozenset[int] = frozenset()
         self.report: BootReport | None = None
-        """What the last boot-up found and did."""
+        """Result of the last boot-up."""
 
     def listen(self) -> None:
-        """Hear, once, whether somebody else masters the bus; `BusInUseError` then, and nothing is sent.
+        """Listens, once, for another master on the bus; raises `BusInUseError` if there is one. Sends
+        nothing.
 
-        It takes two heartbeats, and at least the 0.51 s in which the slowest other master sends two SYNCs.
-        `boot` does it; call it before reading objects of a drive that is not booted.
+        Takes two heartbeat periods, and at least the 0.51 s in which the slowest other master sends two
+        SYNCs. `boot` calls it; call it before reading objects of a drive that is not booted.
         """
         if self._may_speak:
             return
@@ -107,11 +108,12 @@ class Drive:
         self._may_speak = True
 
     def boot(self, *, reset: bool = True) -> BootReport:
-        """Boot the drive up to OPERATIONAL, power off: see docs/master.md for each step.
+        """Boots the drive up to OPERATIONAL with power off; docs/master.md describes each step.
 
-        ``reset`` resets the node's communication first, so that it starts from known settings. Raises
-        `DriveError` when it is absent or refuses, `IdentityError` when it is another drive or scales
-        differently, `BusInUseError` before anything is sent when another master is heard, `BusError`.
+        By default (``reset``) the node's communication is reset first, so that it starts from known settings.
+        Raises `DriveError` if the drive is absent or refuses, `IdentityError` if it is another drive or
+        scales differently, `BusInUseError` before anything is sent if another master is heard, and
+        `BusError`.
         """
         self.listen()
         self._touched = True
@@ -124,9 +126,9 @@ class Drive:
         return self.report
 
     def take_over(self) -> BootReport:
-        """Take over a drive that another process of this machine has booted, in whatever state it is.
+        """Takes over a drive that another process on this computer has booted, whatever its state.
 
-        Compares it with the axis file as `boot` does, and raises as that; writes nothing.
+        Compares it with the axis file and raises as `boot` does; writes nothing.
         """
         self.listen()
         self.report = BootUp(self.link, self.monitor, self.axis, self._clients).look()
@@ -134,17 +136,19 @@ class Drive:
 
     @property
     def identity(self) -> Identity:
-        """Which drive it is: what the booted one has answered, else what the axis file expects."""
+        """Identity of the drive: as read in the boot-up, else as the axis file expects it."""
         answered = self.report.identity if self.report else {}
         return Identity.model_validate({**self.axis.drive.identity.model_dump(exclude_none=True), **answered})
 
     def enable(self, mode: Mode | None = None) -> None:
-        """Make ready for power in ``mode``: target = actual position, mode set and seen in 6061h, then power.
+        """Prepares for power in ``mode``: sets target = actual position and the mode, checks 6061h, then
+        enables.
 
-        By default the mode is that of the control cycle (``drive.mode``). In PP and HM the states are walked
-        here, by SDO. In a cyclic mode they are not: the drive wants SYNC and set-points while it is enabled,
-        so ``image.power`` is aimed and the cycle walks. Raises `DriveError` for a fault (`fault_reset`
-        first), for a position outside the limits, `TransitionError`, `InputError` for another cyclic mode.
+        The default is the mode of the control cycle (``drive.mode``). In PP and HM the states are walked
+        here, by SDO. A cyclic mode needs SYNC and set-points while the drive is enabled, so only
+        ``image.power`` is aimed and the cycle walks the states. Raises `DriveError` for a fault (call
+        `fault_reset` first) or a position outside the limits, `TransitionError`, and `InputError` for the
+        other cyclic mode.
         """
         cyclic = self.image.cyclic.mode
         mode = cyclic if mode is None else mode
@@ -152,7 +156,8 @@ class Drive:
             raise InputError(f"{self.axis.where('drive.mode')} is {self.axis.drive.mode}, not {mode.name}")
         positions = self._make_ready(mode)
         has_target = self.sdo.has(objects.TARGET_POSITION.index, objects.TARGET_POSITION.sub)
-        # In interpolated position mode the target is 60C1h, and comes by PDO before anything may move.
+        # In interpolated position mode the target is 60C1h, which arrives by PDO before any motion is
+        # possible.
         preload = has_target and mode is not Mode.IP
         motor_counts = self._commander.preload_target() if preload else positions.motor_counts
         self.image.halt = False
@@ -164,14 +169,15 @@ class Drive:
             self._commander.walk(State.OPERATION_ENABLED)
 
     def prepare(self) -> Positions:
-        """Make ready for power in the cyclic mode while a control cycle runs already; where the axis stands.
+        """Prepares for power in the cyclic mode while a control cycle already runs; returns the positions.
 
-        As `enable`, but the cycle's RPDOs keep the target at the actual position, and it walks the states.
+        Like `enable`, but the cycle's RPDOs keep the target at the actual position, and the cycle walks the
+        states.
         """
         return self._make_ready(self.image.cyclic.mode)
 
     def _make_ready(self, mode: Mode) -> Positions:
-        """All that precedes power but the target: checks, the watch for the master, the mode."""
+        """Does everything that precedes power except the target: checks, heartbeat monitoring, mode."""
         modes_of_drive = self._booted().modes
         if mode not in modes_of_drive:
             raise DriveError(
@@ -188,7 +194,7 @@ class Drive:
             )
         positions = self.read_positions()
         if mode is not Mode.HM:
-            # Homing is the way back from there, so it is not refused.
+            # Homing is the way back into the limits, so it is allowed outside them.
             self._check_within_limits(positions)
         self._expect_master(True)
         self._commander.set_mode(mode)
@@ -196,7 +202,7 @@ class Drive:
         return positions
 
     def disable(self) -> None:
-        """Brake, then switch power off, by SDO. Allowed in every state but a running fault reaction."""
+        """Brakes, then switches power off, by SDO. Allowed in every state except an active fault reaction."""
         state = self._commander.state()
         if state is State.OPERATION_ENABLED:
             self._commander.walk(State.SWITCHED_ON)
@@ -209,9 +215,9 @@ class Drive:
         _log.info("disabled", {"node": self.axis.drive.node_id, "state": state.value})
 
     def fault_reset(self) -> str:
-        """Resets a fault by a rising edge on bit 7; returns its error code and last emergency in words.
+        """Resets a fault by a rising edge on bit 7; returns its error code and last emergency as text.
 
-        Raises `TransitionError` if the drive is not in fault, `DriveError` if the fault stays.
+        Raises `TransitionError` if the drive is not in fault, `DriveError` if the fault persists.
         """
         commander = self._commander
         row_for(commander.state(), Command.FAULT_RESET)
@@ -233,18 +239,18 @@ class Drive:
         return words
 
     def quick_stop(self) -> State:
-        """Stop at once. What follows is 605Ah's choice; the state in which the drive then is."""
+        """Stops at once as object 605Ah selects; returns the resulting state."""
         return self._commander.quick_stop()
 
     def halt(self) -> bool:
-        """Halt without leaving 'operation enabled' (605Dh says how); whether the axis came to rest."""
+        """Halts in 'operation enabled' as object 605Dh selects; returns True if the axis came to rest."""
         return modes.halt(self._commander)
 
     def wait(self, duration_s: float) -> None:
-        """Let time pass while the drive is enabled, outside the control cycle.
+        """Waits while the drive is enabled outside the control cycle.
 
-        A drive that hears no heartbeat of the master for ``drive.heartbeat_ms`` stops by itself; this keeps
-        it going, a plain sleep does not.
+        A drive that hears no heartbeat of the master for ``drive.heartbeat_ms`` stops on its own. This call
+        keeps sending it; a plain sleep does not.
         """
         self._commander.pause(duration_s)
 
@@ -255,11 +261,11 @@ class Drive:
         acceleration_deg_s2: float | None = None,
         timeout_s: float | None = None,
     ) -> Positions:
-        """Move to a load angle in PP, enabling the drive for it where it is not; where the axis then is.
+        """Moves to a load angle in PP, enabling the drive if necessary; returns the positions on arrival.
 
-        Speed and acceleration are at the load; the limits of the axis are their defaults. Raises `InputError`
-        before anything is sent when a value is not finite or outside the limits, `DriveError` when the drive
-        fails on the way, `TransitionError` when it takes too long (computed from the travel unless given).
+        Speed and acceleration are at the load and default to the limits of the axis. Raises `InputError`
+        before anything is sent if a value is not finite or outside the limits, `DriveError` if the drive
+        fails on the way, and `TransitionError` on time-out (computed from the travel unless given).
         """
         move = modes.ProfileMove.checked(self.image, load_deg, velocity_deg_s, acceleration_deg_s2, timeout_s)
         self._need(Mode.PP)
@@ -275,7 +281,7 @@ class Drive:
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
     ) -> Positions:
-        """Home by a method of 6098h, enabling the drive for it where it is not; where the axis then is.
+        """Homes by a method of 6098h, enabling the drive if necessary; returns the positions afterwards.
 
         Speeds, acceleration and offset (607Ch) are at the load. Raises as `move_to` does.
         """
@@ -293,11 +299,11 @@ class Drive:
         return self.read_positions()
 
     def state(self) -> State:
-        """The power state, read by SDO."""
+        """Reads the power state by SDO."""
         return self._commander.state()
 
     def read_positions(self) -> Positions:
-        """Both encoders by SDO, as they read now."""
+        """Reads both encoders by SDO."""
         source = self.axis.load_encoder.source
         client = self._clients[source.node if source.node is not None else self.axis.drive.node_id]
         motor = self.sdo.fetch(objects.POSITION_ACTUAL)
@@ -305,15 +311,17 @@ class Drive:
         return Positions(motor, load, self.image.motor_deg(motor), self.image.load_deg(load))
 
     def can_set(self, address: Address) -> bool:
-        """The drive has an object that can be written, by its EDS and by what it took in the boot-up."""
+        """Returns True if an object can be written, by the EDS and by what the drive accepted
+        in the boot-up.
+        """
         variable = find(self.sdo.od, address.index, address.sub)
         left = self.report.left if self.report is not None else ()
         return variable is not None and is_writable(variable) and (address.index, address.sub) not in left
 
     def close(self) -> list[str]:
-        """Stop and disable the drive, take it out of OPERATIONAL; what did not work, in words.
+        """Stops and disables the drive and takes it out of OPERATIONAL; returns the problems as text.
 
-        Tries everything, raises nothing of its own: it runs when the bus is broken, too.
+        Tries every step and raises nothing of its own, because it also runs when the bus is broken.
         """
         if not self._touched:
             return []
@@ -331,13 +339,13 @@ class Drive:
         return problems
 
     def __enter__(self) -> Self:
-        """The drive itself; nothing is sent yet."""
+        """Returns the drive; sends nothing yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """`close`; a failure to disable the drive is raised, or added to the error that is on its way."""
+        """Closes the drive; a failure to disable it is raised, or added as a note to the error in flight."""
         problems = self.close()
         if not problems:
             return
@@ -350,9 +358,9 @@ class Drive:
         error.add_note(warning)
 
     def _expect_master(self, expected: bool) -> None:
-        """Have the drive watch the master's heartbeat while power may be on, and only then.
+        """Makes the drive monitor the master's heartbeat while power may be on, and only then.
 
-        Without power nothing can move, and the master may be busy with files. A drive begins to watch with
+        Without power nothing can move, and the master may be busy with files. A drive starts to monitor at
         the first heartbeat that it hears after this object was written.
         """
         if self.can_set(objects.HEARTBEAT_CONSUMER):
@@ -374,12 +382,14 @@ class Drive:
                 "'switch on disabled'", lambda word: decode(word) in _OFF, STEP_TIMEOUT_S, allow_fault=True
             )
         if self.can_set(objects.HEARTBEAT_CONSUMER):
-            # The master leaves on purpose; its silence from now on is no fault.
-            with suppress(SdoAbortError):  # a drive that refuses this has never watched
+            # The master leaves on purpose; its silence from now on is not a fault.
+            with suppress(SdoAbortError):  # a drive that refuses this never monitored it
                 quick.store(objects.HEARTBEAT_CONSUMER, 0)
 
     def _power_off_blindly(self) -> None:
-        """The same without an answer: as frames that a drive which only listens can still obey."""
+        """Powers off without waiting for answers, with frames that a drive which can only receive still
+        obeys.
+        """
         request = objects.COB_SDO_REQUEST + self.axis.drive.node_id
         with suppress(HdbridgeError):
             for word in (Command.QUICK_STOP.word, Command.DISABLE_VOLTAGE.word):

@@ -1,7 +1,7 @@
-"""What the error codes of EMCY messages and of object 603Fh are called (CiA 301 table 26, CiA 402-2 annex).
+"""Names of the error codes in EMCY messages and object 603Fh (CiA 301 table 26, CiA 402-2 annex).
 
-Data, and one function that reads it: the code itself where the profiles name it, else the class to which its
-first digits belong.
+A table and one look-up: the name of the code if the profiles define it, else the class given by its leading
+digits.
 """
 
 from __future__ import annotations
@@ -105,6 +105,8 @@ _FAMILIES: Final[dict[int, str]] = {
 
 
 def error_name(code: int) -> str:
-    """``following error`` of 8611h; the class of a code that the profiles do not name."""
+    """Returns the name of an error code, for example ``following error`` for 8611h, or the name
+    of its class.
+    """
     name = _CODES.get(code) or _CLASSES.get(code >> 8) or _FAMILIES.get(code >> 12)
     return name or "a code that no profile names"

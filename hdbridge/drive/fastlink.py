@@ -1,9 +1,9 @@
-"""The link of the control cycle: the same frames and the same errors as `Link`, for less CPU time.
+"""Fast link for the control cycle: the same frames and errors as `Link`, for less CPU time.
 
-Half of what a cycle would cost is python-can's way of copying and building messages. Two shortcuts avoid it
-and change nothing else: on SocketCAN the frames go straight through the bus's own socket; elsewhere the
-messages sent are copied by their constructor rather than by a general deep copy (which python-can's virtual
-bus makes for each receiver).
+Half the cost of a cycle would be python-can's copying and building of messages. Two shortcuts avoid it and
+change nothing else. On SocketCAN, frames go straight through the bus's own socket. On other interfaces, sent
+messages are copied by their constructor instead of the general deep copy that python-can's virtual bus makes
+for each receiver.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ _REMOTE: Final = 0x4000_0000
 _ERROR: Final = 0x2000_0000
 _IDENTIFIER: Final = 0x1FFF_FFFF
 _LARGEST: Final = 72
-"""Bytes of the largest frame that the socket may give (CAN FD)."""
+"""Bytes of the largest frame that the socket can deliver (CAN FD)."""
 _DONTWAIT: Final = socket.MSG_DONTWAIT
 
 
 def fast_link(link: Link) -> Link:
-    """A link on the same bus and clock for use in the cycle; it shares the count of dropped frames."""
+    """Returns a link on the same bus and clock for use in the cycle; it shares the count of
+    dropped frames.
+    """
     if type(link) is not Link:
         return link
     fast = _SocketLink(link) if type(link.bus) is SocketcanBus else _MessageLink(link.bus, link.clock)
@@ -42,7 +44,7 @@ def fast_link(link: Link) -> Link:
 
 
 class _MessageLink(Link):
-    """Sends messages that are cheap to copy."""
+    """Link that sends messages that are cheap to copy."""
 
     __slots__ = ()
 
@@ -56,7 +58,7 @@ class _MessageLink(Link):
 
 
 class _SocketLink(Link):
-    """Frames through the socket of a python-can SocketCAN bus."""
+    """Link that uses the socket of a python-can SocketCAN bus directly."""
 
     __slots__ = ("_give", "_sockets", "_take")
 
@@ -85,7 +87,7 @@ class _SocketLink(Link):
             raise BusError(self._down)
         while True:
             try:
-                # Mostly there is one already, and then this is the only call into the kernel.
+                # A frame is usually waiting, and then this is the only system call.
                 raw = self._take(_LARGEST, _DONTWAIT)
             except BlockingIOError:
                 timeout_s = deadline_s - self.now()
@@ -108,12 +110,12 @@ class _SocketLink(Link):
         try:
             select.select(self._sockets, (), (), timeout_s)
         except (OSError, ValueError) as error:
-            # ValueError: the socket has been closed under us.
+            # ValueError: the socket was closed during the wait.
             raise self._failure("receive", OSError(*error.args)) from error
 
 
 def _refused(can_id: int) -> Any:
-    """A frame that CANopen does not use, as a message, for the base class to count."""
+    """Returns a frame that CANopen does not use as a message, so that the base class can count it."""
     return can.Message(
         arbitration_id=can_id & _IDENTIFIER,
         is_extended_id=bool(can_id & _EXTENDED),

@@ -1,4 +1,4 @@
-"""What one control cycle measured. Data only."""
+"""Measurements of one control cycle. Data only."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 
 class Feedback(NamedTuple):
-    """What a cycle measured. Positions are encoder counts, unwrapped, multi-turn."""
+    """Measurements of one cycle. Positions are encoder counts, unwrapped, multi-turn."""
 
     cycle: int
-    """Number of the period since `Cycle.restart`; skipped periods are counted."""
+    """Number of periods since `Cycle.restart`, skipped ones included."""
     time_s: float
     """``cycle`` times the period."""
     statusword: int
@@ -19,6 +19,6 @@ class Feedback(NamedTuple):
     torque_permille: float
     """NaN if the drive does not send it (6077h)."""
     fresh: bool
-    """False when a TPDO was missing or not believed: the values are the last good ones."""
+    """False if a TPDO was missing or implausible; the values are then the last good ones."""
     readings: tuple[float | None, ...]
-    """Of each channel of the axis file the last reading that was believed; None where none is known."""
+    """Last good reading of each channel of the axis file; None if there is none."""

@@ -1,7 +1,7 @@
-"""The process image: what goes over the bus in every cycle, and what its numbers mean for the axis. Pure.
+"""Process image: the data exchanged over the bus in every cycle, and its scaling to axis units. Pure.
 
-Which PDO carries what, `hdbridge.drive.layout` says; the boot-up maps the drive accordingly and the cycle
-packs and unpacks with it.
+`hdbridge.drive.layout` defines the contents of each PDO. The boot-up maps the drive accordingly, and the
+cycle packs and unpacks with it.
 """
 
 from __future__ import annotations
@@ -28,17 +28,19 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 Frames = tuple[tuple[int, bytes], ...]
-"""Identifier and data of the frames to send."""
-# For the control cycle: to look a member up in its class takes five times as long as a name of the module.
+"""Frames to send: identifier and data of each."""
+# The control cycle uses module names because looking up an enum member in its class takes five times as long.
 _ENABLED: Final = State.OPERATION_ENABLED
 _ENABLE_OPERATION: Final = Command.ENABLE_OPERATION.word
 HALT_BIT: Final = 0x0100
 HEARTBEATS_PER_TIMEOUT: Final = 2
-"""The master sends this many heartbeats in the time in which the drive expects one, and grants as many."""
+"""Heartbeats that the master sends within the drive's time-out, and periods of the drive's heartbeat that it
+waits.
+"""
 
 
 def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> int:
-    """Period of the drive's heartbeat; 0 if its EDS has none (1017h)."""
+    """Returns the period of the drive's heartbeat, ms; 0 if its EDS has none (1017h)."""
     od = dictionary_of(axis) if od is None else od
     address = objects.HEARTBEAT_PRODUCER
     there = od is None or find(od, address.index, address.sub) is not None
@@ -46,11 +48,11 @@ def drive_heartbeat_ms(axis: AxisConfig, od: ObjectDictionary | None = None) -> 
 
 
 def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
-    """Least and greatest target of the drive, motor counts, in this order whatever the direction.
+    """Returns the least and the greatest target of the drive in motor counts, ordered for either direction.
 
-    The limits of the axis file hold for the place that is aimed at. The compensation may add its own
-    maximum on top of that, so the drive's limits are wider by it. An `AxisConfig` makes sure that both fit
-    the 32 bits of a target.
+    The limits of the axis file apply to the commanded position. The compensation may add up to its own
+    maximum, so the drive's limits are wider by that. `AxisConfig` ensures that both fit the 32 bits of a
+    target.
     """
     margin_deg = axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
     ends = [
@@ -61,11 +63,11 @@ def position_limits_counts(axis: AxisConfig) -> tuple[int, int]:
 
 
 class ProcessImage:
-    """The newest values from the drive, the next ones to it, and the scaling between counts and degrees.
+    """Newest values from the drive, next values to it, and the scaling between counts and degrees.
 
-    `accept` takes the frames of a cycle, `pack_rpdo` gives the frames to send; the power states are walked by
-    ``power`` (aim with ``power.go``). Positions are unwrapped multi-turn Python integers. ``od`` is by
-    default the dictionary of the axis's own EDS, ``pdos`` the mapping that the boot-up writes.
+    `accept` takes the frames of a cycle and `pack_rpdo` returns the frames to send. ``power`` walks the power
+    states (aim with ``power.go``). Positions are unwrapped multi-turn Python integers. ``od`` is by default
+    the dictionary of the axis's EDS, ``pdos`` the mapping that the boot-up writes.
     """
 
     def __init__(
@@ -81,50 +83,52 @@ class ProcessImage:
         self.heartbeat_id: int = objects.COB_HEARTBEAT + axis.drive.master_node_id
         """Identifier of the master's own heartbeat; its data is one byte 05h."""
         self.heartbeat_period_s: float = axis.drive.heartbeat_ms / 1000.0 / HEARTBEATS_PER_TIMEOUT
-        """How often the master has to send its heartbeat."""
+        """Period of the master's heartbeat; s."""
         beat_ms = drive_heartbeat_ms(axis, od)
         self.heartbeat_timeout_s: float = beat_ms / 1000.0 * HEARTBEATS_PER_TIMEOUT if beat_ms else math.inf
-        """How old the drive's heartbeat may become; infinite if it sends none."""
+        """Maximum age of the drive's heartbeat, s; infinite if it sends none."""
         self.limits_counts = position_limits_counts(axis)
         self.power = PowerWalk()
         self.halt = False
-        """Sets the halt bit of the controlword."""
+        """True sets the halt bit of the controlword."""
 
         self._motor, self._load = axis.motor_encoder.scale, axis.load_encoder.scale
         self.channels = tuple(
             ChannelFollower(key, channel, axis.drive.cycle_ms) for key, channel in axis.channels.items()
         )
-        """What the axis has in addition to its encoders; empty for most."""
+        """Optional channels of the axis, in addition to its encoders; usually empty."""
         self._followers = {
             (channel.source.index, channel.source.subindex): follower
             for channel, follower in zip(axis.channels.values(), self.channels, strict=True)
         }
         self.readings: tuple[float | None, ...] = (None,) * len(self.channels)
-        """Of each of ``channels`` the last reading that was believed; None where none is known (any more)."""
+        """Last good reading of each of ``channels``; None if there is none, or none any more."""
         position = self._entry_of(objects.POSITION_ACTUAL)
         demand = self._entry_of(objects.POSITION_DEMAND)
         self._unwrap_motor = Unwrap(1 << position.type.bits if position else INT32_RANGE)
         self._unwrap_demand = Unwrap(1 << demand.type.bits if demand else INT32_RANGE)
         self._unwrap_load = Unwrap(axis.load_encoder.source.wraps_at_counts)
         self.has_demand = objects.POSITION_DEMAND not in absent
-        """The drive sends its position demand."""
+        """True if the drive sends its position demand."""
         self._handlers = self._handlers_of((*self.tpdos, *self.channel_tpdos))
         self.tpdo_ids: tuple[int, ...] = tuple(layout.can_id for layout in self.tpdos)
-        """Identifiers of the frames that each cycle needs."""
+        """Identifiers of the frames that each cycle waits for."""
         self._packers = tuple(self._packer(layout, od) for layout in self.rpdos)
         self.statusword: int | None = None
-        """Newest statusword; None before the first."""
+        """Newest statusword; None before the first one."""
         self.motor_counts = 0
         self.load_counts = 0
         self.demand_counts = 0
-        """Position demand; the target before the last one, which the drive has reached, if it sends none."""
+        """Position demand. If the drive does not send it: the target before the last, which it
+        has reached.
+        """
         self.torque_permille: float = math.nan if objects.TORQUE_ACTUAL in absent else 0
-        """NaN if the drive does not send it."""
+        """Torque in per mille of the rated torque; NaN if the drive does not send it."""
         self.target_counts = 0
         """Last target that was packed."""
         self._under_way = 0
 
-    # -- received -----------------------------------------------------------------------------------------
+    # -- received frames ----------------------------------------------------------------------------------
 
     def _entry_of(self, address: Address) -> PdoEntry | None:
         entries = (entry for layout in self.tpdos for entry in layout.codec.entries)
@@ -133,7 +137,7 @@ class ProcessImage:
         )
 
     def _handlers_of(self, tpdos: Iterable[Layout]) -> dict[int, Callable[[bytes], None]]:
-        """What takes the data of each TPDO. An object that several carry is taken from the first."""
+        """Returns the handler of each TPDO's data. An object in several TPDOs is taken from the first."""
         source = self.axis.load_encoder.source
         takers: dict[tuple[int, int, int], Callable[[int], None]] = {
             (self.node_id, address.index, address.sub): take
@@ -157,9 +161,10 @@ class ProcessImage:
         return handlers
 
     def accept(self, can_id: int, data: bytes) -> bool:
-        """Take a TPDO; whether it was one of the image's. `PdoLengthError` when its length is wrong.
+        """Takes a frame; returns True if it is one of the image's TPDOs.
 
-        Of several frames of one identifier the newest wins. A frame that is rejected leaves all as it was.
+        Raises `PdoLengthError` if its length is wrong. Of several frames with one identifier the newest wins.
+        A rejected frame changes nothing.
         """
         handler = self._handlers.get(can_id)
         if handler is None:
@@ -168,16 +173,18 @@ class ProcessImage:
         return True
 
     def handler(self, can_id: int) -> Callable[[bytes], None]:
-        """What takes the data of one of the image's TPDOs: `accept` for one that looks it up only once."""
+        """Returns the handler of one of the image's TPDOs, for callers that look it up once instead of using
+        `accept`.
+        """
         return self._handlers[can_id]
 
     def length_of(self, can_id: int) -> int:
-        """Bytes that a TPDO of the image has to have."""
+        """Returns the required length of one of the image's TPDOs; bytes."""
         layouts = (*self.tpdos, *self.channel_tpdos)
         return next(each.codec.length for each in layouts if each.can_id == can_id)
 
     def statusword_in(self, can_id: int, data: bytes) -> int | None:
-        """Statusword that a TPDO carries, or None. Takes nothing over into the image."""
+        """Returns the statusword that a TPDO carries, or None. Does not change the image."""
         for layout in self.tpdos:
             place = layout.codec.positions.get((objects.STATUSWORD.index, objects.STATUSWORD.sub))
             if layout.can_id == can_id and place is not None and len(data) == layout.codec.length:
@@ -203,7 +210,7 @@ class ProcessImage:
         self.demand_counts = self._unwrap_demand.update(counts)
 
     def awaited_channels(self) -> list[int]:
-        """Identifiers of the optional channels' TPDOs that come with every SYNC, as long as they do."""
+        """Returns the identifiers of the channel TPDOs that come with every SYNC and are not lost."""
         return [
             layout.can_id
             for layout in self.channel_tpdos
@@ -215,7 +222,7 @@ class ProcessImage:
         return [self._followers[key] for key in keys if key in self._followers]
 
     def step_channels(self) -> list[tuple[Fault, str]]:
-        """One cycle is over for the channels: their values as of now, and what is wrong with them."""
+        """Ends a cycle for the channels: updates ``readings`` and returns the channels' faults."""
         faults = []
         for follower in self.channels:
             fault = follower.step()
@@ -225,18 +232,19 @@ class ProcessImage:
         return faults
 
     def forget_channels(self) -> None:
-        """Nothing is known of the channels: the cycle begins, or has rested."""
+        """Discards all readings, at the start of the cycle and after a pause."""
         for follower in self.channels:
             follower.reset()
         self.readings = (None,) * len(self.channels)
 
-    # -- sent ---------------------------------------------------------------------------------------------
+    # -- sent frames --------------------------------------------------------------------------------------
 
     def _packer(self, layout: Layout, od: ObjectDictionary | None) -> Callable[[int, int], tuple[int, bytes]]:
-        """What makes the frame of an RPDO from controlword and target; either may be in another one.
+        """Returns a function that builds an RPDO frame from controlword and target, either of which may be in
+        another RPDO.
 
-        A mapping that cannot be written may have other objects: the mode of operation is that of the cycle,
-        any other holds what the EDS says, else 0.
+        A read-only mapping may contain other objects. The mode of operation is then that of the cycle; any
+        other object gets its value from the EDS, else 0.
         """
         entries, can_id, pack = layout.codec.entries, layout.can_id, layout.codec.pack
         values = [0 if entry.is_gap or od is None else _held(od, entry) for entry in entries]
@@ -261,7 +269,7 @@ class ProcessImage:
         return frame
 
     def check_target(self, counts: int) -> None:
-        """`InputError` unless ``counts`` is an integer within the position limits."""
+        """Raises `InputError` unless ``counts`` is an integer within the position limits."""
         least, greatest = self.limits_counts
         if not isinstance(counts, int) or not least <= counts <= greatest:
             raise InputError(
@@ -271,26 +279,26 @@ class ProcessImage:
             )
 
     def pack_rpdo(self, target_counts: int) -> Frames:
-        """The RPDOs with the controlword of ``power`` and the target, checked against the limits.
+        """Returns the RPDOs with the controlword of ``power`` and the target.
 
-        `InputError`, and nothing to send, when the target is outside them. Before power is enabled use
-        `pack_rpdo_idle`: the axis may stand anywhere then.
+        Raises `InputError` if the target is outside the limits. Before power is enabled use `pack_rpdo_idle`,
+        because the axis may then stand anywhere.
         """
         self.check_target(target_counts)
         return self._pack(target_counts)
 
     def pack_rpdo_idle(self) -> Frames:
-        """The RPDOs with the actual position as target: for every cycle before power is enabled."""
+        """Returns the RPDOs with the actual position as target, for every cycle before power is enabled."""
         return self._pack(wrap_int32(self.motor_counts))
 
     def pack_rpdo_held(self) -> Frames:
-        """The RPDOs with the last target once more."""
+        """Returns the RPDOs with the last target repeated."""
         return self._pack(self.target_counts)
 
     def pack_rpdo_stop(self) -> Frames:
-        """The RPDOs with *quick stop* and the actual position, whatever ``power`` aims at.
+        """Returns the RPDOs with *quick stop* and the actual position, regardless of the aim of ``power``.
 
-        They enable no drive in any state, and replace RPDOs that a drive has buffered.
+        They enable no drive in any state, and they replace RPDOs that a drive has buffered.
         """
         word, target_counts = Command.QUICK_STOP.word, wrap_int32(self.motor_counts)
         return tuple([frame(word, target_counts) for frame in self._packers])
@@ -308,13 +316,13 @@ class ProcessImage:
         return frames
 
     def follow_target(self, target_counts: int) -> None:
-        """A target was sent in this cycle; the one before it is the demand now, if the drive sends none."""
+        """Records a sent target. If the drive sends no demand, the previous target becomes the demand."""
         if not self.has_demand:
             self.demand_counts = self._under_way
             self._under_way = self.motor_counts + wrap_int32(target_counts - self.motor_counts)
 
     def seed(self, motor_counts: int, load_counts: int, statusword: int) -> None:
-        """Start the multi-turn counts from readings over SDO, so that the cycle goes on from there."""
+        """Starts the multi-turn counts from SDO readings, so that the cycle continues from there."""
         self._unwrap_motor.reset(motor_counts)
         self._unwrap_load.reset(load_counts)
         self._unwrap_demand.reset(motor_counts)
@@ -324,15 +332,18 @@ class ProcessImage:
         self.power.observe(statusword)
 
     def motor_deg(self, counts: float) -> float:
-        """Motor angle of motor counts, degrees of the motor, with the encoder's direction."""
+        """Converts motor counts to the motor angle in degrees, with the encoder's direction."""
         return self._motor.degrees(counts)
 
     def load_deg(self, counts: float) -> float:
-        """Load angle of load counts, degrees of the load, with the encoder's direction."""
+        """Converts load counts to the load angle in degrees, with the encoder's direction."""
         return self._load.degrees(counts)
 
     def target_counts_for(self, motor_deg: float) -> int:
-        """Nearest motor counts of a motor angle; `InputError` when it is not finite or outside the limits."""
+        """Returns the nearest motor counts to a motor angle in degrees.
+
+        Raises `InputError` if the angle is not finite or is outside the limits.
+        """
         if not math.isfinite(motor_deg):
             raise InputError(f"target of {motor_deg!r} deg is not a finite angle; the target was not sent")
         counts = round(self._motor.counts(motor_deg))

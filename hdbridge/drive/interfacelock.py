@@ -1,4 +1,4 @@
-"""One master per CAN interface on this machine: a lock that goes with the process that holds it."""
+"""One master per CAN interface and computer: a lock that ends with the process that holds it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from hdbridge.files.expectation import one_line
 try:
     import fcntl
     import pwd
-except ImportError:  # a system without flock has no lock, and no holder to name
+except ImportError:  # a system without flock has no lock and no holder to report
     fcntl = None  # type: ignore[assignment]
 
 _SHARED_BY_ALL_USERS: Final = Path("/run/lock")
 _IN_ONE_PROCESS: Final = frozenset({"virtual"})
-"""Interfaces of python-can that end in their process."""
+"""python-can interfaces that do not reach beyond their process."""
 
 
 @contextmanager
 def interface_lock(interface: str, channel: object, folder: Path | None = None) -> Iterator[None]:
-    """Hold the lock of an interface; `BusInUseError` where somebody on this machine has it.
+    """Holds the lock of an interface; raises `BusInUseError` if another process on this computer holds it.
 
-    The lock file stays: to remove it would give the next two processes a lock each. ``folder`` is where it
-    lies, by default one that all users of the machine share.
+    The lock file is never removed, because the next two processes could then each get a lock. ``folder`` is
+    its location, by default one that all users of the computer share.
     """
     if fcntl is None or interface in _IN_ONE_PROCESS:
         yield
@@ -54,7 +54,7 @@ def interface_lock(interface: str, channel: object, folder: Path | None = None) 
 
 
 def holders(folder: Path | None = None) -> dict[int, str]:
-    """The processes of hdbridge that master an interface of this machine: by number, what each holds."""
+    """Returns the hdbridge processes that hold an interface of this computer: process id and description."""
     found: dict[int, str] = {}
     for path in sorted((folder or _folder()).iterdir()):
         match = re.fullmatch(r"hdbridge-(.+)\.lock", path.name)
@@ -66,7 +66,7 @@ def holders(folder: Path | None = None) -> dict[int, str]:
 
 
 def process_words(number: int) -> str:
-    """Number, user and command line of a process."""
+    """Returns process id, user and command line of a process, as text."""
     user = ""
     with suppress(OSError):
         user = f" of {user_name(Path(f'/proc/{number}').stat().st_uid)}"
@@ -74,7 +74,7 @@ def process_words(number: int) -> str:
 
 
 def command_line(number: int) -> str:
-    """The command line of a process; empty if there is no such process."""
+    """Returns the command line of a process; empty if there is no such process."""
     words: list[bytes] = []
     with suppress(OSError):
         words = Path(f"/proc/{number}/cmdline").read_bytes().split(b"\0")
@@ -82,7 +82,7 @@ def command_line(number: int) -> str:
 
 
 def user_name(uid: int) -> str:
-    """The name of a user of this machine; ``user`` and the number if it has none."""
+    """Returns the name of a user of this computer; ``user`` and the number if there is none."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -90,7 +90,9 @@ def user_name(uid: int) -> str:
 
 
 def _holder(path: Path) -> int:
-    """Number of the process that has locked a file; 0 if none has, or this system does not show it."""
+    """Returns the id of the process that has locked a file; 0 if there is none or the system does not show
+    it.
+    """
     inode = path.stat().st_ino
     with suppress(OSError, ValueError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
@@ -105,12 +107,12 @@ def _folder() -> Path:
 
 
 def _open(path: Path) -> int:
-    """Open for reading, which is enough to lock it: the file may be another user's."""
+    """Opens for reading, which suffices for locking: the file may belong to another user."""
     flags = os.O_RDONLY | os.O_NOFOLLOW
     try:
         try:
             handle = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644)
-            os.fchmod(handle, 0o644)  # whatever the umask: the next one may be another user
+            os.fchmod(handle, 0o644)  # regardless of the umask, because the next user may be another
         except FileExistsError:
             return os.open(path, flags)
         return handle

@@ -1,16 +1,16 @@
-"""Which PDO carries what: laid out from what an axis needs and what its drive offers. Pure.
+"""Contents of each PDO, chosen from what the axis needs and what its drive offers. Pure.
 
 A drive with free mappings gets
 
-    TPDO1 180h+id  statusword, position, torque        8 bytes
-    TPDO2 280h+id  load encoder, position demand       8 bytes (4 when the load encoder is a node of its own)
-    TPDO3 380h+id  load torque, temperature            as long as its objects; where the axis has them
-    TPDO4 480h+id  temperature                         where it comes less often than the load torque
-    RPDO1 200h+id  controlword, target                 6 bytes
+  TPDO1 180h+id  statusword, position, torque        8 bytes
+  TPDO2 280h+id  load encoder, position demand       8 bytes (4 if the load encoder has its own node id)
+  TPDO3 380h+id  load torque, temperature            if the axis has them; length of its objects
+  TPDO4 480h+id  temperature                         if it comes less often than the load torque
+  RPDO1 200h+id  controlword, target                 6 bytes
 
-A mapping that cannot be written is used as it is, if it carries something that is needed; the rest goes
-into the other PDOs. Position demand and torque are left out if the drive cannot send them. A load encoder
-that is a node of its own sends its TPDO1.
+A read-only mapping is used as it is if it carries a needed object; the remaining objects go into the other
+PDOs. Position demand and torque are left out if the drive cannot send them. A load encoder with its own node
+id sends its TPDO1.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ if TYPE_CHECKING:
 
 PDOS_PER_KIND: Final = 512
 _PREDEFINED: Final = 4
-"""PDOs of each kind that have an identifier of their own (CiA 301)."""
+"""Number of PDOs of each kind with a predefined identifier (CiA 301)."""
 _STEP: Final = 0x100
 _MOST_ENTRIES: Final = 64
 _STANDARD_ENTRIES: Final = 8
 _LAST_SYNCHRONOUS: Final = 240
 _EXTENDED: Final = 0x2000_0000
 OPTIONAL: Final = (objects.TORQUE_ACTUAL, objects.POSITION_DEMAND)
-"""What the control cycle takes from the drive if it can, the more important first."""
+"""Objects that the control cycle uses if the drive can send them, the more important first."""
 
 
 class Layout(NamedTuple):
-    """One PDO of an axis: whose it is, its number (1..), its identifier and what is mapped."""
+    """One PDO of an axis: its node, its number (1..), its identifier and its mapping."""
 
     node_id: int
     number: int
     can_id: int
     codec: PdoCodec
     every: int = 1
-    """It goes with every so many SYNCs."""
+    """Number of SYNCs per transmission."""
     is_fixed: bool = False
-    """The drive's mapping cannot be written."""
+    """True if the drive's mapping is read-only."""
 
     def __str__(self) -> str:
-        """``181h: 6041h:00 uint16, 6064h:00 int32``."""
+        """For example ``181h: 6041h:00 uint16, 6064h:00 int32``."""
         return f"{self.can_id:03X}h: {', '.join(map(str, self.codec.entries))}"
 
 
@@ -63,38 +63,38 @@ class Layouts(NamedTuple):
     """All PDOs of an axis."""
 
     cyclic: tuple[Layout, ...]
-    """The TPDOs that each cycle needs."""
+    """TPDOs that each cycle waits for."""
     channels: tuple[Layout, ...]
-    """The TPDOs that carry optional channels and nothing else."""
+    """TPDOs that carry only optional channels."""
     rpdos: tuple[Layout, ...]
-    """What the master sends."""
+    """PDOs that the master sends."""
     absent: tuple[Address, ...]
-    """The objects of `OPTIONAL` that no TPDO carries."""
+    """Objects of `OPTIONAL` that no TPDO carries."""
 
 
 class _Offer(NamedTuple):
-    """A PDO of the drive."""
+    """PDO of the drive, before objects are assigned to it."""
 
     number: int
     capacity: int
-    """Objects that it can map."""
+    """Number of objects that it can map."""
     fixed: tuple[PdoEntry, ...] | None
-    """The entries of a mapping that cannot be written; None if it can."""
+    """Entries of a read-only mapping; None if the mapping can be written."""
     can_id: int | None
-    """The identifier, if it cannot be written."""
+    """Identifier, if it is read-only."""
     every: int | None
-    """The transmission type, if it cannot be written."""
+    """Transmission type, if it is read-only."""
 
 
 def cyclic_mode(axis: AxisConfig) -> CyclicMode:
-    """The mode of operation of the control cycle."""
+    """Returns the mode of operation of the control cycle."""
     return objects.CYCLIC[axis.drive.mode]
 
 
 def layouts(axis: AxisConfig, od: ObjectDictionary | None = None) -> Layouts:
-    """The PDOs of an axis, by default by its own EDS.
+    """Returns the PDOs of an axis; ``od`` defaults to the dictionary of its EDS.
 
-    Raises `InputError` with the line of the axis file if the drive cannot send or receive what is needed.
+    Raises `InputError` with the line of the axis file if the drive cannot send or receive a needed object.
     """
     od = dictionary_of(axis) if od is None else od
     if od is not None:
@@ -132,7 +132,7 @@ def layouts(axis: AxisConfig, od: ObjectDictionary | None = None) -> Layouts:
 def _channel_layouts(
     axis: AxisConfig, offers: Sequence[_Offer], carried: set[tuple[int, int]], taken: set[int]
 ) -> list[Layout]:
-    """One TPDO, or more, for all channels that come equally often."""
+    """Groups the channels by rate and assigns one or more TPDOs to each group."""
     together: dict[int, dict[str, PdoEntry]] = {}
     for key, channel in axis.channels.items():
         source = channel.source
@@ -167,11 +167,11 @@ def _receiving(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[Layout, .
     return tuple(_laid_out(axis.drive.node_id, objects.COB_RPDO1, chosen, taken, 1))
 
 
-# -- what the drive offers --------------------------------------------------------------------------------
+# -- capabilities of the drive ----------------------------------------------------------------------------
 
 
 def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> Iterator[_Offer]:
-    """The PDOs of a kind, by their first communication and mapping parameters."""
+    """Yields the PDOs of a kind, given the indices of its first communication and mapping parameters."""
     if od is None:
         for number in range(1, _PREDEFINED + 1):
             yield _Offer(number, _STANDARD_ENTRIES, None, None, None)
@@ -198,7 +198,9 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
 
 
 def mapped(od: ObjectDictionary | None, words: Iterable[int | None]) -> tuple[PdoEntry, ...]:
-    """The entries of a mapping, by its words; none if one is not known, or not of whole bytes."""
+    """Decodes the words of a mapping into entries; empty if a word is unknown or not a whole
+    number of bytes.
+    """
     entries = []
     for word in words:
         if word is None:
@@ -216,7 +218,7 @@ def mapped(od: ObjectDictionary | None, words: Iterable[int | None]) -> tuple[Pd
 
 
 def _entry(od: ObjectDictionary | None, address: Address) -> PdoEntry:
-    """An object as it is mapped, with the type that the EDS gives it."""
+    """Returns the PDO entry of an object, with the type given by the EDS."""
     variable = find(od, address.index, address.sub) if od is not None else None
     kind = integer_type(variable) if variable is not None else None
     return PdoEntry(address.index, address.sub, kind or address.type)
@@ -236,23 +238,23 @@ def _is_carried(index: int, sub: int, offers: Iterable[_Offer]) -> bool:
 
 
 def _described(offers: Sequence[_Offer]) -> str:
-    """What there is, for a message."""
+    """Describes the available PDOs, for a message."""
     fixed = sum(each.fixed is not None for each in offers)
     if not offers:
         return "it has none"
     return f"it has {len(offers)}" + (f", {fixed} of them with a fixed mapping" if fixed else "")
 
 
-# -- what goes where --------------------------------------------------------------------------------------
+# -- assignment -------------------------------------------------------------------------------------------
 
 _Choice = list[tuple[_Offer, tuple[PdoEntry, ...]]]
 
 
 def _assign(needs: list[PdoEntry], offers: Sequence[_Offer], slowest: int | None) -> _Choice | None:
-    """The PDOs that carry ``needs``, and their entries; None if there is no room for all.
+    """Assigns objects to PDOs; returns the chosen PDOs with their entries, or None if not all fit.
 
-    Fixed mappings come first, because a free one can take what they do not carry. With ``slowest``, a PDO
-    has to come at least with every so many SYNCs.
+    Read-only mappings are used first, because a free one can take what they do not carry. With ``slowest``,
+    only PDOs sent at least every ``slowest`` SYNCs are used.
     """
     usable = [each for each in offers if each.every is None or slowest is None or each.every <= slowest]
     chosen: _Choice = []
@@ -290,7 +292,10 @@ def _fits(need: PdoEntry, offer: _Offer, entries: Sequence[PdoEntry]) -> bool:
 
 
 def _laid_out(node_id: int, first: int, chosen: _Choice, taken: set[int], every: int) -> Iterator[Layout]:
-    """Layouts with an identifier each; ``first`` is that of the kind's first PDO, ``taken`` grows."""
+    """Yields layouts, each with an identifier.
+
+    ``first`` is the function code of the kind's first PDO. Identifiers in use are added to ``taken``.
+    """
     predefined = [first + _STEP * place + node_id for place in range(_PREDEFINED)]
     reserved = {predefined[offer.number - 1] for offer, _ in chosen if offer.number <= _PREDEFINED}
     for offer, entries in chosen:
@@ -309,11 +314,11 @@ def _laid_out(node_id: int, first: int, chosen: _Choice, taken: set[int], every:
         yield Layout(node_id, offer.number, can_id, PdoCodec(entries), own, offer.fixed is not None)
 
 
-# -- what the EDS says of it ------------------------------------------------------------------------------
+# -- checks against the EDS -------------------------------------------------------------------------------
 
 
 def _check_needed(axis: AxisConfig, od: ObjectDictionary) -> None:
-    """`InputError` if the EDS lacks what is needed, or describes a source otherwise than the axis file."""
+    """Raises `InputError` if the EDS lacks a needed object or contradicts a source in the axis file."""
     target = cyclic_mode(axis).target
     needed = (*objects.REQUIRED, target)
     lacking = [str(each) for each in needed if find(od, each.index, each.sub) is None]
@@ -343,7 +348,9 @@ def _check_needed(axis: AxisConfig, od: ObjectDictionary) -> None:
 
 
 def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[_Offer]) -> Iterator[str]:
-    """One rule for the load encoder and the channels: the object exists, of its type, and can be mapped."""
+    """Yields an error for each load encoder or channel object that is missing, of another type or not
+    mappable.
+    """
     sources: dict[str, Source | ChannelSource] = {}
     if axis.load_encoder.source.node is None:
         sources["load_encoder"] = axis.load_encoder.source
@@ -370,7 +377,7 @@ def _source_complaints(axis: AxisConfig, od: ObjectDictionary, offers: Sequence[
 
 
 def _instead(od: ObjectDictionary, index: int) -> str:
-    """What the EDS lists of an index, for a message."""
+    """Lists the sub-indices that the EDS has at an index, for a message."""
     entry = od.get(index)
     if entry is None:
         return ""

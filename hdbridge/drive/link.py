@@ -1,8 +1,8 @@
-"""Raw CAN frames in and out: the only place where the master touches python-can.
+"""Raw CAN frames in and out: the only module of the master that uses python-can.
 
-It runs in the control cycle, so it adds as little as it can to the back end's own call. What it does add:
-every failure of the interface becomes a `BusError` that names it, frames that CANopen does not use are
-dropped and counted, and every deadline is on the monotonic clock that was passed in.
+It runs in the control cycle, so it adds little to the back end's own call. Every failure of the interface
+becomes a `BusError` that names it, frames that CANopen does not use are dropped and counted, and every
+deadline is on the monotonic clock that was passed in.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _GONE: Final = frozenset(
 )
 _DRAIN_AT_MOST: Final = 4096
 _ECHOING: Final = frozenset({"UdpMulticastBus"})
-"""Back ends of python-can that give a bus its own frames back and cannot be told not to."""
+"""python-can back ends that echo a bus's own frames and cannot be configured not to."""
 _PACKAGES: Final = {
     "udp_multicast": ("msgpack", "msgpack"),
     **dict.fromkeys(("slcan", "serial", "robotell", "seeedstudio"), ("serial", "pyserial")),
 }
-"""What python-can does not install by itself: module and package."""
+"""Interfaces with an optional dependency of python-can: its module and its package."""
 _NETWORK: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = 280
 """ARPHRD_CAN of linux/if_arp.h, the type of a CAN interface."""
@@ -47,7 +47,7 @@ _ERROR_FRAME_BUS_OFF: Final = 0x40
 
 
 class TransmitBufferFull(BusError):  # noqa: N818 - the name says what happened
-    """The kernel's transmit queue is full (ENOBUFS); the frame was dropped and must not be sent later."""
+    """The kernel's transmit queue is full (ENOBUFS). The frame was dropped and must not be sent later."""
 
 
 class Frame(NamedTuple):
@@ -56,16 +56,16 @@ class Frame(NamedTuple):
     can_id: int
     data: bytes
     time_s: float
-    """When it was taken from the interface, on the link's clock."""
+    """Time of reception on the link's clock; s."""
 
 
 new_tuple: Final = tuple.__new__
-"""Makes a named tuple of its values in half the time of its own constructor."""
+"""Builds a named tuple from its values in half the time of its own constructor."""
 
 
 @dataclass(slots=True)
 class Dropped:
-    """Frames that were received and thrown away, by kind."""
+    """Counts of received frames that were discarded, by kind."""
 
     remote: int = 0
     extended: int = 0
@@ -74,12 +74,12 @@ class Dropped:
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Number of discarded frames of all kinds."""
         return self.remote + self.extended + self.error + self.fd
 
 
 class BusSettings(Protocol):
-    """The ``bus`` part of an axis file."""
+    """The ``bus`` section of an axis file."""
 
     @property
     def interface(self) -> str: ...
@@ -92,11 +92,11 @@ class BusSettings(Protocol):
 
 
 class Link:
-    """A CAN bus as the master sees it.
+    """CAN bus as seen by the master.
 
-    Once the interface has gone (ENETDOWN, ENODEV, bus-off), every call raises the same `BusError`: a
-    SocketCAN socket reports the loss *once* and then stays silent for ever, which would look like a quiet
-    bus. A new link on a newly opened bus is the way back.
+    Once the interface is lost (ENETDOWN, ENODEV, bus-off), every call raises the same `BusError`. A SocketCAN
+    socket reports the loss only *once* and then stays silent, which would look like a quiet bus. To continue,
+    open the bus again and make a new link.
     """
 
     __slots__ = (
@@ -111,12 +111,13 @@ class Link:
         self.name = str(getattr(bus, "channel_info", "") or type(bus).__name__)
         self.dropped = Dropped()
         self.private: bool = getattr(bus, "private", False)
-        """Nobody but the drive and this link can be on the bus: it says so itself."""
+        """True if the bus declares that only the drive and this link can be on it."""
         self._down: str | None = None
         self._mark = _mark(bus)
         self._send = bus.send
-        # BusABC.recv measures its remaining time on the *wall* clock: when that is set back during a wait,
-        # recv blocks for as long. Its hook has no such loop, so it is used where a back end relies on it.
+        # BusABC.recv measures its remaining time on the *wall* clock: if that is set back during a wait, recv
+        # blocks for as long. The hook below has no such loop, so it is used for back ends that rely on
+        # BusABC.recv.
         own_recv = getattr(type(bus), "recv", None) is not can.BusABC.recv
         self._raw_recv = None if own_recv else bus._recv_internal
         self._recv = bus.recv
@@ -124,13 +125,13 @@ class Link:
 
     @property
     def down(self) -> str | None:
-        """Why the interface is gone for good, or None."""
+        """Reason for which the interface is lost for good, or None."""
         return self._down
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a data frame with an 11-bit identifier; returns when the interface has taken it.
+        """Sends a data frame with an 11-bit identifier; returns when the interface has taken it.
 
-        Raises `TransmitBufferFull` when the frame was dropped for want of room, `BusError` when the
+        Raises `TransmitBufferFull` if the frame was dropped because the queue is full, `BusError` if the
         interface failed.
         """
         if self._down is not None:
@@ -143,9 +144,9 @@ class Link:
             raise self._failure("send", error) from error
 
     def recv(self, deadline_s: float) -> Frame | None:
-        """The next data frame, or None when none came until ``deadline_s`` (a past one polls once).
+        """Returns the next data frame, or None if none came by ``deadline_s`` (a past deadline polls once).
 
-        Raises `BusError` when the interface failed.
+        Raises `BusError` if the interface failed.
         """
         if self._down is not None:
             raise BusError(self._down)
@@ -178,7 +179,7 @@ class Link:
             return new_tuple(Frame, (message.arbitration_id, bytes(message.data), now()))
 
     def drain(self) -> list[Frame]:
-        """Everything that has arrived, without waiting; at most 4096 frames, so that it ends on any bus."""
+        """Returns all frames that have arrived, without waiting; at most 4096, so that it ends on any bus."""
         frames: list[Frame] = []
         now_s = self.now()
         while len(frames) < _DRAIN_AT_MOST and (frame := self.recv(now_s)) is not None:
@@ -189,7 +190,7 @@ class Link:
         if message.is_error_frame:
             self.dropped.error += 1
             if self.name.startswith("socketcan") and message.arbitration_id & _ERROR_FRAME_BUS_OFF:
-                # During bus-off sends "succeed" and nothing arrives: this frame is the only sign.
+                # During bus-off, sends "succeed" and nothing arrives: this frame is the only sign.
                 self._down = (
                     f"{self.name}: the CAN controller went bus-off; check wiring, bit rate and termination"
                 )
@@ -216,10 +217,11 @@ class Link:
 
 
 def _mark(bus: can.BusABC) -> str | None:
-    """What frames sent through ``bus`` carry as their channel where the back end echoes them; else None.
+    """Returns the channel name that marks this bus's own frames on a back end that echoes them, else None.
 
-    Such a back end transports the channel with the frame, so an echo is known for certain: a frame of another
-    master with the same identifier and data has another mark, or none. All links of a bus share one.
+    Such a back end transports the channel with the frame, so an echo is identified reliably: a frame of
+    another master with the same identifier and data has another mark, or none. All links of a bus share one
+    mark.
     """
     if type(bus).__name__ not in _ECHOING:
         return None
@@ -227,7 +229,7 @@ def _mark(bus: can.BusABC) -> str | None:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """The operating system's error number, wherever python-can left it."""
+    """Returns the operating system's error number from wherever python-can stored it, or None."""
     while error is not None:
         code = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if isinstance(code, int):
@@ -237,7 +239,9 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def check_interface(interface: str, where: str) -> None:
-    """InputError if python-can has no such interface; ``where`` is the key or the option that names it."""
+    """Raises `InputError` if python-can has no such interface; ``where`` is the key or option
+    that names it.
+    """
     if interface not in can.VALID_INTERFACES:
         known = sorted(can.VALID_INTERFACES)
         close = nearest(interface, known)
@@ -248,7 +252,9 @@ def check_interface(interface: str, where: str) -> None:
 
 
 def absent_interface(settings: BusSettings) -> str | None:
-    """Message if this computer has no network interface for a SocketCAN channel; None if it has."""
+    """Returns an error text if this computer lacks the network interface of a SocketCAN
+    channel, else None.
+    """
     channel = str(settings.channel)
     if settings.interface != "socketcan" or (_NETWORK / channel).exists():
         return None
@@ -260,18 +266,18 @@ def absent_interface(settings: BusSettings) -> str | None:
 
 
 def _lacking(interface: str) -> str | None:
-    """The package to install for an interface of python-can; None where it is there, or none is known of."""
+    """Returns the package to install for a python-can interface; None if it is installed or none is known."""
     module, package = _PACKAGES.get(interface, ("", ""))
     return package if module and find_spec(module) is None else None
 
 
 @contextmanager
 def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.BusABC]:
-    """Open the bus of an axis file; `BusError` in one line when that is not possible.
+    """Opens the bus of an axis file; raises a one-line `BusError` if that fails.
 
-    One process of a machine opens an interface, the next is refused with `BusInUseError`: two masters on one
-    bus stop each other's axes. ``shared`` is for a program that is no master, and for one that insists.
-    Configuration files of python-can in the home folder are ignored: the axis file says it all.
+    Only one process of a computer may open an interface; the next is refused with `BusInUseError`, because
+    two masters on one bus stop each other's axes. ``shared`` skips this check, for programs that are not a
+    master and for an explicit override. python-can's configuration files in the home folder are ignored.
     """
     lock = nullcontext() if shared else interface_lock(settings.interface, settings.channel)
     with lock, _opened(settings) as bus:
@@ -286,7 +292,7 @@ def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
     if settings.bitrate_bps is not None:
         options["bitrate"] = settings.bitrate_bps
     if settings.interface == "socketcan":
-        # CANopen uses 11-bit identifiers only: the kernel drops the others before they wake the process.
+        # CANopen uses only 11-bit identifiers: the kernel drops the others before they wake the process.
         options["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
     try:
         bus = can.Bus(interface=settings.interface, channel=settings.channel, ignore_config=True, **options)
@@ -298,13 +304,13 @@ def _opened(settings: BusSettings) -> Iterator[can.BusABC]:
             what = f"cannot open it: {reason}; "
             what += absent_interface(settings) or "check bus.channel and that the interface is up"
         raise BusError(f"{name}: {what}") from error
-    if bus.channel_info == "unknown":  # python-can's word for it; messages need a name
+    if bus.channel_info == "unknown":  # python-can's placeholder; messages need a name
         bus.channel_info = name
     _log.info("bus opened", {"bus": name})
     try:
         yield bus
     finally:
         _log.info("bus closed", {"bus": name})
-        # A device that has been unplugged may fail to close; there is nothing left to save then.
+        # A device that has been unplugged may fail to close. Nothing is lost then.
         with suppress(can.CanError, OSError):
             bus.shutdown()

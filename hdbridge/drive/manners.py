@@ -1,9 +1,9 @@
-"""Listening before speaking: does somebody else master this bus?
+"""Detection of another master on the bus, by listening before the first frame is sent.
 
-A reset, and on some drives a mere SDO request, stops an axis that another master is moving. So before its
-first frame a master hears what is on the bus, for as long as the slowest other master may be silent. What
-counts is what would stop the axis if it came while this master ran: SYNC, NMT commands, the heartbeat of a
-master, set-points.
+A reset, and on some drives even an SDO request, stops an axis that another master is moving. A master
+therefore listens first, for as long as the slowest other master may be silent. The frames that count are
+those that would stop the axis while this master runs: SYNC, NMT commands, the heartbeat of a master, and
+set-points.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from hdbridge.drive.link import Frame, Link
 from hdbridge.errors import BusInUseError
 
 LONGEST_CYCLE_S: Final = 0.255
-"""The slowest SYNC that a drive can be set to: 255 ms in 60C2h."""
+"""Longest SYNC period that a drive accepts: 255 ms in 60C2h; s."""
 PERIODS: Final = 2
-"""Of the slowest cycle, and of the heartbeat: one may just have been sent."""
+"""Periods to listen, of the slowest cycle and of the heartbeat, because a frame may just have been sent."""
 USUAL_MASTER: Final = 127
-"""Node id under which masters send their heartbeat (77Fh), unless their axis file says otherwise."""
+"""Default node id of a master's heartbeat (77Fh), unless its axis file sets another."""
 _RPDOS: Final = (objects.COB_RPDO1, 0x300, 0x400, 0x500)
 _FUNCTION: Final = 0x780
 _NODE: Final = 0x7F
 
 
 def listening_s(heartbeat_ms: float = 0.0) -> float:
-    """How long to listen where heartbeats come every ``heartbeat_ms``, s."""
+    """Returns the time to listen, s, for a heartbeat period in ms."""
     return PERIODS * max(heartbeat_ms / 1000.0, LONGEST_CYCLE_S)
 
 
 def heartbeat_of(frame: Frame) -> int | None:
-    """The node whose heartbeat or boot-up message this is, or None."""
+    """Returns the node whose heartbeat or boot-up message this is, or None."""
     node_id = frame.can_id - objects.COB_HEARTBEAT
     return node_id if 0 < node_id <= _NODE else None
 
@@ -42,7 +42,7 @@ class Ear:
     """Counts the frames that only another master sends.
 
     ``drives`` are the nodes whose set-points count, ``masters`` the node ids whose heartbeat is a master's,
-    ``asked`` the nodes whose SDO channel nobody else may use.
+    ``asked`` the nodes whose SDO channel no one else may use.
     """
 
     def __init__(
@@ -51,10 +51,10 @@ class Ear:
         self._drives, self._masters, self._asked = drives, masters, asked
         self._heard: Counter[int] = Counter()
         self.nodes: set[int] = set()
-        """Whose heartbeat was heard."""
+        """Nodes whose heartbeat was heard."""
 
     def take(self, frame: Frame) -> bool:
-        """Take a frame; whether it was another master's."""
+        """Takes a frame; returns True if it came from another master."""
         can_id = frame.can_id
         self._note(frame)
         if self._name(can_id) is None:
@@ -63,7 +63,10 @@ class Ear:
         return True
 
     def listen(self, link: Link, duration_s: float, then: Callable[[Frame], object] = lambda _: None) -> None:
-        """Hear everything that comes; ``then`` receives it as well. A master that was there before is not."""
+        """Listens for a duration; ``then`` receives every frame as well.
+
+        Frames that were waiting before do not count, because their master may be gone.
+        """
         for old in link.drain():
             self._note(old)
             then(old)
@@ -79,12 +82,12 @@ class Ear:
             self.nodes.add(node_id)
 
     def __str__(self) -> str:
-        """``26 SYNC (080h), 26 set-points of node 1 (201h)``; empty where nothing was heard."""
+        """For example ``26 SYNC (080h), 26 set-points of node 1 (201h)``; empty if nothing was heard."""
         return ", ".join(f"{count} {self._name(can_id)} ({can_id:03X}h)" for can_id, count in
                          sorted(self._heard.items()))  # fmt: skip
 
     def refuse(self, bus: str, duration_s: float) -> None:
-        """`BusInUseError` where another master was heard."""
+        """Raises `BusInUseError` if another master was heard."""
         if self._heard:
             raise BusInUseError(
                 f"{bus}: somebody else masters this bus: {self} in {duration_s:.2g} s, and nothing was sent; "

@@ -1,7 +1,7 @@
 """Profile position (PP) and homing (HM): moves that the drive plans itself, outside the control cycle.
 
-Each is a handshake of controlword and statusword bits, as CiA 402-2 gives it. A move that fails or takes
-too long ends with a quick stop.
+Each is a handshake of controlword and statusword bits defined in CiA 402-2. A move that fails or takes too
+long ends with a quick stop.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FAILED: Final = 0x2000
 """PP: following error; HM: homing error."""
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
-"""Readings of the statusword, `POLL_S` apart at least, after which bits from before a command have gone."""
+"""Statusword readings, at least `POLL_S` apart, after which bits from before a command have been cleared."""
 _OFFSET_COUNTS: Final = 2**31
 _TIME_MARGIN: Final = 1.5
 _TIME_EXTRA_S: Final = 2.0
@@ -47,7 +47,7 @@ def _stopping_on_failure(commander: Commander) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # Whatever went wrong, Ctrl-C included: first the axis stops, then the error goes on its way.
+        # On any failure, Ctrl-C included, the axis is stopped before the error propagates.
         with suppress(HdbridgeError):
             commander.quick_stop()
         raise
@@ -55,7 +55,7 @@ def _stopping_on_failure(commander: Commander) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class ProfileMove:
-    """A checked move: what PP is told, in motor counts, and how long it may take."""
+    """A checked PP move: target in motor counts, limits at the load, and time-out."""
 
     load_deg: float
     target_counts: int
@@ -72,9 +72,10 @@ class ProfileMove:
         acceleration_deg_s2: float | None,
         timeout_s: float | None,
     ) -> ProfileMove:
-        """`InputError` when a value is not finite or outside the axis's limits, which are the defaults too.
+        """Builds a move; angles, speeds and accelerations are at the load and default to the axis's limits.
 
-        Angles, speeds and accelerations are at the load. Without a time-out it is computed from the travel.
+        Raises `InputError` if a value is not finite or outside the limits. Without ``timeout_s`` the time-out
+        is computed from the travel.
         """
         axis = image.axis
         limits = axis.limits
@@ -93,7 +94,7 @@ class ProfileMove:
         )
 
     def time_allowed_s(self, axis: AxisConfig, start_counts: int) -> float:
-        """The time-out: as given, else one and a half times the move and two seconds."""
+        """Returns the time-out: the given one, else 1.5 times the duration of the move plus 2 s."""
         if self.timeout_s is not None:
             return self.timeout_s
         way_deg = abs(axis.motor_encoder.degrees(self.target_counts - start_counts)) / axis.gear.ratio
@@ -123,7 +124,7 @@ class Homing:
         offset_deg: float,
         timeout_s: float,
     ) -> Homing:
-        """`InputError` when a value is not finite or beyond the axis's limits."""
+        """Builds a homing run; raises `InputError` if a value is not finite or beyond the axis's limits."""
         limits = axis.limits
         highest_deg = abs(axis.motor_encoder.degrees(_OFFSET_COUNTS) / axis.gear.ratio)
         if not abs(offset_deg) < highest_deg:  # false for NaN, too
@@ -142,10 +143,10 @@ class Homing:
 
 
 def run_move(commander: Commander, move: ProfileMove) -> None:
-    """Move in PP; the drive is enabled in that mode.
+    """Moves in PP; the drive must be enabled in that mode.
 
-    Raises `DriveError` when the drive fails on the way, `TransitionError` when it takes too long; the axis is
-    stopped then.
+    Raises `DriveError` if the drive fails on the way, `TransitionError` on time-out; the axis is stopped
+    then.
     """
     axis, sdo = commander.axis, commander.sdo
     with _stopping_on_failure(commander):
@@ -171,10 +172,10 @@ def run_move(commander: Commander, move: ProfileMove) -> None:
 
 
 def run_homing(commander: Commander, homing: Homing) -> None:
-    """Home in HM; the drive is enabled in that mode.
+    """Homes in HM; the drive must be enabled in that mode.
 
-    Raises `DriveError` when the drive reports a homing error, `TransitionError` when it takes too long; the
-    axis is stopped then.
+    Raises `DriveError` if the drive reports a homing error, `TransitionError` on time-out; the axis is
+    stopped then.
     """
     axis, sdo = commander.axis, commander.sdo
     offset = round(axis.motor_encoder.counts(homing.offset_deg * axis.gear.ratio))
@@ -201,7 +202,7 @@ def run_homing(commander: Commander, homing: Homing) -> None:
 
 
 def _store_if_there(sdo: SdoClient, address: Address, value: int) -> None:
-    """Set an object that is optional in CiA 402; a drive without it has a value of its own."""
+    """Writes an object that is optional in CiA 402; a drive without it uses its own value."""
     try:
         sdo.store(address, value)
     except SdoAbortError as refusal:
@@ -210,16 +211,16 @@ def _store_if_there(sdo: SdoClient, address: Address, value: int) -> None:
 
 
 def halt(commander: Commander) -> bool:
-    """Halt a move of PP or HM with the halt bit; whether the axis came to rest."""
+    """Halts a PP or HM move with the halt bit; returns True if the axis came to rest."""
     commander.image.halt = True
     commander.control(ENABLED | HALT_BIT)
     return commander.wait_for_standstill()
 
 
 def _wait(commander: Commander, doing: str, what: str, done: Callable[[int], bool], timeout_s: float) -> int:
-    """Waits for a statusword; `DriveError` if the drive leaves 'operation enabled' before.
+    """Waits for a statusword; raises `DriveError` if the drive leaves 'operation enabled' first.
 
-    It must not be sent another *enable operation* then: that could set it in motion again.
+    The drive must then not receive another *enable operation*, which could set it in motion again.
     """
     word = commander.wait_for(what, lambda word: done(word) or _dropped_out(word), timeout_s)
     if _dropped_out(word):
@@ -231,11 +232,11 @@ def _wait(commander: Commander, doing: str, what: str, done: Callable[[int], boo
 
 
 def _end(commander: Commander, doing: str, what: str, before: int, bits: int, timeout_s: float) -> int:
-    """Waits for the end of an action, which shows in ``bits``, all set, or in `FAILED`.
+    """Waits for the end of an action: all of ``bits`` set, or `FAILED`.
 
     ``before`` is the statusword before the action was started. If it shows the end of an earlier action, the
-    drive has to clear those bits first. Some drives take 50 ms for that; an action that is over at once
-    never shows them cleared. So after `STALE_READINGS` readings they count as the answer.
+    drive has to clear those bits first. Some drives take 50 ms for that, and an action that ends at once
+    never shows them cleared. After `STALE_READINGS` readings the bits therefore count as the answer.
     """
 
     def over(word: int) -> bool:
@@ -257,7 +258,7 @@ def _has_room(statusword: int) -> bool:
 
 
 def _dropped_out(statusword: int) -> bool:
-    # A fault is not a mere drop-out: the waiting itself raises it, with its code.
+    # A fault is not treated as a drop-out, because the wait itself raises it, with its code.
     return decode(statusword) not in (State.OPERATION_ENABLED, State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 

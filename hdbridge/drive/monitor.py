@@ -1,7 +1,7 @@
-"""What the nodes say without being asked: heartbeats, boot-up messages, emergencies.
+"""Unsolicited messages of the nodes: heartbeats, boot-up messages and emergencies.
 
-Bookkeeping only; nothing is decided here. Whoever receives frames passes them on, so that a heartbeat that
-arrives in the middle of an SDO transfer is not lost.
+Bookkeeping only; nothing is decided here. Every receiver passes its frames on to the monitor, so that a
+heartbeat that arrives during an SDO transfer is not lost.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EMERGENCIES_KEPT: Final = 64
 
 
 class Emergency(NamedTuple):
-    """One EMCY message. A short one is kept with what it has."""
+    """One EMCY message; a short one is kept with the bytes it has."""
 
     time_s: float
     code: int
@@ -26,7 +26,7 @@ class Emergency(NamedTuple):
     vendor: bytes
 
     def __str__(self) -> str:
-        """``EMCY 8611h (following error), register 21h, 00 00 00 00 00``."""
+        """For example ``EMCY 8611h (following error), register 21h, 00 00 00 00 00``."""
         return f"EMCY {self.code:04X}h ({error_name(self.code)}), register {self.register:02X}h" + (
             f", {self.vendor.hex(' ')}" if self.vendor else ""
         )
@@ -34,32 +34,32 @@ class Emergency(NamedTuple):
 
 @dataclass(slots=True)
 class NodeStatus:
-    """What is known of a node from its own messages."""
+    """State of a node according to its own messages."""
 
     node_id: int
     nmt_state: int | None = None
     """Last `NmtState` byte; None before the first heartbeat."""
     heartbeat_s: float | None = None
-    """When the last heartbeat or boot-up message came, on the link's clock."""
+    """Time of the last heartbeat or boot-up message, on the link's clock; s."""
     boot_ups: int = 0
     heartbeats: int = 0
     boot_up_s: float | None = None
-    """When the last boot-up message came."""
+    """Time of the last boot-up message, on the link's clock; s."""
     emergency_count: int = 0
-    """All emergencies, those that no longer fit the ring included."""
+    """Number of all emergencies, including those dropped from the ring buffer."""
     emergencies: deque[Emergency] = field(default_factory=lambda: deque(maxlen=EMERGENCIES_KEPT))
 
     def heartbeat_age_s(self, now_s: float) -> float:
-        """Seconds since the last heartbeat; infinite before the first."""
+        """Returns the seconds since the last heartbeat; infinite before the first."""
         return float("inf") if self.heartbeat_s is None else now_s - self.heartbeat_s
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Boot-up messages, heartbeats and emergencies so far."""
+        """Number of boot-up messages, heartbeats and emergencies so far."""
         return self.boot_ups, self.heartbeats, self.emergency_count
 
     def heard_since(self, counts: tuple[int, int, int]) -> str:
-        """What was heard of the node since it had these counts, for a message; empty if nothing was."""
+        """Describes what was heard of the node since it had these counts; empty if nothing was."""
         boot_ups, heartbeats, emergencies = counts
         said = []
         if self.boot_ups > boot_ups:
@@ -72,12 +72,12 @@ class NodeStatus:
 
     @property
     def last_error(self) -> Emergency | None:
-        """The newest emergency that reports an error rather than its end (code 00xxh)."""
+        """Newest emergency that reports an error rather than its end (code 00xxh), or None."""
         return next((entry for entry in reversed(self.emergencies) if entry.code >> 8), None)
 
 
 class NetworkMonitor:
-    """Keeps a `NodeStatus` for each node that is watched."""
+    """Keeps a `NodeStatus` for each watched node."""
 
     __slots__ = ("_emergency", "_heartbeat", "nodes")
 
@@ -89,7 +89,7 @@ class NetworkMonitor:
             self.watch(node_id)
 
     def watch(self, node_id: int) -> NodeStatus:
-        """The status of a node, watched from now on if it was not."""
+        """Returns the status of a node; starts to watch the node if necessary."""
         status = self.nodes.get(node_id)
         if status is None:
             status = NodeStatus(node_id)
@@ -99,13 +99,13 @@ class NetworkMonitor:
         return status
 
     def dispatch(self, frame: Frame) -> bool:
-        """Take a frame; whether it was a heartbeat, boot-up message or emergency of a watched node."""
+        """Takes a frame; returns True for a heartbeat, boot-up message or emergency of a watched node."""
         can_id, data, time_s = frame
         status = self._heartbeat.get(can_id)
         if status is not None:
             if not data:
                 return True
-            # Bit 7 is the toggle bit of the older node guarding.
+            # Bit 7 is the toggle bit of the obsolete node guarding.
             nmt_state = data[0] & 0x7F
             status.nmt_state = nmt_state
             status.heartbeat_s = time_s

@@ -1,7 +1,7 @@
-"""What a drive says of itself, held against the axis file. Pure: it judges readings, it reads nothing.
+"""Comparison of a drive's identification and scaling with the axis file. Pure: it judges readings.
 
-Every difference is a `Complaint`: the key of the axis file, what was found there and what the drive says, in
-one line. The boot-up refuses the drive with the first one; the bring-up shows them all.
+Every difference is a one-line `Complaint`: the key of the axis file, its value, and the drive's value. The
+boot-up refuses the drive with the first one; the bring-up shows them all.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 Readings = Mapping[Address, int]
-"""What the drive answered; an object that it lacks is not in it."""
+"""Values read from the drive; objects that it lacks are missing."""
 
 IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
     (objects.VENDOR_ID, "vendor_id"),
@@ -26,7 +26,7 @@ IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
     (objects.REVISION, "revision"),
     (objects.SERIAL, "serial"),
 )
-"""The identity object, and the keys of ``drive.identity``."""
+"""Identity objects, and their keys under ``drive.identity``."""
 _RATED_TORQUE_TOLERANCE: Final = 0.01
 
 
@@ -36,11 +36,11 @@ class Complaint(NamedTuple):
     key: str
     """Key of the axis file."""
     text: str
-    """What is wrong, where, and what to do: one line."""
+    """One line: what is wrong, where, and what to do."""
 
 
 def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
-    """The objects that say how the drive counts; a drive need not have them."""
+    """Returns the objects that define the drive's position scaling; a drive need not have them."""
     source = axis.load_encoder.source
     additional = source.node is None and source.index == objects.ADDITIONAL_POSITIONS
     return (
@@ -56,7 +56,7 @@ def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
 
 
 def device_type_complaints(axis: AxisConfig, device_type: int) -> list[Complaint]:
-    """Whether 1000h is that of a drive."""
+    """Checks that 1000h reports a CiA-402 drive."""
     if device_type & 0xFFFF == objects.DEVICE_PROFILE_402:
         return []
     key = "drive.node_id"
@@ -70,7 +70,7 @@ def device_type_complaints(axis: AxisConfig, device_type: int) -> list[Complaint
 
 
 def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Complaint]:
-    """Where the identity (keys of ``drive.identity``) is not the one that the axis file demands."""
+    """Lists the identity values (keys of ``drive.identity``) that differ from the axis file."""
     complaints = []
     for address, name in IDENTITY:
         wanted = getattr(axis.drive.identity, name)
@@ -88,7 +88,7 @@ def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Comp
 
 
 def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
-    """Whether 6502h has the mode of the control cycle; 0 says nothing."""
+    """Checks that 6502h contains the mode of the control cycle; a value of 0 is accepted as unknown."""
     if not modes or modes & cyclic_mode(axis).mode.supported_bit:
         return []
     key = "drive.mode"
@@ -102,7 +102,7 @@ def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
 
 
 def mode_advice(modes: int) -> str:
-    """What to do if 6502h lacks the mode of the control cycle."""
+    """Returns advice for a drive whose 6502h lacks the mode of the control cycle."""
     for name, each in objects.CYCLIC.items():
         if modes & each.mode.supported_bit:
             return f"'mode: {name}' would be one that it has"
@@ -113,7 +113,7 @@ def mode_advice(modes: int) -> str:
 
 
 def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
-    """Where the drive counts otherwise than the axis file says, by every object that says something."""
+    """Lists the contradictions between the axis file and every object that defines the drive's scaling."""
     try:
         increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
         feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT) if axis.drive.feed_scales else None
@@ -129,7 +129,7 @@ def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
 
 
 def torque_notes(axis: AxisConfig, rated_mnm: int | None) -> list[str]:
-    """Whether 6076h differs from the axis file: worth knowing, no reason to refuse."""
+    """Returns a note if 6076h differs from the axis file, which is no reason to refuse the drive."""
     if rated_mnm is None:
         return []
     drive_nm, file_nm = rated_mnm / 1000.0, axis.drive.rated_torque_nm
@@ -200,7 +200,7 @@ def _polarity(axis: AxisConfig, readings: Readings) -> list[Complaint]:
 
 
 def _load_counts(axis: AxisConfig, readings: Readings) -> list[Complaint]:
-    """60E6h and 60EBh say how an encoder at 60E4h counts, per turn of the load or of the motor."""
+    """Compares 60E6h and 60EBh, for an encoder at 60E4h, with the axis file; per turn of load or motor."""
     source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
     if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
         return []
@@ -230,7 +230,7 @@ class _NotARatioError(Exception):
 
 
 def _ratio(axis: AxisConfig, readings: Readings, above: Address, below: Address) -> Fraction | None:
-    """A ratio of two objects, None where the drive has none."""
+    """Returns the ratio of two objects; None if the drive lacks the first."""
     if above not in readings:
         return None
     numerator, denominator = readings[above], readings.get(below, 1)

@@ -1,7 +1,7 @@
-"""The objects of CiA 301 and CiA 402 that the master touches: address, type, name. Data only.
+"""The objects of CiA 301 and CiA 402 that the master uses: address, type, name. Data only.
 
-Everything is keyed by (index, sub-index). A drive's EDS may give another type for an object than the
-profile does; the EDS then wins, because it is what the drive answers with.
+Everything is keyed by (index, sub-index). If the EDS of a drive gives an object another type than the profile
+does, the EDS wins, because the drive answers according to it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hdbridge.errors import InputError
 
 
 class IntegerType(Enum):
-    """An integer type of CiA 301 that can stand in a PDO, named as in the axis file."""
+    """Integer type of CiA 301 that can be mapped to a PDO, named as in the axis file."""
 
     INT8 = "int8"
     INT16 = "int16"
@@ -34,30 +34,33 @@ class IntegerType(Enum):
 
     @property
     def signed(self) -> bool:
-        """Whether the type has a sign."""
+        """True if the type has a sign."""
         return not self.value.startswith("u")
 
     @property
     def minimum(self) -> int:
-        """Least value."""
+        """Smallest value."""
         return -(1 << (self.bits - 1)) if self.signed else 0
 
     @property
     def maximum(self) -> int:
-        """Greatest value."""
+        """Largest value."""
         return (1 << (self.bits - self.signed)) - 1
 
     def encode(self, value: int) -> bytes:
-        """Little-endian bytes of ``value``; the caller has checked the range."""
+        """Returns the little-endian bytes of ``value``; the caller has checked the range."""
         return value.to_bytes(self.bits // 8, "little", signed=self.signed)
 
     def decode(self, data: bytes) -> int:
-        """Value of exactly ``bits / 8`` little-endian bytes."""
+        """Decodes exactly ``bits / 8`` little-endian bytes."""
         return int.from_bytes(data, "little", signed=self.signed)
 
     @classmethod
     def named(cls, name: object) -> IntegerType:
-        """The type of that name ("int32"); a member of another string enum serves as well."""
+        """Returns the type with a name ("int32") or an equivalent member of another string enum.
+
+        Raises `InputError` for an unknown name.
+        """
         text = getattr(name, "value", name)
         try:
             return cls(text)
@@ -68,7 +71,7 @@ class IntegerType(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where an object is, what it holds, and what the profile calls it."""
+    """Address, type and profile name of an object."""
 
     index: int
     sub: int
@@ -76,12 +79,12 @@ class Address:
     name: str
 
     def __str__(self) -> str:
-        """``6041h:00 statusword``."""
+        """For example ``6041h:00 statusword``."""
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
 class Mode(IntEnum):
-    """Modes of operation (6060h), as far as they are used here."""
+    """Modes of operation (6060h) that hdbridge uses."""
 
     PP = 1
     HM = 6
@@ -90,7 +93,7 @@ class Mode(IntEnum):
 
     @property
     def supported_bit(self) -> int:
-        """Bit of 6502h that says that the drive has this mode."""
+        """Bit of 6502h that reports this mode as supported."""
         return 1 << (self.value - 1)
 
 
@@ -113,7 +116,7 @@ class NmtState(IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
-# Function codes of the predefined connection set (CiA 301): add the node id where there is one.
+# Function codes of the predefined connection set (CiA 301); the node id is added where there is one.
 COB_NMT: Final = 0x000
 COB_SYNC: Final = 0x080
 COB_EMCY: Final = 0x080
@@ -192,11 +195,11 @@ CYCLE_EXPONENT: Final = Address(0x60C2, 2, _I8, "interpolation time index")
 SUPPORTED_MODES: Final = Address(0x6502, 0, _U32, "supported drive modes")
 
 ADDITIONAL_POSITIONS: Final = 0x60E4
-"""Array of additional encoders; its sub-index says which."""
+"""Array of additional encoders; the sub-index is the encoder's number."""
 
 
 def additional_resolution(sub: int) -> tuple[Address, Address]:
-    """Increments and revolutions of the additional encoder ``sub`` (60E6h, 60EBh)."""
+    """Returns the objects for increments and revolutions of additional encoder ``sub`` (60E6h, 60EBh)."""
     return (
         Address(0x60E6, sub, _U32, "additional encoder increments"),
         Address(0x60EB, sub, _U32, "additional encoder revolutions"),
@@ -204,24 +207,24 @@ def additional_resolution(sub: int) -> tuple[Address, Address]:
 
 
 REQUIRED: Final = (CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY, POSITION_ACTUAL)
-"""The objects that the control cycle cannot do without, next to the target of its `CyclicMode`."""
+"""Objects that the control cycle requires, in addition to the target of its `CyclicMode`."""
 
 
 class CyclicMode(NamedTuple):
-    """A mode of operation that takes a position target in every cycle."""
+    """Mode of operation that takes a position target in every cycle."""
 
     mode: Mode
     target: Address
     enabling: int
-    """Controlword bits, set in 'operation enabled' only, without which the drive holds its position."""
+    """Controlword bits set only in 'operation enabled', without which the drive holds its position."""
 
 
 CYCLIC: Final = {
     "csp": CyclicMode(Mode.CSP, TARGET_POSITION, 0),
     "ip": CyclicMode(Mode.IP, INTERPOLATION_DATA, 0x0010),
 }
-"""By the value of ``drive.mode`` in the axis file."""
+"""Cyclic modes by the value of ``drive.mode`` in the axis file."""
 STANDARD: Final[dict[tuple[int, int], Address]] = {
     (value.index, value.sub): value for value in list(vars().values()) if isinstance(value, Address)
 }
-"""Every object above by (index, sub-index)."""
+"""All objects above by (index, sub-index)."""

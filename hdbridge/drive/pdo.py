@@ -1,8 +1,8 @@
-"""A PDO as bytes: what is mapped into it, and the way from frame to integers and back. No I/O.
+"""PDO codec: mapped objects, and conversion between frame data and integers. No I/O.
 
-The layout is compiled once into a `struct`, because this runs in every control cycle. A frame of the wrong
-length is rejected whole, and nothing that is not an integer within its type's range is ever packed: NaN,
-infinity and an out-of-range target end here, before the bus.
+The layout is compiled once into a `struct`, because it is used in every control cycle. A frame of the wrong
+length is rejected as a whole, and only integers within the range of their type are packed: NaN, infinity and
+an out-of-range target never reach the bus.
 """
 
 from __future__ import annotations
@@ -44,28 +44,29 @@ class PdoEntry:
 
     @classmethod
     def of(cls, address: Address) -> PdoEntry:
-        """The entry that maps a known object."""
+        """Returns the entry that maps a known object."""
         return cls(address.index, address.sub, address.type)
 
     @property
     def is_gap(self) -> bool:
-        """A data type in place of an object, which a drive's own mapping may have to leave a gap."""
+        """True for a data type in place of an object, which a drive's own mapping may use as padding."""
         return self.index < _FIRST_OBJECT
 
     @property
     def mapping(self) -> int:
-        """The value of a mapping parameter (1600h or 1A00h): index, sub-index, bits."""
+        """Value of a mapping parameter (1600h or 1A00h): index, sub-index, bits."""
         return self.index << 16 | self.sub << 8 | self.type.bits
 
     def __str__(self) -> str:
-        """``6064h:00 int32``."""
+        """For example ``6064h:00 int32``."""
         return f"{self.index:04X}h:{self.sub:02X} {self.type.value}"
 
 
 class PdoCodec:
     """Packs and unpacks one PDO.
 
-    ``entries`` are the mapped objects in order; 1 to 8 bytes together, no object twice, else `InputError`.
+    ``entries`` are the mapped objects in order. Raises `InputError` unless they have 1 to 8 bytes in total
+    and no object occurs twice.
     """
 
     __slots__ = ("_odd", "_struct", "_unpack", "entries", "length", "positions")
@@ -75,12 +76,12 @@ class PdoCodec:
         self._struct = struct.Struct("<" + "".join(_FORMATS[entry.type] for entry in self.entries))
         self._unpack = self._struct.unpack
         self.length: int = self._struct.size
-        """Bytes of the PDO, exactly."""
+        """Exact length of the PDO; bytes."""
         self.positions: dict[tuple[int, int], int] = {
             (entry.index, entry.sub): place for place, entry in enumerate(self.entries)
         }
         """Place of an object's value in the tuple, by (index, sub-index)."""
-        # struct has no 24-bit integer: such entries travel as three bytes and are converted apart.
+        # struct has no 24-bit integer: such entries are packed as three bytes and converted separately.
         self._odd = tuple(place for place, entry in enumerate(self.entries) if entry.type.bits == 24)
         names = ", ".join(map(str, self.entries))
         if not 1 <= self.length <= MAX_BYTES:
@@ -92,7 +93,9 @@ class PdoCodec:
             raise InputError(f"a PDO maps an object once, but got {names}")
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, ...]:
-        """The mapped values in order; `PdoLengthError` unless ``data`` has exactly the mapped length."""
+        """Returns the mapped values in order; raises `PdoLengthError` unless ``data`` has the
+        mapped length.
+        """
         try:
             values = self._unpack(data)
         except struct.error as error:
@@ -108,10 +111,12 @@ class PdoCodec:
         return tuple(decoded)
 
     def pack(self, values: Sequence[int]) -> bytes:
-        """The frame's data; `InputError` when a value is not an integer within the range of its type."""
+        """Returns the frame's data; raises `InputError` if a value is not an integer within the range of its
+        type.
+        """
         if not self._odd:
             try:
-                # struct itself refuses what is no integer (NaN is a float) and what is out of range.
+                # struct itself refuses non-integers (NaN is a float) and out-of-range values.
                 return self._struct.pack(*values)
             except struct.error as error:
                 raise self._refusal(values) from error

@@ -1,8 +1,8 @@
-"""Whether the positions of a cycle can be true, and whether the drive follows. Pure.
+"""Plausibility of a cycle's positions, and the following error. Pure.
 
-An encoder that moves farther in a cycle than the axis can is not believed: its reading is rejected and the
-last good one stays, so that one glitch costs one cycle. The drive's following error is watched here as well
-as by the drive itself (6065h and 6066h).
+If an encoder moves farther in a cycle than the axis can, its reading is rejected and the last good one is
+kept, so that one glitch costs one cycle. The drive's following error is checked here as well as by the drive
+itself (6065h and 6066h).
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 OVERSPEED: Final = 1.5
-"""A quick stop, an overshoot or a resonance may exceed the axis's velocity limit by this factor."""
+"""Factor by which a quick stop, an overshoot or a resonance may exceed the axis's velocity limit."""
 FLOOR_ARCSEC: Final = 180.0
-"""Vibration and noise at the load that are no jump, however slow the axis's limit is."""
+"""Load movement per cycle that vibration and noise may cause, however slow the axis's limit is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plausibility:
-    """Limits of what can happen within one cycle, in encoder counts."""
+    """Limits of the movement within one cycle, in encoder counts."""
 
     motor_floor_counts: float
     motor_step_counts: float
-    """Most that the motor encoder moves in one cycle, on top of its floor."""
+    """Maximum movement of the motor encoder per cycle, in addition to its floor."""
     load_floor_counts: float
     load_step_counts: float
-    """Most that the load encoder moves in one cycle, on top of its floor."""
+    """Maximum movement of the load encoder per cycle, in addition to its floor."""
     following_counts: float
-    """Most by which the motor may differ from the drive's demand."""
+    """Maximum difference between the motor position and the drive's demand."""
 
     @classmethod
     def of(cls, axis: AxisConfig) -> Plausibility:
-        """The limits that follow from an axis file."""
+        """Derives the limits from an axis file."""
         step_deg = OVERSPEED * axis.limits.velocity_deg_s * axis.drive.cycle_s
         floor_deg = FLOOR_ARCSEC / ARCSEC_PER_DEG
         motor, load, ratio = axis.motor_encoder, axis.load_encoder, axis.gear.ratio
@@ -49,7 +49,7 @@ class Plausibility:
         )
 
     def jump(self, motor_counts: int, load_counts: int, cycles: int) -> str | None:
-        """What jumped, given how far the encoders moved in ``cycles`` cycles; None when nothing did."""
+        """Returns a description of an implausible movement over ``cycles`` cycles, or None."""
         allowed = self.motor_floor_counts + cycles * self.motor_step_counts
         if not -allowed <= motor_counts <= allowed:
             return f"motor encoder: {motor_counts:+d} counts, at most {allowed:.0f} are possible"
@@ -59,7 +59,7 @@ class Plausibility:
         return None
 
     def lag(self, error_counts: int) -> str | None:
-        """The following error when it is too large, given demand minus actual; None when it is not."""
+        """Returns a description of an excessive following error (demand minus actual), or None."""
         if -self.following_counts <= error_counts <= self.following_counts:
             return None
         return f"{error_counts:+d} motor counts, allowed are {self.following_counts:.0f}"

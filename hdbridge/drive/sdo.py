@@ -1,10 +1,10 @@
-"""Reading and writing a node's objects, in the caller's own thread.
+"""SDO client that reads and writes a node's objects in the caller's thread.
 
-The SDO protocol itself is that of `canopen`; what is replaced is how it waits. canopen's client needs a
-notifier thread that feeds a queue, and that thread dies for good when the interface goes down. Here the
-caller's thread receives until the answer is there, until a deadline on the passed clock; every other frame
-that arrives meanwhile goes to the network monitor. Added besides: retries that repeat the whole transfer, a
-cap on what a node may send, a check of every answer's length, and errors that say what to do.
+The SDO protocol is that of `canopen`; only its way of waiting is replaced. canopen's client needs a notifier
+thread that feeds a queue, and that thread dies for good when the interface goes down. Here the caller's
+thread receives until the answer arrives or a deadline on the given clock passes, and hands every other frame
+to the network monitor. It also adds retries of the whole transfer, a limit on the size of an answer, a check
+of every answer's length, and errors with advice.
 
 Never used inside the control cycle.
 """
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 DEFAULT_TIMEOUT_S: Final = 0.5
 DEFAULT_ATTEMPTS: Final = 3
 DEFAULT_SIZE_CAP: Final = 4096
-"""Longest object that is read, bytes: names and versions are the longest that are wanted."""
+"""Maximum length of an object that is read, bytes; names and versions are the longest ones needed."""
 _TIMEOUTS_PER_TRANSFER: Final = 20
 _FRAME_BYTES: Final = 8
 _ABORT: Final = 0x80
@@ -53,11 +53,11 @@ _ADVICE: Final = {
 
 
 ABSENT: Final = frozenset({0x0602_0000, 0x0609_0011})
-"""Abort codes of a drive that does not have the object."""
+"""Abort codes of a drive that lacks the object."""
 
 
 class SdoAbortError(SdoError):
-    """The node refused with an abort code: it is there, and it means it."""
+    """The node refused with an abort code, which also proves that it is present."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -69,7 +69,7 @@ class _NoAnswerError(SdoCommunicationError):
 
 
 class _Channel(CanopenSdoClient):
-    """canopen's SDO protocol, receiving in the caller's thread."""
+    """canopen's SDO protocol, with reception in the caller's thread."""
 
     def __init__(self, link: Link, monitor: NetworkMonitor, node_id: int, od: ObjectDictionary) -> None:
         super().__init__(COB_SDO_REQUEST + node_id, COB_SDO_ANSWER + node_id, od)  # type: ignore[no-untyped-call]
@@ -77,7 +77,7 @@ class _Channel(CanopenSdoClient):
         self.monitor = monitor
         self.timeout_s = DEFAULT_TIMEOUT_S
         self.transfer_ends_s = 0.0
-        """A node may answer every segment in time and never end: the transfer as a whole has a bound too."""
+        """Deadline of the whole transfer, because a node could answer every segment in time and never end."""
         self.strays = 0
 
     def send_request(self, request: bytes | bytearray) -> None:
@@ -93,7 +93,7 @@ class _Channel(CanopenSdoClient):
         initiates = command >> 5 in (1, 2)
         self.send_request(sdo_request)
         deadline_s = min(self.link.now() + self.timeout_s, self.transfer_ends_s)
-        # The second condition ends the wait on a bus that is never quiet.
+        # The second condition ends the wait on a bus that is never idle.
         while (frame := self.link.recv(deadline_s)) is not None and frame.time_s <= deadline_s:
             if frame.can_id != self.tx_cobid:
                 self._set_aside(frame)
@@ -113,7 +113,7 @@ class _Channel(CanopenSdoClient):
 
     def _set_aside(self, frame: Frame) -> None:
         if frame.can_id == self.tx_cobid:
-            # The delayed answer to an earlier request, or to somebody else's.
+            # A delayed answer to an earlier request, or an answer to another client.
             self.strays += 1
         else:
             self.monitor.dispatch(frame)
@@ -140,9 +140,9 @@ class _Channel(CanopenSdoClient):
 
 
 class SdoClient:
-    """Reads and writes the objects of one node. Not for several threads, not for the control cycle.
+    """Reads and writes the objects of one node. Not thread-safe; not for the control cycle.
 
-    ``od`` is the node's object dictionary, or None where the types of CiA 301 and CiA 402 suffice.
+    ``od`` is the node's object dictionary, or None if the types of CiA 301 and CiA 402 suffice.
     """
 
     def __init__(
@@ -164,15 +164,17 @@ class SdoClient:
 
     @property
     def strays(self) -> int:
-        """SDO answers that nobody had asked for: delayed ones, or those to another client."""
+        """Number of unsolicited SDO answers: delayed ones, or answers to another client."""
         return self._channel.strays
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the EDS lists the object."""
+        """Returns True if the EDS lists the object."""
         return find(self.od, index, sub) is not None
 
     def type_of(self, index: int, sub: int) -> IntegerType:
-        """Integer type of an object by the EDS, else by the profile; `SdoError` when neither has it."""
+        """Returns an object's integer type by the EDS, else by the profile; raises `SdoError` if neither has
+        it.
+        """
         variable = find(self.od, index, sub)
         if variable is not None:
             kind = integer_type(variable)
@@ -189,7 +191,9 @@ class SdoClient:
         return known.type
 
     def describe(self, index: int, sub: int) -> str:
-        """``node 1, object 607Ah:00 'Target position'``, the name by the EDS or the profile."""
+        """For example ``node 1, object 607Ah:00 'Target position'``, with the name from the EDS or the
+        profile.
+        """
         name = ""
         variable = find(self.od, index, sub)
         if variable is not None:
@@ -199,7 +203,7 @@ class SdoClient:
         return f"node {self.node_id}, object {index:04X}h:{sub:02X}" + (f" '{name}'" if name else "")
 
     def read(self, index: int, sub: int = 0, type: IntegerType | None = None) -> int:  # noqa: A002
-        """Value of an integer object; `SdoError` when it cannot be had or has the wrong length."""
+        """Reads an integer object; raises `SdoError` if that fails or the length is wrong."""
         kind = type or self.type_of(index, sub)
         data = self.read_bytes(index, sub)
         size = kind.bits // 8
@@ -211,7 +215,9 @@ class SdoClient:
         return kind.decode(data[:size])
 
     def write(self, index: int, sub: int, value: int, type: IntegerType | None = None) -> None:  # noqa: A002
-        """Write an integer object; `InputError` when the value does not fit it, `SdoError` on refusal."""
+        """Writes an integer object; raises `InputError` if the value is out of range,
+        `SdoError` on refusal.
+        """
         kind = type or self.type_of(index, sub)
         if not isinstance(value, int) or not kind.minimum <= value <= kind.maximum:
             raise InputError(
@@ -221,15 +227,15 @@ class SdoClient:
         self.write_bytes(index, sub, kind.encode(value))
 
     def fetch(self, address: Address) -> int:
-        """`read` of a known object."""
+        """Reads a known object, as `read` does."""
         return self.read(address.index, address.sub)
 
     def store(self, address: Address, value: int) -> None:
-        """`write` of a known object."""
+        """Writes a known object, as `write` does."""
         self.write(address.index, address.sub, value)
 
     def read_text(self, index: int, sub: int = 0) -> str:
-        """Value of a string object; what is not ASCII becomes a question mark."""
+        """Reads a string object; characters outside ASCII become question marks."""
         return (
             self.read_bytes(index, sub)
             .decode("ascii", errors="replace")
@@ -238,11 +244,11 @@ class SdoClient:
         )
 
     def read_bytes(self, index: int, sub: int) -> bytes:
-        """Raw bytes of an object, at most ``size_cap``; an expedited answer without a size has four."""
+        """Reads an object's raw bytes, at most ``size_cap``; an expedited answer without a size has four."""
         return self._transfer("read", index, sub, None)
 
     def write_bytes(self, index: int, sub: int, data: bytes) -> None:
-        """Write raw bytes, expedited up to four and in segments beyond."""
+        """Writes raw bytes: expedited up to four, segmented beyond."""
         self._transfer("write", index, sub, data)
 
     def _transfer(self, doing: str, index: int, sub: int, data: bytes | None) -> bytes:
@@ -283,6 +289,6 @@ class SdoClient:
 
     @staticmethod
     def _is_extension(data: bytes, size: int, kind: IntegerType) -> bool:
-        # Some drives answer every object with four bytes; harmless when the rest repeats the sign.
+        # Some drives answer every object with four bytes, which is harmless if the rest repeats the sign.
         fill = 0xFF if kind.signed and data[size - 1] & 0x80 else 0
         return len(data) <= 4 and all(byte in (fill, 0) for byte in data[size:])

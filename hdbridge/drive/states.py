@@ -1,13 +1,13 @@
 """The power state machine of CiA 402, as tables.
 
-What may live here: the states, the rows of the decoding table, the rows of the transition table, and what
-follows from those rows alone: decoding, which command is legal where, the way from a state to another, the
-diagram. No bus, no clock, no objects, no modes of operation, no policy about *when* to move: those belong to
-`drive.py` and to the cycle. A drive that behaves differently gets another row, not an `if`.
+This module holds the states, the rows of the decoding table, the rows of the transition table, and what
+follows from those rows alone: decoding, the commands allowed in each state, the path between two states, the
+diagram. It has no bus, clock, objects or modes of operation, and no policy about *when* to move: those belong
+to `drive.py` and to the cycle. A drive that behaves differently gets another row, not an `if`.
 
-The rows are those of CiA 402-2, with its transition numbers. Three of them are never part of a way that
-is looked up, because somebody has to *want* them: leaving a fault (15), resuming out of a quick stop (16),
-and of course a fault (13).
+The rows are those of CiA 402-2, with its transition numbers. Three transitions are never part of an automatic
+path, because each must be requested explicitly: leaving a fault (15), resuming from a quick stop (16), and of
+course a fault (13).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hdbridge.errors import RESET, TransitionError
 
 
 class State(Enum):
-    """State of the power drive system as the statusword tells it."""
+    """State of the power drive system, as reported by the statusword."""
 
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -32,13 +32,13 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = "fault reaction active"
     FAULT = "fault"
     UNKNOWN = "unknown"
-    """No statusword yet, or one that no row describes."""
+    """No statusword yet, or one that matches no row."""
 
-    # By identity: the hash that Enum has is computed in Python, which shows in a control cycle.
+    # Hash by identity: Enum's own hash is computed in Python, which is measurable in a control cycle.
     __hash__ = object.__hash__
 
 
-# For the control cycle: to look a member up in its class takes five times as long as a name of the module.
+# The control cycle uses module names because looking up an enum member in its class takes five times as long.
 _ENABLED: Final = State.OPERATION_ENABLED
 _QUICK_STOP: Final = State.QUICK_STOP_ACTIVE
 _FAULT: Final = State.FAULT
@@ -57,7 +57,7 @@ _DECODING: Final[tuple[tuple[State, int, int], ...]] = (
 
 
 class Command(Enum):
-    """What a controlword asks of the state machine: ``mask`` and ``word`` over bits 0-3 and 7."""
+    """Command of a controlword: ``mask`` and ``word`` over bits 0-3 and 7."""
 
     SHUTDOWN = ("shutdown", 0x87, 0x06)
     SWITCH_ON = ("switch on", 0x8F, 0x07)
@@ -66,7 +66,7 @@ class Command(Enum):
     DISABLE_VOLTAGE = ("disable voltage", 0x82, 0x00)
     QUICK_STOP = ("quick stop", 0x86, 0x02)
     FAULT_RESET = ("fault reset", 0x80, 0x80)
-    """An edge: bit 7 has to be seen low before."""
+    """Edge-triggered: bit 7 must have been low before."""
 
     def __init__(self, label: str, mask: int, word: int) -> None:
         self.label = label
@@ -75,7 +75,9 @@ class Command(Enum):
 
 
 class Transition(NamedTuple):
-    """One row: in ``source``, ``command`` leads to ``target``; without a command the drive goes by itself."""
+    """One row: in ``source``, ``command`` leads to ``target``. Without a command the drive changes on its
+    own.
+    """
 
     number: int
     source: State
@@ -110,7 +112,7 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(16, _S.QUICK_STOP_ACTIVE, _S.OPERATION_ENABLED, _C.ENABLE_OPERATION),
 )
 NEVER_IMPLIED: Final = frozenset({13, 15, 16})
-"""Transitions that no search for a way may use."""
+"""Transitions that an automatic path must not use."""
 
 HOLD: Final[dict[State, int]] = {
     State.READY_TO_SWITCH_ON: Command.SHUTDOWN.word,
@@ -118,7 +120,7 @@ HOLD: Final[dict[State, int]] = {
     State.OPERATION_ENABLED: Command.ENABLE_OPERATION.word,
     State.QUICK_STOP_ACTIVE: Command.QUICK_STOP.word,
 }
-"""Controlword that leaves the drive where it is; in every other state that is 0, disable voltage."""
+"""Controlword that keeps the drive in a state; in every other state it is 0, disable voltage."""
 
 
 def _decoded(bits: int) -> State:
@@ -130,14 +132,16 @@ _DECODED: Final = tuple(_decoded(bits) for bits in range(_STATE_BITS + 1))
 
 
 def decode(statusword: int | None) -> State:
-    """The state that a statusword tells; UNKNOWN for None, for no 16-bit value and for undefined bits."""
+    """Returns the state in a statusword; UNKNOWN for None, for a value beyond 16 bits and for
+    undefined bits.
+    """
     if statusword is None or not 0 <= statusword <= 0xFFFF:
         return State.UNKNOWN
     return _DECODED[statusword & _STATE_BITS]
 
 
 def row_for(state: State, command: Command) -> Transition:
-    """The row that ``command`` takes in ``state``; `TransitionError` when there is none."""
+    """Returns the row that ``command`` takes in ``state``; raises `TransitionError` if there is none."""
     for row in TRANSITIONS:
         if row.source is state and row.command is command:
             return row
@@ -149,10 +153,10 @@ def row_for(state: State, command: Command) -> Transition:
 
 
 def _first_row(state: State, target: State) -> Transition | None:
-    """First row of the shortest way, breadth first.
+    """Returns the first row of the shortest path (breadth-first search), or None.
 
-    Without the rows that are never implied, and never *through* 'operation enabled': nobody is to be put
-    under power in order to get somewhere else.
+    The path avoids the transitions of `NEVER_IMPLIED` and never passes *through* 'operation enabled': no
+    drive is to be powered merely to reach another state.
     """
     ways: deque[tuple[State, Transition | None]] = deque([(state, None)])
     seen = {state}
@@ -173,11 +177,12 @@ _FIRST_ROWS: Final = {(a, b): _first_row(a, b) for a in State for b in State}
 
 
 def controlword_for(state: State, target: State) -> int:
-    """The controlword to send in ``state`` on the way to ``target``; at the target, the one that holds it.
+    """Returns the controlword for the next step from ``state`` to ``target``, or the one that holds the
+    target.
 
-    Where the drive has to go first by itself, the word is 0 (disable voltage). Raises `TransitionError` when
-    no way leads there, which includes every way out of a fault (`PowerWalk.reset_fault`) or straight out of a
-    quick stop (by way of 'switch on disabled' only).
+    It is 0 (disable voltage) if the drive must first change state on its own. Raises `TransitionError` if
+    there is no path, which includes every exit from a fault (use `PowerWalk.reset_fault`) and the direct exit
+    from a quick stop (only through 'switch on disabled').
     """
     if state is target and state is not State.UNKNOWN:
         return HOLD.get(state, 0)
@@ -199,17 +204,17 @@ def _word(state: State, aim: State) -> int:
     try:
         return controlword_for(state, aim)
     except TransitionError:
-        return 0  # nothing leads there: power off, and wait to be told more
+        return 0  # no path: power off, and wait for the next aim
 
 
 _WORDS: Final = {state: {aim: _word(state, aim) for aim in State} for state in State}
 
 
 class PowerWalk:
-    """Walks a drive through its states, one statusword in and one controlword out at a time.
+    """Walks a drive through its states, taking one statusword and returning one controlword at a time.
 
-    It has an aim and never invents one: a drive that leaves 'operation enabled' by itself is not enabled
-    again, and a fault is reset only when asked. A call that raises changes nothing.
+    It only pursues the aim it was given: a drive that leaves 'operation enabled' on its own is not enabled
+    again, and a fault is reset only on request. A call that raises changes nothing.
     """
 
     __slots__ = ("_aim", "_reset", "_state", "_was_enabled", "dropped")
@@ -220,9 +225,10 @@ class PowerWalk:
         self._reset = _NO_RESET
         self._was_enabled = False
         self.dropped: State | None = None
-        """State in which the drive was first seen after it left 'operation enabled' unasked.
+        """First state seen after the drive left 'operation enabled' without a command.
 
-        It stays until the next `go`, whatever the drive reports meanwhile."""
+        Kept until the next `go`, whatever the drive reports meanwhile.
+        """
 
     @property
     def state(self) -> State:
@@ -231,16 +237,16 @@ class PowerWalk:
 
     @property
     def aim(self) -> State:
-        """Where the walk is going."""
+        """Target state of the walk."""
         return self._aim
 
     @property
     def arrived(self) -> bool:
-        """Whether the drive is where the walk was going."""
+        """True if the drive is in the target state."""
         return self._state is self._aim
 
     def observe(self, statusword: int | None) -> State:
-        """Take a statusword, give its state."""
+        """Takes a statusword and returns its state."""
         state = _DECODED[statusword & _STATE_BITS] if statusword is not None else State.UNKNOWN
         self._state = state
         if state is _ENABLED:
@@ -248,7 +254,7 @@ class PowerWalk:
         elif self._was_enabled:
             self._was_enabled = False
             if self._aim is State.OPERATION_ENABLED:
-                # The drive dropped out on its own. It stays where it went until the next `go`.
+                # The drive dropped out on its own. It stays there until the next `go`.
                 self.dropped = state
                 blind = state in (State.QUICK_STOP_ACTIVE, State.UNKNOWN)
                 self._aim = State.QUICK_STOP_ACTIVE if blind else State.SWITCH_ON_DISABLED
@@ -257,14 +263,14 @@ class PowerWalk:
         return state
 
     def go(self, target: State) -> None:
-        """Aim at a state; `TransitionError` when no way leads there from the present one."""
+        """Sets the target state; raises `TransitionError` if no path leads there from the present state."""
         controlword_for(self._state, target)
         self._aim = target
         self.dropped = None
         self._was_enabled = self._state is State.OPERATION_ENABLED
 
     def quick_stop(self) -> None:
-        """Stop now: quick stop where power is on, disable voltage elsewhere. Always allowed."""
+        """Stops now: quick stop if power is on, else disable voltage. Always allowed."""
         self._aim = (
             State.QUICK_STOP_ACTIVE
             if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.UNKNOWN)
@@ -273,38 +279,40 @@ class PowerWalk:
         self._reset = _NO_RESET
 
     def reset_fault(self) -> None:
-        """Ask for one fault reset; `TransitionError` unless the drive is in 'fault'."""
+        """Requests one fault reset; raises `TransitionError` unless the drive is in 'fault'."""
         row_for(self._state, Command.FAULT_RESET)
         self._reset = _RESET_LOW
         self._aim = State.SWITCH_ON_DISABLED
 
     def controlword(self) -> int:
-        """The word to send now. Bits 4-6 and 8-15 are zero: the mode of operation adds its own."""
+        """Returns the word to send now. Bits 4-6 and 8-15 are zero: the mode of operation adds its own."""
         if self._reset == _RESET_LOW:
-            # Bit 7 acts on its rising edge, so it is sent low once before it is sent high.
+            # Bit 7 acts on its rising edge, so it is sent low once before high.
             self._reset = _RESET_HIGH
             return 0
         if self._reset == _RESET_HIGH:
             return Command.FAULT_RESET.word
         if self._aim is _QUICK_STOP and self._state is not _QUICK_STOP:
-            # Also blind, when nothing is known about the drive: a quick stop harms in no state.
+            # Also if nothing is known about the drive: a quick stop does no harm in any state.
             return Command.QUICK_STOP.word
         return _WORDS[self._state][self._aim]
 
 
 def states_on_the_way(state: State, target: State) -> Iterator[State]:
-    """The states from ``state`` to ``target``, both included; `TransitionError` when no way leads there."""
+    """Yields the states from ``state`` to ``target``, both included; raises `TransitionError` if there is no
+    path.
+    """
     yield state
     while state is not target:
         controlword_for(state, target)
         row = _FIRST_ROWS[state, target]
-        assert row is not None  # controlword_for has raised otherwise
+        assert row is not None  # otherwise controlword_for has raised
         state = row.target
         yield state
 
 
 def mermaid() -> str:
-    """The table as a Mermaid state diagram; docs/master.md holds its text."""
+    """Returns the table as a Mermaid state diagram, which docs/master.md contains."""
     lines = ["stateDiagram-v2"]
     lines += [f"    {state.name}: {state.value}" for state in State if state is not State.UNKNOWN]
     lines.append(f"    [*] --> {State.NOT_READY_TO_SWITCH_ON.name}")

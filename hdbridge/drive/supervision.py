@@ -1,9 +1,8 @@
-"""The fault table: what a fault in a control cycle leads to. Pure: no bus, no clock.
+"""The fault table: the reaction to each fault in a control cycle. Pure: no bus, no clock.
 
-The cycle says which faults it saw; the table says what follows. A stop is latched: only `Supervision.reset`
-leads back, and after a `Reaction.LATCH` only when everything about the drive has been verified again.
-
-The table is data. A fault with another reaction is another row, not an `if`.
+The cycle reports the faults it saw, and the table gives the reaction. A stop is latched: only
+`Supervision.reset` releases it, and after a `Reaction.LATCH` only when the drive has been fully verified
+again. The table is data. A fault with another reaction is another row, not an `if`.
 """
 
 from __future__ import annotations
@@ -18,20 +17,22 @@ from hdbridge.errors import RESET, SafetyStop
 
 
 class Reaction(IntEnum):
-    """What the cycle does, in rising order of severity."""
+    """Reaction of the cycle, in order of severity."""
 
     GO = 0
-    """Go on; the fault is counted."""
+    """Continue; the fault is counted."""
     FREEZE = 1
-    """Go on with the compensation's correction held: this cycle's feedback is the last good one."""
+    """Continue with the compensation's correction held, because this cycle's feedback is the
+    last good one.
+    """
     QUICK_STOP = 2
     """Command a quick stop until the drive reports it; latched."""
     LATCH = 3
-    """Send no more RPDOs; latched until the drive has been verified from identity to limits again."""
+    """Send no more RPDOs; latched until the drive has been verified again, from identity to limits."""
 
 
 class Fault(Enum):
-    """What can be wrong in one cycle."""
+    """Faults that a cycle can have."""
 
     LOST_TPDO = "a TPDO is missing"
     OVERRUN = "the cycle started too late"
@@ -59,14 +60,14 @@ class Fault(Enum):
 
 
 class Row(NamedTuple):
-    """One fault's reactions: ``first`` at once, ``then`` from the ``threshold``-th cycle in a row on."""
+    """Reactions to one fault: ``first`` at once, ``then`` from the ``threshold``-th consecutive cycle on."""
 
     fault: Fault
     first: Reaction
     threshold: int
     then: Reaction
     hint: str
-    """What a person does about it."""
+    """Advice to the user."""
 
 
 _GO, _FREEZE, _STOP, _LATCH = Reaction.GO, Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
@@ -107,14 +108,14 @@ ROWS: Final[dict[Fault, Row]] = {row.fault: row for row in TABLE}
 EVENTS_KEPT: Final = 1000
 EMERGENCIES_TOLD: Final = 3
 _BY_THE_DRIVE: Final = frozenset({Fault.DRIVE_FAULT, Fault.DROPPED_OUT, Fault.NMT_CHANGE})
-"""What a drive does by itself, and for reasons that it knows best."""
+"""Faults that the drive raises on its own; its emergency messages give the reason."""
 _EMERGENCIES: Final = frozenset({Fault.EMERGENCY, Fault.MASTER_LOST})
 EXPLAINED_HINT: Final = f"remove that cause, then reset the fault: {RESET}"
-"""What to do about a stop that an emergency message of the drive explains."""
+"""Advice for a stop that an emergency message of the drive explains."""
 
 
 class Event(NamedTuple):
-    """A fault as it was seen."""
+    """Occurrence of a fault."""
 
     cycle: int
     fault: Fault
@@ -122,7 +123,7 @@ class Event(NamedTuple):
     detail: str
 
     def __str__(self) -> str:
-        """``cycle 120: a TPDO is missing (282h): freeze``."""
+        """For example ``cycle 120: a TPDO is missing (282h): freeze``."""
         detail = f" ({self.detail})" if self.detail else ""
         return (
             f"cycle {self.cycle}: {self.fault.value}{detail}: {self.reaction.name.lower().replace('_', ' ')}"
@@ -130,9 +131,9 @@ class Event(NamedTuple):
 
 
 class Supervision:
-    """Judges each cycle by the table, keeps the latch and the list of everything seen.
+    """Judges each cycle by the table; keeps the latch and the log of events.
 
-    Memory is bounded: the newest `EVENTS_KEPT` events are kept, and the count of each fault.
+    Memory is bounded: the newest `EVENTS_KEPT` events and a count of each fault are kept.
     """
 
     __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "noted", "stop")
@@ -141,31 +142,31 @@ class Supervision:
         self._runs: dict[Fault, int] = {}
         self._frozen = False
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
-        """Every fault seen, oldest first."""
+        """Newest events, oldest first."""
         self.noted = 0
-        """How many were seen, those that are no longer kept included."""
+        """Number of all events, including those no longer kept."""
         self.counts: dict[Fault, int] = dict.fromkeys(Fault, 0)
-        """Cycles in which each fault was seen."""
+        """Number of cycles in which each fault was seen."""
         self.stop: Event | None = None
-        """What stopped the axis, the first cause, or None while it may run."""
+        """Event that stopped the axis first; None while it may run."""
         self.gravest: Event | None = None
-        """What decides how it is stopped: the first cause, or something graver that came of it."""
+        """Event that decides how the axis is stopped: the first cause, or a graver consequence of it."""
 
     @property
     def quiet(self) -> bool:
-        """Whether a cycle without faults would change nothing: `judge` need not be called for it."""
+        """True if a cycle without faults changes nothing, so that `judge` need not be called for it."""
         return not self._runs and self.stop is None
 
     @property
     def reaction(self) -> Reaction:
-        """The latched reaction; GO when nothing is latched."""
+        """The latched reaction; GO if nothing is latched."""
         return self.gravest.reaction if self.gravest is not None else Reaction.GO
 
     def judge(self, cycle: int, faults: Iterable[tuple[Fault, str]]) -> Reaction:
-        """The reaction to one cycle's faults, each with its detail for a person; none is a good cycle.
+        """Returns the reaction to one cycle's faults, each given with its detail; no faults is a good cycle.
 
-        Returns the latched reaction once there is one, however good the cycle was. Two cycles in a row
-        without usable feedback are a stop, whichever faults spoilt them.
+        Returns the latched reaction once there is one, however good the cycle was. Two consecutive cycles
+        without usable feedback cause a stop, whichever faults spoilt them.
         """
         previous, self._runs = self._runs, {}
         frozen, self._frozen = self._frozen, False
@@ -176,7 +177,7 @@ class Supervision:
         return max(worst, self.reaction)
 
     def also(self, cycle: int, fault: Fault, detail: str) -> Reaction:
-        """One more fault of the cycle that `judge` has judged: one that came of answering it."""
+        """Adds a fault to the cycle that `judge` has judged, one that arose from the reaction to it."""
         self._note(cycle, fault, detail, self._runs.get(fault, 0) + 1, frozen=False)
         return self.reaction
 
@@ -199,12 +200,12 @@ class Supervision:
         return reaction
 
     def since(self, noted: int) -> list[Event]:
-        """The events that came after ``noted`` had been seen, oldest first, as far as they are kept."""
+        """Returns the events after the first ``noted`` ones, oldest first, as far as they are kept."""
         new = min(self.noted - noted, len(self.events))
         return list(islice(self.events, len(self.events) - new, None)) if new > 0 else []
 
     def error(self) -> SafetyStop:
-        """The latched stop as the error to raise."""
+        """Returns the latched stop as the error to raise."""
         stop, gravest = self.stop, self.gravest
         assert stop is not None, "there is no stop to report"
         assert gravest is not None
@@ -221,7 +222,7 @@ class Supervision:
         )
 
     def _emergencies(self, since_cycle: int) -> list[str]:
-        """The first emergencies that came with the stop: the drive's own explanation of it."""
+        """Returns the first emergencies that came with the stop: the drive's own explanation of it."""
         said = [
             event.detail
             for event in self.events
@@ -230,9 +231,10 @@ class Supervision:
         return list(dict.fromkeys(said))[:EMERGENCIES_TOLD]
 
     def reset(self, *, verified: bool = False) -> None:
-        """Release the latch. After a LATCH, ``verified`` states that the drive was booted and verified again.
+        """Releases the latch.
 
-        Raises `SafetyStop` and changes nothing when that was needed and not done. Events are kept.
+        After a LATCH, ``verified`` must state that the drive was booted and verified again; otherwise raises
+        `SafetyStop` and changes nothing. Events are kept.
         """
         if self.reaction is Reaction.LATCH and not verified:
             raise self.error()

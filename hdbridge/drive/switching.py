@@ -1,4 +1,4 @@
-"""Power in the control cycle: waiting until it is on; the states in which an axis may be at rest."""
+"""Power in the control cycle: waiting for enable, and the states in which an axis may be at rest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ STANDING: Final = (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.READ
 
 
 def until_enabled(tick: Callable[[], Feedback], power: PowerWalk, period_s: float) -> Feedback:
-    """Cycle until operation is enabled: that cycle's feedback. `TransitionError` where it takes too long."""
+    """Cycles until operation is enabled and returns that cycle's feedback; raises `TransitionError` on
+    time-out.
+    """
     for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s)):
         feedback = tick()
         if power.state is State.OPERATION_ENABLED:

@@ -1,4 +1,4 @@
-"""Frames that are no PDO of the cycle: what they say of the nodes, and of somebody else on the bus."""
+"""Frames that are not PDOs of the cycle: node status, and signs of another master on the bus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _NODE_MASK: Final = 0x7F
 _MASTER_LOST: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT)
-"""Emergency codes of a drive that has stopped because it missed its master."""
+"""Emergency codes of a drive that stopped because it missed its master."""
 _STATES: Final[dict[int, str]] = {
     NmtState.STOPPED: " (stopped)",
     NmtState.PRE_OPERATIONAL: " (pre-operational)",
@@ -24,7 +24,10 @@ _STATES: Final[dict[int, str]] = {
 
 
 def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
-    """What a frame says that only the one master of a bus sends; ``heartbeat_id`` is its heartbeat's."""
+    """Returns the fault for each frame that only the single master of a bus sends.
+
+    ``heartbeat_id`` is the identifier of its heartbeat.
+    """
     return {
         COB_SYNC: (Fault.FOREIGN_SYNC, ""),
         heartbeat_id: (Fault.OWN_ID_ELSEWHERE, f"{heartbeat_id:03X}h, the master's heartbeat"),
@@ -50,14 +53,14 @@ class Traffic:
         self.identifiers: frozenset[int] = frozenset(
             (*self._own, *(base + node_id for node_id in self._nodes for base in (COB_EMCY, COB_HEARTBEAT)))
         )
-        """Identifiers of the frames that say something of this axis."""
+        """Identifiers of the frames that concern this axis."""
         self.heard_s = now_s
-        """When the drive's last heartbeat came."""
+        """Time of the drive's last heartbeat; s."""
 
     def faults(self, frame: Frame, *, commanded: bool) -> Iterator[tuple[Fault, str]]:
-        """Faults that a frame reports, each with its detail for a person.
+        """Yields the faults that a frame reports, each with its detail for a message.
 
-        ``commanded``: the drive is enabled on this master's behalf, and is to follow set-points.
+        ``commanded``: the drive is enabled by this master and is to follow set-points.
         """
         can_id, data, time_s = frame
         if self._monitor.dispatch(frame):

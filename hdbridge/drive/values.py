@@ -1,4 +1,4 @@
-"""Values of objects as a person writes them, by the type that the EDS gives the object."""
+"""Conversion of object values between bytes and text, by the type given in the EDS."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _TEXTS = {datatypes.VISIBLE_STRING: "text", datatypes.UNICODE_STRING: "unicode t
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """An entry of a node's dictionary: what it is called, and what it may hold."""
+    """Entry of a node's object dictionary: name, type, access and limits."""
 
     index: int
     sub: int
     name: str
     data_type: int
-    """Number of the type in the EDS; 0 where only the profile knows the object."""
+    """Number of the type in the EDS; 0 if only the profile knows the object."""
     integer: IntegerType | None
     readable: bool = True
     writable: bool = True
@@ -40,7 +40,7 @@ class Object:
 
     @property
     def type_name(self) -> str:
-        """For example int32."""
+        """Name of the type, for example int32."""
         if self.integer is not None:
             return self.integer.value
         if self.data_type == datatypes.BOOLEAN:
@@ -53,7 +53,9 @@ class Object:
         return f"{self.index:04X}h:{self.sub:02X}" + (f" '{self.name}'" if self.name else "")
 
     def decode(self, data: bytes) -> Value:
-        """What the bytes say; InputError where they are not of the type. Raw bytes as hexadecimal."""
+        """Decodes a value; unknown types become hexadecimal text. Raises `InputError` if the bytes do not fit
+        the type.
+        """
         try:
             if self.integer is not None:
                 return self.integer.decode(_fitting(data, self.integer.bits // 8))
@@ -74,7 +76,7 @@ class Object:
         return data.hex(" ")
 
     def encode(self, text: str) -> bytes:
-        """The bytes of a value as it is written; InputError where it is none of the type, or out of range."""
+        """Encodes a value written as text; raises `InputError` if it is not of the type or out of range."""
         if self.integer is not None:
             return self.integer.encode(self._integer(text, self.integer))
         if self.data_type == datatypes.BOOLEAN:
@@ -116,9 +118,9 @@ class Object:
 
 
 def find_object(text: str, od: ObjectDictionary) -> Object:
-    """An object by its number (6064h, 0x1018:4, 60C2h:01) or its name in the EDS; InputError where it is not.
+    """Returns an object by its number (6064h, 0x1018:4, 60C2h:01) or its name in the EDS.
 
-    A sub-index is hexadecimal, as manuals have it.
+    A sub-index is hexadecimal, as in manuals. Raises `InputError` if there is no such object.
     """
     number = re.fullmatch(r"(?:0[xX])?([0-9a-fA-F]{4})[hH]?(?:[:.](?:0[xX])?([0-9a-fA-F]{1,2})[hH]?)?", text)
     known = {_name(each): each for each in _variables(od)}
@@ -170,7 +172,7 @@ def _name(variable: ODVariable) -> str:
 
 
 def _fitting(data: bytes, size: int) -> bytes:
-    """An expedited answer may have more bytes than the type, all of one sign."""
+    """Cuts an expedited answer to ``size`` bytes; extra bytes must only repeat the sign."""
     if len(data) < size or any(each not in {0, 0xFF} for each in data[size:]):
         raise ValueError(f"{len(data)} bytes ({data.hex(' ')})")
     return data[:size]

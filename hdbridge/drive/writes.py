@@ -1,6 +1,6 @@
-"""What the boot-up writes into the drive, as a list that a person can read before it happens. Pure.
+"""Writes of the boot-up, as a list that can be reviewed before it is carried out. Pure.
 
-Every row says which object gets which value, why, and which field of the axis file it comes from. The
+Every row gives the object, its value, the reason, and the field of the axis file that it comes from. The
 boot-up reads each object first, writes those that hold another value, in this order, and reads them back.
 `hdbridge.drive.bootplan` leaves objects that are optional in CiA 402 to a drive that lacks them.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SYNCHRONOUS: Final = 1
 """Transmission type: sent, or put into force, at every SYNC."""
 RPDO_TIMEOUT_CYCLES: Final = 4
-"""The drive gives up on the master after this many cycles without a set-point (and not before 10 ms)."""
+"""Cycles without a set-point after which the drive stops (but not before 10 ms)."""
 _COB_COMPARED: Final = PDO_INVALID | 0x7FF
 _EVERYTHING: Final = -1
 _EXPONENTS: Final = (-3, -4, -2, -5, -6, -1, 0)
@@ -38,7 +38,7 @@ _LARGEST_MANTISSA: Final = 255
 
 @dataclass(frozen=True, slots=True)
 class PlannedWrite:
-    """The value that one object is to hold."""
+    """Value that one object is to hold."""
 
     node_id: int
     index: int
@@ -46,39 +46,39 @@ class PlannedWrite:
     value: int
     why: str
     field: str = ""
-    """Field of the axis file that decides the value; empty where none does."""
+    """Field of the axis file that decides the value; empty if none does."""
     type: IntegerType | None = None
-    """Integer type; None where the EDS or the profile says it."""
+    """Integer type; None if the EDS or the profile gives it."""
     compared: int = _EVERYTHING
-    """Bits that must read back as written."""
+    """Mask of the bits that must read back as written."""
     kept: int = 0
-    """Bits that stay as the drive has them."""
+    """Mask of the bits that keep the drive's value."""
     composed: bool = False
-    """Several numbers in one object. The limits of the EDS are ignored: vendors give those of one number."""
+    """Several numbers in one object. The EDS limits are ignored, because vendors give those of one number."""
     without: str = ""
-    """What follows if the drive keeps a value of its own; empty if hdbridge cannot do without this one."""
+    """Consequence if the drive keeps its own value; empty if hdbridge requires this value."""
     exact: bool = False
-    """A drive that has the object has to hold this value."""
+    """True if a drive that has the object must hold exactly this value."""
     pdo: int = 0
-    """Communication parameter of the PDO that the row configures; such rows stand together."""
+    """Communication parameter of the PDO that the row configures; the rows of a PDO are consecutive."""
     passing: bool = False
-    """The object holds the value only while its PDO is changed."""
+    """True if the object holds the value only while its PDO is being changed."""
 
     def __str__(self) -> str:
-        """``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
+        """For example ``605Ah:00 = 6 (6h): what a quick stop does [drive.quick_stop_option]``."""
         source = f" [{self.field}]" if self.field else ""
         return f"{self.index:04X}h:{self.sub:02X} = {self.value} ({self.value:X}h): {self.why}{source}"
 
     def holds(self, found: int) -> bool:
-        """Whether an object that holds ``found`` needs no write."""
+        """Returns True if an object with the value ``found`` needs no write."""
         return found & self.compared == self.value & self.compared
 
 
 def rows(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> list[PlannedWrite]:
-    """All writes in order, whether or not the drive has the objects.
+    """Returns all writes in order, whether or not the drive has the objects.
 
-    Those of the PDOs and of the cycle are what the drive can have by ``od``. Raises `InputError` if a value
-    of the axis file cannot be expressed in its object.
+    The rows of the PDOs and of the cycle depend on what ``od`` permits. Raises `InputError` if a value of the
+    axis file cannot be expressed in its object.
     """
     return [*_heartbeats(axis), *_pdos(axis, od, pdos), *_cycle(axis, od), *_options(axis), *_limits(axis)]
 
@@ -106,22 +106,24 @@ def _row(
 
 
 def master_heartbeat(axis: AxisConfig) -> int:
-    """Value of 1016h: whose heartbeat the drive watches, and for how long it may stay away."""
+    """Returns the value of 1016h: the master's node id and its heartbeat time-out, ms."""
     return axis.drive.master_node_id << 16 | axis.drive.heartbeat_ms
 
 
 def set_point_timeout_ms(axis: AxisConfig) -> int:
-    """Value of 1400h:05: for how long set-points may stay away."""
+    """Returns the value of 1400h:05: the time without set-points after which the drive stops, ms."""
     return max(math.ceil(RPDO_TIMEOUT_CYCLES * axis.drive.cycle_ms), 10)
 
 
 def drives_patience_s(axis: AxisConfig) -> float:
-    """For how long a drive with all its watchdogs waits for a silent master before it stops by itself."""
+    """Returns the time after which a drive with all its watchdogs stops on its own if the master is silent;
+    s.
+    """
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
 
 _WATCHDOGS: Final = frozenset({(0x1016, 1), (0x1400, 5)})
-"""The heartbeat consumer, and the event timer of the set-points."""
+"""Objects of the watchdogs: heartbeat consumer, and event timer of the set-points."""
 
 
 def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
@@ -178,7 +180,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
 
 
 def _carried(axis: AxisConfig, layout: Layout) -> list[str]:
-    """The key of the axis file that chose each entry of a PDO; empty where none did."""
+    """Returns the key of the axis file that chose each entry of a PDO; empty if none did."""
     encoder = axis.load_encoder.source
     keys = {(encoder.index, encoder.subindex): "load_encoder.source"}
     for key, channel in axis.channels.items():
@@ -206,9 +208,9 @@ def _invalid(
 
 
 def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) -> Iterator[PlannedWrite]:
-    """The order that CiA 301 prescribes: invalid, empty, entries, count, valid.
+    """Yields the rows of one PDO in the order of CiA 301: invalid, empty, entries, count, valid.
 
-    ``fields`` are the keys of the axis file that chose the entries, empty where none did.
+    ``fields`` are the keys of the axis file that chose the entries, empty if none did.
     """
     node_id, number, can_id, codec, every, _ = layout
     field = next(filter(None, fields), "")
@@ -245,7 +247,7 @@ def _pdo(layout: Layout, communication: int, mapping: int, fields: list[str]) ->
         "drive.node_id" if not field else "",
         word,
         compared=_COB_COMPARED,
-        # Bit 30 says that the PDO cannot be asked for by RTR; some drives insist on it.
+        # Bit 30 forbids requests of the PDO by RTR; some drives insist on it.
         kept=0x4000_0000,
     )
 
@@ -263,7 +265,9 @@ def _cycle(axis: AxisConfig, od: ObjectDictionary | None) -> Iterator[PlannedWri
 
 
 def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
-    """Mantissa and exponent of the cycle as the drive takes them: some have a fixed exponent or period."""
+    """Returns mantissa and exponent of the cycle that the drive accepts; some have a fixed exponent or
+    period.
+    """
     seconds = Decimal(repr(axis.drive.cycle_ms)) / 1000
     pairs = [(seconds.scaleb(-exponent), exponent) for exponent in _EXPONENTS]
     whole = [(int(m), e) for m, e in pairs if m == int(m) and 1 <= m <= _LARGEST_MANTISSA]
@@ -286,7 +290,7 @@ def _period(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[int, int]:
 
 
 def permitted(variable: ODVariable, kind: IntegerType) -> tuple[int, int]:
-    """Least and greatest value of an object by its type and its limits in the EDS."""
+    """Returns the least and greatest value of an object by its type and its limits in the EDS."""
     low = kind.minimum if variable.min is None else max(kind.minimum, variable.min)
     high = kind.maximum if variable.max is None else min(kind.maximum, variable.max)
     return low, high
@@ -324,7 +328,7 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
     limits, drive = axis.limits, axis.drive
     least, greatest = position_limits_counts(axis)
     margin = f"at the load, x ratio, wider by the compensation's {axis.compensation.maximum_arcsec:g} arcsec"
-    # A reversed encoder makes the axis's lower end the drive's upper one; the counts are in order already.
+    # A reversed encoder makes the axis's lower end the drive's upper one; the counts are already in order.
     ends = ["limits.position_min_deg", "limits.position_max_deg"][:: axis.motor_encoder.direction]
     window = round(abs(axis.motor_encoder.counts(drive.following_error_deg)))
     if window == 0:
@@ -367,5 +371,5 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
 
 
 def motor_rate(axis: AxisConfig, load_deg: float) -> int:
-    """A speed or acceleration at the load in whole motor counts (per s or s2), at least 1."""
+    """Converts a speed or acceleration at the load to whole motor counts (per s or s2), at least 1."""
     return max(round(abs(axis.motor_encoder.counts(load_deg * axis.gear.ratio))), 1)
