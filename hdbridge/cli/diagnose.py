@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from hdbridge.cli.flights import AxisOption, FromOption, ToOption, is_flight, read_flights, remarks
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
@@ -44,16 +45,24 @@ def register(app: typer.Typer) -> None:
 def run(
     records: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="RECORD...", help="CSV files or recording folders, in their order."),
+        typer.Argument(
+            metavar="RECORD...",
+            help="CSV files, recording folders, or flight recordings (MCAP files or their folder), in their "
+            "order.",
+        ),
     ] = None,
     model: Annotated[
         str | None,
         typer.Option(
             "--model",
             metavar="MODEL.yaml|PROFILE",
-            help="The model that is put to the test, or the profile whose active one is.",
+            help="Model to test, or the profile whose active model is tested. Default for flight recordings: "
+            "the model that the axis used at their end.",
         ),
     ] = None,
+    axis: AxisOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
@@ -90,15 +99,25 @@ def run(
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render
 
-    if model is None:
+    flights = [each for each in records or () if is_flight(each)]
+    if not flights and (
+        name := next((n for n, t in (("--axis", axis), ("--from", begin), ("--to", end)) if t), "")
+    ):
+        raise InputError(f"{name} is for flight recordings; expected an MCAP file or a folder of them")
+    flown, used = read_flights(flights, axis, begin, end) if flights else (None, None)
+    if model is None and used is not None and used.text:
+        path = flights[0] / f"model {used.version}"
+        known = TransmissionModel.from_text(used.text, path)
+    elif model is None:
         given = shlex.join(map(str, records)) if records else "RECORD"
         raise InputError(
             "--model is missing: the records are compared with a model; fit one, hdbridge fit "
             f"{given} --ratio N --out model.yaml, and pass --model model.yaml, or pass the profile of an "
             "axis that was calibrated, --model PROFILE"
         )
-    path = model_file(model)
-    known = TransmissionModel.load(path)
+    else:
+        path = model_file(model)
+        known = TransmissionModel.load(path)
     if plan is not None:
         if records:
             raise InputError("--plan looks at a plan before anything is measured; leave the records out")
@@ -108,7 +127,11 @@ def run(
         return
     if not records:
         raise InputError("no record; name CSV files or recording folders, or a plan with --plan")
-    recordings = load_recordings(records, columns, units, unwrap)
+    recordings = load_recordings([each for each in records if each not in flights], columns, units, unwrap)
+    if flown is not None:
+        recordings[flights[0]] = flown
+        for each in remarks(flown):
+            notes.print(each)
     result = diagnose(
         recordings,
         known,
@@ -118,6 +141,8 @@ def run(
     recording = Recording.joined(list(recordings.values()))
     options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
     said = [word for name, texts in options.items() for text in texts or () for word in (name, text)]
+    single = {"--model": model, "--axis": axis, "--from": begin, "--to": end}
+    said += [word for name, text in single.items() if text for word in (name, text)]
     document = result.as_dict()
     # Files first: who reads the tables may have had enough of them (`| head`).
     write_json(json_file, document)
@@ -126,7 +151,7 @@ def run(
             result,
             title=_title(recording, records),
             provenance=_provenance(recording, records, path),
-            command=shlex.join(["hdbridge", "diagnose", *map(str, records), "--model", model, *said]),
+            command=shlex.join(["hdbridge", "diagnose", *map(str, records), *said]),
         )
         write_result(html_file, render(page))
     if extend is not None:

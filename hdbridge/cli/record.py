@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from hdbridge.cli.flights import AxisOption, FromOption, ToOption, need_extra, read_flights, remarks
 from hdbridge.cli.options import JsonOption, console, notes, print_table, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
@@ -18,10 +18,9 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.recorder.reading import Flight, Overview
+    from hdbridge.daemon.recorder.reading import Overview
     from hdbridge.records.recording import Recording
 
-_EXTRA = ("mcap", "google.protobuf")
 _NS = 10**9
 
 FlightsArgument = Annotated[
@@ -58,7 +57,7 @@ def register(app: typer.Typer) -> None:
 
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
     """List recordings: from when to when, how large, and what stopped an axis in them."""
-    _need_extra()
+    need_extra()
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
     found = list(each_flight(flights, overview))
@@ -82,7 +81,7 @@ def info(
     json_file: JsonOption = None,
 ) -> None:
     """Tell what a recording holds: machine, axes, models, cycles that are missing, events."""
-    _need_extra()
+    need_extra()
     import numpy as np
 
     from hdbridge.daemon.recorder.reading import read
@@ -134,7 +133,7 @@ def mend(flights: FlightsArgument) -> None:
 
     The daemon does this itself when it starts. One that is being written is refused.
     """
-    _need_extra()
+    need_extra()
     from hdbridge.daemon.recorder import mend as mending
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
@@ -150,17 +149,10 @@ def mend(flights: FlightsArgument) -> None:
 
 def export(
     flights: FlightsArgument,
-    axis: Annotated[
-        str | None, typer.Option("--axis", metavar="NAME", help="Which axis, where there are several.")
-    ] = None,
+    axis: AxisOption = None,
     out: OutOption = None,
-    begin: Annotated[
-        str | None,
-        typer.Option(
-            "--from", metavar="TIME", help="From this time on, ISO 8601, UTC unless it says otherwise."
-        ),
-    ] = None,
-    end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Up to this time.")] = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     all_states: AllStatesOption = False,
     model: Annotated[
         Path | None,
@@ -175,26 +167,8 @@ def export(
     Nothing is rounded or interpolated. Where cycles are missing, or the axis was not enabled, a new part
     begins: a recording folder has a file for each part. Of a CSV file there can be only one part.
     """
-    _need_extra()
-    from hdbridge.daemon.recorder.export import axis_of, exported, last_model
-    from hdbridge.daemon.recorder.reading import each_flight, overview, read
-
     out = _checked_out(out)
-    limits = (_time_ns(begin, "--from"), _time_ns(end, "--to"))
-
-    def wanted(path: Path) -> Flight | None:
-        about = overview(path)
-        if _outside(about, *limits):
-            return None
-        return read(about.path, (axis_of(about.about, axis, path)[1].name,))
-
-    found = [each for each in each_flight(flights, wanted) if each is not None]
-    if not found:
-        raise InputError(f"{flights[0]}: nothing was recorded between --from and --to")
-    found.sort(key=lambda each: each.first_ns)
-    recording = exported(found, axis, all_states=all_states, start_ns=limits[0], end_ns=limits[1])
-    assert recording.axis is not None
-    used = last_model(found, recording.axis)
+    recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
     if model is not None and (used is None or not used.text):
         raise InputError(f"{flights[0]}: no model was in use; leave out --model-out")
     _write(recording, out)
@@ -250,22 +224,14 @@ def _write(recording: Recording, out: Path) -> None:
 
 
 def _print_export(recording: Recording, out: Path) -> None:
-    record, about = recording.record, recording.notes
-    parts = about["parts"]
+    record, parts = recording.record, recording.notes["parts"]
     lengths = [float(each.time_s[-1] - each.time_s[0]) for each in record.parts()]
     _say(
         f"{out}: axis '{recording.axis}', {len(record)} samples in {parts} "
         f"part{'s' * (parts != 1)}, {sum(lengths):.1f} s"
     )
-    if count := about.get("cycles_missing_within_parts"):
-        notes.print(f"{count} cycles are missing within parts: the time goes on over them")
-    if count := about.get("parts_too_short"):
-        notes.print(f"{count} parts were too short and are left out")
-    if about.get("zeros_may_differ"):
-        notes.print(
-            "the drive was booted or homed meanwhile: where its encoders' zeros are lost with that, say "
-            "--independent-zeros to fit and diagnose"
-        )
+    for each in remarks(recording):
+        notes.print(each)
 
 
 def _checked_out(out: Path | None) -> Path:
@@ -282,38 +248,6 @@ def _checked_out(out: Path | None) -> Path:
 
 def _is_csv(path: Path) -> bool:
     return path.name.endswith((".csv", ".csv.gz"))
-
-
-def _outside(about: Overview, begin_ns: int | None, end_ns: int | None) -> bool:
-    return (begin_ns is not None and about.last_ns < begin_ns) or (
-        end_ns is not None and about.first_ns > end_ns
-    )
-
-
-def _need_extra() -> None:
-    """InputError where what reads recordings is not installed."""
-    lacking = [name for name in _EXTRA if not _found(name)]
-    if lacking:
-        raise InputError(
-            f"flight recordings need {', '.join(lacking)}: python -m pip install 'hdbridge[daemon]'"
-        )
-
-
-def _found(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False
-
-
-def _time_ns(text: str | None, option: str) -> int | None:
-    if text is None:
-        return None
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        raise InputError(f"{option}: found '{text}'; expected a time such as 2026-03-01T12:30:00") from None
-    return round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * _NS)
 
 
 def _date(time_ns: int) -> datetime:

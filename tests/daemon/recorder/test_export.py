@@ -178,6 +178,41 @@ def test_the_command_makes_a_record_that_diagnose_names_the_change_in(worked, tm
     ]
 
 
+def test_diagnose_takes_flight_recordings_with_the_model_in_use_and_a_time(worked, tmp_path):
+    result = tmp_path / "result.json"
+    for paths, limits in (
+        ([str(worked)], []),
+        ([str(each) for each in sorted(worked.rglob("*.mcap"))], ["--axis", "demo", "--from", "2026-01-01"]),
+    ):
+        done = command("diagnose", *paths, *limits, "--json", str(result))
+        assert done.returncode == 0, done.stderr
+        assert [each["cause"] for each in json.loads(result.read_text())["findings"]] == [
+            "motor_encoder_eccentricity"
+        ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--axis", "nose"], "no axis 'nose'"),
+        (["--to", "2020-01-01"], "nothing was recorded between"),
+        (["--from", "noon"], "--from: found 'noon'"),
+    ],
+)
+def test_diagnose_refuses_an_axis_or_a_time_that_the_flight_does_not_have(worked, arguments, complaint):
+    done = command("diagnose", str(worked), *arguments)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert complaint in done.stderr
+
+
+def test_diagnose_refuses_options_of_flight_recordings_for_other_records(tmp_path):
+    (tmp_path / "bench.csv").write_text("time_s,motor_position_deg,load_position_deg\n")
+    done = command("diagnose", str(tmp_path / "bench.csv"), "--to", "2026-01-01", "--model", "article")
+    assert done.returncode == 2
+    assert "--to is for flight recordings" in done.stderr
+
+
 def test_the_command_lists_and_tells(worked, tmp_path):
     done = command("record", "list", str(worked))
     assert done.returncode == 0
@@ -219,7 +254,7 @@ def test_bad_input_is_one_line_and_status_2(worked, tmp_path):
 
 
 def test_without_the_extra_it_says_what_to_install(worked, tmp_path, monkeypatch):
-    monkeypatch.setattr("hdbridge.cli.record._EXTRA", ("mcap", "no_such_package"))
+    monkeypatch.setattr("hdbridge.cli.flights._EXTRA", ("mcap", "no_such_package"))
     done = command("record", "list", str(worked))
     assert done.returncode == 2
     assert "pip install 'hdbridge[daemon]'" in done.stderr
