@@ -1,1 +1,1 @@
-"""The control process: one thread, one bus, one turn a period."""
+"""The control process: one thread, one bus, one turn per cycle."""

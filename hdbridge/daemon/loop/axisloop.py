@@ -1,8 +1,8 @@
-"""One axis in the control loop: its state, the commands that it takes, what it tells.
+"""One axis in the control loop: its state, the commands it accepts and the events it reports.
 
-`AxisLoop.command` takes the service's commands, between two turns. `AxisCycle` asks for a target in each
-turn in which the drive is enabled; whom it asks (`_enabling`, `Follower.follow` or nobody) changes with the
-state, so that the turn itself decides nothing. `AxisLoop.after` looks at what the turn has left behind.
+`AxisLoop.command` takes the service's commands between two turns. `AxisCycle` asks for a target in each turn
+in which the drive is enabled. The state decides who answers (`_enabling`, `Follower.follow` or nobody), so
+the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _UNDER_COMMAND: Final = (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPI
 
 
 class AxisLoop:
-    """One axis; silent and unverified until the service says that its drive is verified."""
+    """One axis. It sends nothing and is unverified until the service reports that its drive was verified."""
 
     def __init__(self, index: int, setup: AxisSetup, knots: KnotQueue, slot: SettingSlot, tell: Tell) -> None:
         config = setup.config
@@ -47,9 +47,9 @@ class AxisLoop:
         self.follower = Follower(setup, self.image)
         self.set_point = self.follower.set_point
         self.group: frozenset[int] = frozenset()
-        """The axes (indices) that its stream began with; they stop when it does."""
+        """Indices of the axes that began the same stream; they stop when this one does."""
         self.broken: frozenset[int] = frozenset()
-        """The group of a stream that this axis has left before its end: the others are to stop."""
+        """Group whose stream this axis left before its end; the controller stops the others."""
 
         self._slot, self._tell = slot, tell
         slot.use(0)
@@ -60,18 +60,18 @@ class AxisLoop:
         self._sampler = AxisSampler(self.cycle, self.follower)
         self._changing = self._underrun = False
         self._doubt = ""
-        """Last states reported of the change of compensation, the stream and the load loop."""
+        """Last reported states of the compensation change, the stream underrun and the load loop."""
         self._enable_id = self._disable_id = self._motion_id = 0
         self._mode = MotionMode.HOLD
         self._powering_off = False
         self._left = 0
-        """Turns until the drive has taken too long."""
+        """Turns left before the drive's time-out."""
         self._why = ""
-        """Why the axis stops, where that is no fault of the supervision's."""
+        """Reason for stopping, if the supervision did not report one."""
         self.stands = True
-        """A stop is over, and told; never False but in QUICK_STOPPED and LATCHED."""
+        """The axis stands and the stop was reported; False only in QUICK_STOPPED and LATCHED."""
         self._place = self._still = 0
-        """Motor counts of the last turn of a stop, and turns without a change."""
+        """Motor counts in the last turn of a stop, and the number of turns without a change."""
         self._handlers: dict[CommandKind, Callable[[Command], None]] = {
             CommandKind.VERIFIED: self._verified,
             CommandKind.RELEASE: self._silence,
@@ -92,7 +92,7 @@ class AxisLoop:
     # ---------------------------------------------------------------- commands, between two turns
 
     def command(self, command: Command) -> None:
-        """Carry a command out, or refuse it and change nothing; either is told."""
+        """Carries out a command, or refuses it and changes nothing; reports either to the service."""
         try:
             kind = CommandKind(command.kind)
             self.check(kind)
@@ -110,25 +110,25 @@ class AxisLoop:
         self._enter(target)
 
     def check(self, kind: CommandKind) -> None:
-        """TransitionError where a command is not possible in the present state."""
+        """Raises TransitionError if a command is not possible in the present state."""
         if target_of(self.state, kind) is None:
             raise TransitionError(f"{self.config.name}: {refusal(self.state, kind)}")
 
     def begin_stream(self, command: Command, group: frozenset[int]) -> None:
-        """Follow knots from the next turn on, together with the other axes of ``group``.
+        """Follows knots from the next turn on, together with the other axes of ``group``.
 
-        InputError in motion, or for a bad time-out.
+        Raises InputError if the axis is in motion or the time-out is invalid.
         """
         self._feed.begin(command.j, command.a)
         self._motion_id = command.id
         self.group = group
 
     def stop(self) -> None:
-        """Brake to rest within the limits."""
+        """Brakes to rest within the limits."""
         self.set_point.stop()
 
     def verification_lost(self) -> None:
-        """The bus is down: an axis that is lent has to be verified again, too."""
+        """Handles a bus failure: the drive must be verified again, even if it is lent."""
         self._why = "the bus went down while the axis was lent"
         self._happened(Happening.VERIFICATION_LOST)
 
@@ -137,7 +137,7 @@ class AxisLoop:
             self._tell(self.index, EventKind.DONE, id_, 0)
 
     def _happened(self, cause: Cause) -> bool:
-        """Go where ``cause`` leads; whether that is somewhere else."""
+        """Makes the transition for ``cause``; returns True if the state changed."""
         target = target_of(self.state, cause)
         if target is None or target is self.state:
             return False
@@ -145,7 +145,7 @@ class AxisLoop:
         return True
 
     def _enter(self, state: AxisState) -> None:
-        """What is always true of a state when it is entered."""
+        """Enters a state: switches power off, quick-stops or ends motion, and answers waiting commands."""
         before = self.state
         if state is before:
             return
@@ -155,7 +155,7 @@ class AxisLoop:
         if state not in _UNDER_COMMAND:
             self._stand()
         if state in (AxisState.QUICK_STOPPED, AxisState.LATCHED):
-            self.image.power.quick_stop()  # whatever it aimed at: nothing leads back to power but ENABLE
+            self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
             self.stands = False
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
@@ -163,7 +163,7 @@ class AxisLoop:
         self._answer_waiting(state)
 
     def _answer_waiting(self, state: AxisState) -> None:
-        """Who waits for power on or off learns what came of it."""
+        """Answers pending ENABLE and DISABLE commands."""
         if self._enable_id and state is not AxisState.ENABLING:
             if state is AxisState.ENABLED:
                 self._done(self._enable_id)
@@ -176,7 +176,7 @@ class AxisLoop:
             self._refuse_waiting(CommandKind.DISABLE, self._stop_words())
 
     def _refuse_waiting(self, kind: CommandKind, why: str) -> None:
-        """What was begun and not answered yet has come to nothing."""
+        """Refuses a pending ENABLE or DISABLE command."""
         if kind is CommandKind.ENABLE:
             id_, self._enable_id = self._enable_id, 0
         else:
@@ -185,7 +185,7 @@ class AxisLoop:
             self._tell(self.index, EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
-        """Nothing is followed any more."""
+        """Ends all following of set-points."""
         self.cycle.command = None
         self._powering_off = False
         self._mode = MotionMode.HOLD
@@ -194,7 +194,7 @@ class AxisLoop:
         self.set_point.reset(self.set_point.position_deg)
 
     def _break_group(self) -> None:
-        """It does not go on with the others."""
+        """Leaves the group of a coordinated move, which the controller then stops."""
         if self.group:
             self.broken, self.group = self.group, frozenset()
 
@@ -244,7 +244,7 @@ class AxisLoop:
         if self.state in (*_UNDER_COMMAND, AxisState.LENT):
             self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
-            # What the service does by SDO is overruled by the next RPDO.
+            # The next RPDO overrides what the service does by SDO.
             self.image.power.quick_stop()
             self.cycle.begin()
 
@@ -264,7 +264,7 @@ class AxisLoop:
         velocity = None if math.isnan(command.b) else command.b
         acceleration = None if math.isnan(command.c) else command.c
         self.set_point.goto(command.a, velocity, acceleration)
-        # One to where it stands is over within a turn, and its end is told, too.
+        # A move to the present position ends within a turn; its end is reported as well.
         self._motion_id, self._mode = command.id, MotionMode.GOTO
 
     def _jog(self, command: Command) -> None:
@@ -290,7 +290,7 @@ class AxisLoop:
         try:
             power.go(State.SWITCH_ON_DISABLED)
         except TransitionError:
-            power.quick_stop()  # out of a fault nothing leads but a reset; at least it aims at no power
+            power.quick_stop()  # only a reset leads out of a fault; this at least aims for no power
 
     def _power_off(self) -> None:
         self.cycle.command = None
@@ -299,7 +299,7 @@ class AxisLoop:
         self._aim_off()
 
     def _enabling(self, feedback: Feedback) -> int | None:
-        """Operation is enabled: stand until every channel has told something, then begin from here."""
+        """Holds position until every channel has a value, then follows from the actual position."""
         waiting = [each for each in self.image.channels if each.value is None]
         if waiting and waiting[0].lost:
             self._why = (
@@ -316,14 +316,14 @@ class AxisLoop:
     # ---------------------------------------------------------------- before and after each turn
 
     def before(self) -> None:
-        """What is to be ready when the turn begins: the next knots of a stream."""
+        """Prepares the turn: feeds the next knots of a stream to the set-point."""
         refusal_ = self._feed.feed()
         if refusal_ is not None:
             self._tell(self.index, EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
             self._break_group()
 
     def after(self) -> None:
-        """Look at what the turn has left behind."""
+        """Evaluates the turn: reports faults and ended motions, and makes the resulting transitions."""
         self._faults.tell()
         supervision = self.supervision
         if supervision.stop is not None:
@@ -390,7 +390,7 @@ class AxisLoop:
         self._happened(Happening.OVERDUE)
 
     def _after_stop(self) -> None:
-        """A stop is told in full when the axis stands, or when the time for that is over."""
+        """Reports a stop once the axis stands or the time for stopping has passed."""
         if self.supervision.stop is None and self.state is AxisState.QUICK_STOPPED:
             if not self._obeyed():
                 return
@@ -405,7 +405,7 @@ class AxisLoop:
         self._tell(self.index, EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
-        """Whether the quick stop of a command is over: the motor stands, or the time for it has passed."""
+        """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""
         counts, before = self.cycle.feedback.motor_counts, self._place
         self._place = counts
         driven = self.image.power.state is State.OPERATION_ENABLED
@@ -419,10 +419,9 @@ class AxisLoop:
         return True
 
     def _stop_words(self) -> str:
-        """Why the axis stopped."""
         stop = self.cycle.stopped
         return str(stop) if stop is not None else self._why
 
     def sample(self) -> tuple[float, ...]:
-        """The fields of `layout.Axis` for the turn that is over."""
+        """Returns the fields of `layout.Axis` for the turn that has just ended."""
         return self._sampler.take(self.state, changing=self._changing, underrun=self._underrun)

@@ -1,4 +1,4 @@
-"""What a turn has left of one axis, as plain numbers for the ring of samples."""
+"""Values of one axis after a turn, as plain numbers for the ring of samples."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hdbridge.daemon.memory.layout import NO_FAULT, SampleFlag
 from hdbridge.drive.states import State
 
 _POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
-# As plain numbers: to combine the flags themselves costs more than the whole sample.
+# Plain integers: combining enum flags would cost more than the rest of the sample.
 _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
     map(int, SampleFlag)
 )
 
 
 class AxisSampler:
-    """Of one axis."""
+    """Collects the sample of one axis in each turn."""
 
     __slots__ = (
         "_cycle",
@@ -43,7 +43,7 @@ class AxisSampler:
         self._limited = 0
 
     def take(self, state: AxisState, *, changing: bool, underrun: bool) -> tuple[float, ...]:
-        """The fields of `layout.Axis` for the turn that is over."""
+        """Returns the fields of `layout.Axis` for the turn that has just ended."""
         image, feedback, follower = self._image, self._cycle.feedback, self._follower
         set_point, motor_deg = follower.set_point, self._motor_deg
         position_deg = motor_deg * feedback.motor_counts
@@ -89,7 +89,7 @@ class AxisSampler:
 
 
 def _readings(flags: int, readings: tuple[float | None, ...]) -> tuple[int, float, float]:
-    """The optional channels: which are known, and their values (NaN where not)."""
+    """Returns the flags with those of the known channels added, and both readings (NaN if unknown)."""
     known = [each if each is not None else math.nan for each in (*readings, None)[:2]]
     for value, bit in zip(known, (_KNOWN0, _KNOWN1), strict=True):
         if not math.isnan(value):

@@ -1,9 +1,9 @@
-"""The control loop of one machine, one period a turn. It knows no process: clock, bus and memory come in.
+"""The control loop of one machine, one cycle per turn. Clock, bus and memory are passed in.
 
     commands - knots - [wait - SYNC - TPDOs - judge - targets - RPDOs - service's frame] - states - sample
 
-What is in brackets is `BusCycle.exchange`. So whatever takes long, such as planning a move or loading another
-compensation, is done when the RPDOs of one period have gone, and before the wait for the next.
+The part in brackets is `BusCycle.exchange`. Slow work, such as planning a move or loading another
+compensation, runs after the RPDOs of one cycle and before the wait for the next.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from hdbridge.errors import BusError, HdbridgeError, InputError
 
 COMMANDS_A_TURN: Final = 8
 REOPEN_EVERY_S: Final = 0.5
-"""How often an interface that is down is tried again."""
+"""Interval between attempts to reopen a failed interface."""
 REFUSALS_A_SECOND: Final = 10
-"""Refused frames of the relay that are told."""
+"""Maximum rate at which refused relay frames are reported."""
 ENDING_TIMEOUT_S: Final = 10.0
-"""By then the process ends whether or not the drives have confirmed that power is off."""
+"""Time after which the process ends even if the drives have not confirmed that power is off."""
 _ALL: Final = -1
 _AT_REST: Final = frozenset({AxisState.UNVERIFIED, AxisState.DISABLED, AxisState.LATCHED})
 _OFF: Final = frozenset({State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON, State.UNKNOWN})
 
 
 class Controller:
-    """All axes of one bus, driven by what comes through the shared memory."""
+    """All axes of one bus, controlled through the shared memory."""
 
     def __init__(
         self,
@@ -45,10 +45,10 @@ class Controller:
         reopen: Callable[[], Link | None] = lambda: None,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """``reopen`` opens the interface anew after a failure: a link, or None where it is still down.
+        """``reopen`` reopens the interface after a failure; it returns None while the interface is down.
 
-        ``monotonic_ns`` is the clock that the other processes watch this one by. InputError where the axes do
-        not go together on one bus, or the memory is for others.
+        ``monotonic_ns`` is the clock by which other processes monitor this one. Raises InputError if the axes
+        cannot share one bus, or if the shared memory was made for another number of axes.
         """
         if memory.axes != len(setups):
             raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
@@ -61,7 +61,7 @@ class Controller:
         for axis in self.axes:
             cycle.join(axis.cycle)
         self.ended = False
-        """All axes are without power, as `end` has asked for: no more turns."""
+        """True once `end` has switched off power of all axes; no more turns are due."""
 
         self._reopen = reopen
         self._monotonic_ns = monotonic_ns
@@ -80,7 +80,7 @@ class Controller:
         self._turns = memory.status.loop_count
         cycle.on_frame = self._pass_in
         cycle.outgoing = self._pass_out
-        # What waits was meant for another loop, and another state of the axes.
+        # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
         for knots in memory.knots:
@@ -89,7 +89,7 @@ class Controller:
     # ---------------------------------------------------------------- a turn
 
     def turn(self) -> None:
-        """One period. Raises nothing of the bus or of the service."""
+        """Runs one cycle. Raises no error of the bus or the service."""
         cycle, axes = self.cycle, self.axes
         self._take_commands()
         for axis in axes:
@@ -166,7 +166,7 @@ class Controller:
         return self.axes[index]
 
     def _begin_stream(self, command: Command) -> None:
-        """All axes of the mask, or none."""
+        """Begins a stream on all axes of the command's mask, or on none of them."""
         mask = command.i or 1 << self._axis(command.axis).index
         if mask >> len(self.axes):
             raise InputError(f"a stream of axes {mask:b}b; there are only {len(self.axes)}")
@@ -181,7 +181,7 @@ class Controller:
         self._tell(command.axis, EventKind.DONE, command.id)
 
     def _stop_group(self, stopped: AxisLoop) -> None:
-        """The axes that move together with one that does not go on brake in order."""
+        """Brakes the other axes of a group when one of them leaves it."""
         for index in stopped.broken:
             axis = self.axes[index]
             if axis.group == stopped.broken:
@@ -216,7 +216,7 @@ class Controller:
     # ---------------------------------------------------------------- the bus
 
     def _bus_down(self) -> None:
-        """The interface failed in this turn, or before and has not come back yet."""
+        """Reports a bus failure or recovery, and tries to reopen the interface while it is down."""
         cycle = self.cycle
         if cycle.down is None:
             self._down = False
@@ -235,7 +235,7 @@ class Controller:
             self._try_to_reopen()
 
     def _try_to_reopen(self) -> None:
-        # No axis speaks while the bus is down, so nothing waits for the time that this takes.
+        # No axis communicates while the bus is down, so reopening may take longer than a cycle.
         try:
             link = self._reopen()
         except BusError:
@@ -246,9 +246,10 @@ class Controller:
     # ---------------------------------------------------------------- the end
 
     def end(self, *, at_once: bool = False) -> None:
-        """Stop all axes and switch power off; `ended` says when that is done. Once is enough.
+        """Stops all axes and switches power off; `ended` becomes True when that is done.
 
-        In order, or ``at_once`` by a quick stop, which may also come after the first.
+        Axes are braked to rest, or quick-stopped with ``at_once``. Repeated calls do nothing, except that
+        ``at_once`` may follow an ordinary call.
         """
         if at_once and not self._at_once:
             self._at_once = True
@@ -260,7 +261,7 @@ class Controller:
         self._ending_left = round(ENDING_TIMEOUT_S / self.cycle.period_s)
         self._tell(_ALL, EventKind.ENDING)
         for axis in self.axes:
-            # The service cannot bring a lent axis to rest any more; the loop's quick stop overrules it.
+            # The service can no longer stop a lent axis; the loop's quick stop overrides it.
             lent = axis.state is AxisState.LENT
             self._order(axis, CommandKind.QUICK_STOP if lent else CommandKind.DISABLE)
 
@@ -279,7 +280,7 @@ class Controller:
                 if power.state in _OFF:
                     continue
                 if axis.index not in self._released:
-                    # Out of the latch leads the way to no power; nobody is left to give another order.
+                    # Only RESET leads from the latch to power off, and nobody is left to send it.
                     self._released.add(axis.index)
                     self._order(axis, CommandKind.RESET)
             moving = True

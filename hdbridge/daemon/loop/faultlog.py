@@ -1,4 +1,4 @@
-"""Faults of the supervision as events: one when a fault begins, one when its reaction becomes graver."""
+"""Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from hdbridge.daemon.memory.layout import EventKind
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 
 OVER_S: Final = 1.0
-"""A fault that was absent for so long is over; it is told again when it comes back."""
+"""Time without a fault after which it is over, and is reported again when it returns."""
 CODES_KEPT: Final = 64
 FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
-"""The numbers of faults in events and samples."""
+"""Number of each fault in events and samples."""
 
 
 class Tell(Protocol):
-    """How the loop tells the service something of an axis (-1: of the machine)."""
+    """Callback that reports an event of an axis to the service; axis -1 is the machine."""
 
     def __call__(
         self,
@@ -26,11 +26,11 @@ class Tell(Protocol):
         code: int = 0,
         text: str = "",
     ) -> None:
-        """Add an event."""
+        """Adds an event to the ring."""
 
 
 class FaultLog:
-    """Of one axis."""
+    """Reports the faults of one axis without repeating those that persist."""
 
     __slots__ = ("_axis", "_noted", "_over", "_seen", "_supervision", "_tell")
 
@@ -39,10 +39,10 @@ class FaultLog:
         self._over = math.ceil(OVER_S / period_s)
         self._noted = supervision.noted
         self._seen: dict[tuple[Fault, str], tuple[int, Reaction]] = {}
-        """The last cycle of each fault, and the gravest reaction that was told."""
+        """Last cycle and most severe reported reaction of each fault."""
 
     def tell(self) -> None:
-        """What is new since the last turn."""
+        """Reports the faults that are new since the last turn."""
         supervision = self._supervision
         if supervision.noted == self._noted:
             return

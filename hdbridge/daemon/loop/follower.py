@@ -1,8 +1,8 @@
-"""What an enabled axis is told in each turn: set-point, slow integral at the load, compensation, counts.
+"""Target of an enabled axis in each turn: set-point, load loop, compensation, motor counts.
 
     load target -> + load loop -> inverse of the model -> motor counts -> checked against the last ones
 
-`Follower.begin` starts all of it from where the axis stands; `Follower.follow` is asked once per turn.
+`Follower.begin` starts all of it at the actual position. `Follower.follow` is called once per turn.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG
 
 ROUNDING_COUNTS: Final = 2
-"""By which a target may exceed the fastest motion: both ends of a step are rounded."""
+"""Margin of the step check; both ends of a step are rounded to counts."""
 _AT_REST: Final = Moment()
 
 
 @dataclass(frozen=True, slots=True)
 class AxisSetup:
-    """What an axis begins with."""
+    """Initial setting of an axis."""
 
     config: AxisConfig
     compensation: Compensation
     compensating: bool = True
-    """Whether the correction is faded in when the axis is enabled."""
+    """If True, the correction is faded in when the axis is enabled."""
     load_loop: LoadLoopSettings | None = None
 
 
 class Follower:
-    """The target of one axis, turn by turn."""
+    """Computes the target of one axis, turn by turn."""
 
     __slots__ = (
         "_axis", "_has_channels", "_image", "_issued", "_load_loop", "_load_loop_on", "_most",
@@ -58,11 +58,11 @@ class Follower:
         self.set_point = SetPoint(view.limits, config.drive.cycle_s)
         self.correction = Correction(setup.compensation)
         self.compensating = setup.compensating
-        """Whether the correction is (being) faded in."""
+        """True if the correction is faded in or being faded in."""
         self.target_deg = 0.0
-        """The load target of the last turn, without what the load loop adds."""
+        """Load target of the last turn, without the load loop's correction."""
         self.loop_arcsec = 0.0
-        """What the load loop adds."""
+        """Correction by the load loop."""
         self.sensed = Sensed(config)
         self._axis, self._image, self._ratio = config, image, view.ratio
         self._has_channels = bool(image.channels)
@@ -76,7 +76,7 @@ class Follower:
     # ---------------------------------------------------------------- what compensates
 
     def engage(self, on: bool) -> None:
-        """Fade the correction in or out."""
+        """Fades the correction in or out."""
         self.compensating = on
         if on:
             self.correction.engage()
@@ -84,9 +84,9 @@ class Follower:
             self.correction.disengage()
 
     def use(self, setting: CompensationSetting, *, moving: bool) -> None:
-        """Compensate by a setting from now on: by a ramp if the axis moves, else at once.
+        """Compensates by a setting from now on; ramps to it if the axis moves, else switches at once.
 
-        InputError, and nothing has changed, if the setting does not fit the axis.
+        Raises InputError and changes nothing if the setting does not fit the axis.
         """
         new = setting.compensation(self._axis)
         if new.model != self.correction.model:
@@ -97,7 +97,7 @@ class Follower:
             self.changed()
         self.engage(setting.scheme is not Scheme.NONE)
         if setting.load_loop and not self._load_loop_on and self._load_loop is not None:
-            # It starts from the value that is in the target now, so that nothing jumps.
+            # Start from the correction that is in the target now, so that the target does not jump.
             self._load_loop.reset(self.loop_arcsec)
         self._load_loop_on = setting.load_loop
         if self._load_loop is not None:
@@ -106,7 +106,10 @@ class Follower:
     # ---------------------------------------------------------------- turn by turn
 
     def begin(self, feedback: Feedback) -> None:
-        """The axis stands here: everything starts anew. InputError where that is outside the limits."""
+        """Starts set-point, compensation and load loop at the actual position, at rest.
+
+        Raises InputError if the position is outside the limits.
+        """
         image = self._image
         image.check_target(feedback.motor_counts)
         motor_deg = image.motor_deg(feedback.motor_counts)
@@ -127,7 +130,10 @@ class Follower:
         self.loop_arcsec = 0.0
 
     def follow(self, feedback: Feedback) -> int:
-        """One step of the set-point, compensated: motor counts. InputError where they cannot be sent."""
+        """Advances the set-point by one cycle and returns the compensated target in motor counts.
+
+        Raises InputError if the target cannot be sent.
+        """
         target_deg = self.target_deg = self.set_point.step()
         if self._load_loop is not None:
             target_deg = self._trimmed(self._load_loop, target_deg, feedback)
@@ -155,7 +161,7 @@ class Follower:
         return counts
 
     def changed(self) -> None:
-        """Another compensation may need the motion's history, or no longer."""
+        """Starts or stops tracking the motion history after a change of compensation."""
         needs = bool(self.correction.needs)
         if needs and not self._needs:
             self._observer = Observer()
@@ -163,11 +169,11 @@ class Follower:
 
     @property
     def loop_doubt(self) -> str:
-        """Reason why the load loop does not act, in words; empty while it may."""
+        """Reason why the load loop does not act; empty while it may."""
         return self._load_loop.doubt if self._load_loop is not None else ""
 
     def _trimmed(self, load_loop: LoadLoop, target_deg: float, feedback: Feedback) -> float:
-        """The load target with the slow integral of the measured error; within the limits."""
+        """Returns the load target with the load loop's correction, within the limits."""
         image, correction = self._image, self.correction
         load: float | None = None
         if self._load_loop_on and feedback.fresh:
@@ -178,13 +184,13 @@ class Follower:
         self.loop_arcsec = load_loop.step(ARCSEC_PER_DEG * target_deg, load, by_motor, moving)
         trimmed = target_deg + self.loop_arcsec / ARCSEC_PER_DEG
         limits = self._axis.limits
-        # Where the axis stands outside of its limits the target says so; the loop adds nothing to that.
+        # If the target is outside the limits, the load loop must not move it further out.
         least, greatest = min(limits.position_min_deg, target_deg), max(limits.position_max_deg, target_deg)
         return min(max(trimmed, least), greatest)
 
 
 def fastest_counts(setup: AxisSetup) -> int:
-    """Most that a target may differ from the last one: what velocity and slew limits allow together."""
+    """Returns the largest step of the target in one cycle that the velocity and slew limits allow; counts."""
     config = setup.config
     slew_arcsec_s = config.compensation.slew_arcsec_s
     if setup.load_loop is not None:

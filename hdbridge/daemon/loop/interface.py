@@ -1,4 +1,4 @@
-"""The CAN interface of the control process: opened at the start, and again whenever it has gone."""
+"""The control process's CAN interface: opened at the start and reopened after each failure."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
 from hdbridge.errors import BusError, HdbridgeError
 
 _POLLS: Final = 256
-"""Frames looked at to see whether an interface that could be opened works."""
+"""Frames read to test whether an opened interface works."""
 
 
 class Interface:
-    """Opens the bus of a machine file. The lock of the interface is the keeper's, who outlives this."""
+    """Opens the bus of a machine file. The interface's lock is held by the keeper, which outlives this."""
 
     def __init__(self, settings: BusConfig, clock: Clock) -> None:
         self._settings, self._clock = settings, clock
         self._stack = ExitStack()
 
     def open(self) -> Link:
-        """A link on the newly opened bus; BusError where that is not possible."""
+        """Opens the bus and returns a link; raises BusError if that fails."""
         self.close()
         bus = self._stack.enter_context(open_bus(self._settings, shared=True))
         return Link(bus, self._clock)
 
     def reopen(self) -> Link | None:
-        """The same after a failure, where the interface works again; None where it does not.
+        """Reopens the bus after a failure; returns a link, or None if the interface does not work yet.
 
-        An interface that is down can be opened; the first look at it says that it is.
+        An interface that is down can be opened; only the first read fails.
         """
         try:
             link = self.open()
@@ -45,23 +45,23 @@ class Interface:
         return link
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Closes the bus."""
         with suppress(HdbridgeError):
             self._stack.close()
 
     def __enter__(self) -> Self:
-        """Itself; nothing is opened yet."""
+        """Returns itself; opens nothing yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """`close`."""
+        """Calls `close`."""
         self.close()
 
 
 def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
-    """Hear whether somebody else masters the bus, before the first SYNC; `BusInUseError` then."""
+    """Listens for another master before the first SYNC; raises BusInUseError if there is one."""
     if link.private:
         return
     masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}

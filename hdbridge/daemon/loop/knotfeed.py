@@ -1,4 +1,4 @@
-"""The knots of a stream, from the shared memory to the set-point, a few before each turn."""
+"""Transfer of a stream's knots from the shared memory to the set-point, a few before each turn."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from hdbridge.motion import SetPoint
 KNOTS_A_TURN: Final = 4
 """Knots handed to the set-point before each turn."""
 STALE_KNOTS_A_TURN: Final = 64
-"""Knots of another stream thrown away before each turn."""
+"""Knots of other streams discarded before each turn."""
 
 
 class KnotFeed:
-    """Of one axis; idle until a stream begins.
+    """Knot feed of one axis; idle until a stream begins.
 
-    Streams are numbered upwards. Knots of a stream that is over are thrown away; those of a later one stay
-    until it begins, for they may be handed over while the one before has not quite ended.
+    Stream numbers increase. Knots of a stream that is over are discarded. Those of a later stream wait until
+    it begins, because they may be handed over shortly before the present one ends.
     """
 
     __slots__ = ("_ending", "_following", "_knots", "_set_point", "_stream")
@@ -26,14 +26,15 @@ class KnotFeed:
     def __init__(self, knots: KnotQueue, set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
         self._stream = 0
-        """The number of the stream, or of the last one."""
+        """Number of the present stream, or of the last one."""
         self._following = False
         self._ending = False
 
     def begin(self, stream: int, timeout_s: float) -> None:
-        """Follow the knots of this number from the next turn on.
+        """Follows the knots of this stream from the next turn on.
 
-        InputError in motion, of the time-out, or of a number that is not above the last one.
+        Raises InputError if the axis is in motion, the time-out is invalid, or the number is not above the
+        last one.
         """
         if stream <= self._stream:
             raise InputError(
@@ -44,15 +45,15 @@ class KnotFeed:
         self._stream, self._following, self._ending = stream, True, False
 
     def end(self) -> None:
-        """No more knots come: at the last one the stream ends."""
+        """Announces that no more knots come; the stream ends at the last one."""
         self._ending = True
 
     def leave(self) -> None:
-        """The axis does something else: what waits of the stream is thrown away."""
+        """Stops following the stream; its waiting knots are discarded."""
         self._following = False
 
     def feed(self) -> str | None:
-        """Hand over the next knots; why one was refused (the axis then brakes), else None."""
+        """Hands over the next knots. If one is refused, brakes the axis and returns the reason; else None."""
         knots, set_point, stream = self._knots, self._set_point, self._stream
         taken = 0
         for _ in range(STALE_KNOTS_A_TURN):

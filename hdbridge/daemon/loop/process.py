@@ -1,8 +1,7 @@
 """The control process: ``python -m hdbridge.daemon.loop.process FD``, started by the keeper.
 
-It has one thread, one bus and the shared memory. Once it turns, it opens no files, logs nothing and does no
-SDO of its own.
-All that takes memory is made before the first turn.
+It has one thread, one bus and the shared memory. All memory is allocated before the first turn. While the
+loop runs, the process opens no files, writes no log and makes no SDO transfers of its own.
 """
 
 from __future__ import annotations
@@ -32,12 +31,12 @@ from hdbridge.errors import HdbridgeError
 from hdbridge.model import TransmissionModel
 
 AT_ONCE: Final = 2
-"""``STOP_ASKED`` for an end by quick stop."""
+"""Value of ``STOP_ASKED`` that requests an end by quick stop."""
 SIMULATED_BITRATE_BPS: Final = 1_000_000
 
 
 def main(arguments: list[str]) -> int:
-    """Run until told to end; the exit status."""
+    """Runs until asked to end; returns the exit status."""
     try:
         start = Start.inherited(arguments)
         begin_child(start, "hdbridge-loop")
@@ -49,9 +48,9 @@ def main(arguments: list[str]) -> int:
 
 
 def run(start: Start) -> None:
-    """Turn the loop of a machine until SIGTERM or ``STOP_ASKED`` has brought it to rest.
+    """Runs the loop of a machine until SIGTERM or ``STOP_ASKED`` has brought it to rest.
 
-    Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is heard on it.
+    Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is active on it.
     """
     machine = start.machine
     terminated = False
@@ -69,7 +68,7 @@ def run(start: Start) -> None:
         controller = Controller(cycle, setups, memory, reopen)
         status = memory.status
         status.set(Cell.LOOP_PID, os.getpid())
-        # A simulation that is late does not sleep: it would keep everything else from its processor.
+        # No real-time priority for a simulation: a late one never sleeps and would starve its processor.
         real = interface is not None
         with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext() as conditions:
             log_once(
@@ -85,7 +84,7 @@ def run(start: Start) -> None:
 
 
 def setup_of(axis: Axis) -> AxisSetup:
-    """An axis starts uncompensated; the service sends its setting before the axis can be enabled."""
+    """Returns an uncompensated setup; the service sends the setting before the axis can be enabled."""
     nothing = compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
     return AxisSetup(axis.config, nothing, compensating=False, load_loop=axis.load_loop)
 
@@ -96,7 +95,7 @@ def _bitrate(start: Start) -> int | None:
 
 @contextmanager
 def _bus(start: Start) -> Iterator[tuple[Link, Clock, Interface | None]]:
-    """The bus, its clock, and who opens it again; None for simulated drives, which are in this process."""
+    """Yields the bus, its clock and the interface that reopens it (None for simulated drives)."""
     machine = start.machine
     if start.simulation is not None:
         with _simulated(machine, start.simulation) as (link, clock):
@@ -112,7 +111,7 @@ def _bus(start: Start) -> Iterator[tuple[Link, Clock, Interface | None]]:
 
 @contextmanager
 def _simulated(machine: Machine, simulation: Simulation) -> Iterator[tuple[Link, Clock]]:
-    # Loaded here: who masters a real drive needs no simulated one.
+    # Imported here: with real drives the simulation is not needed.
     from hdbridge.sim.lockstep import SimulatedAxis, simulated_benches  # noqa: PLC0415
     from hdbridge.sim.paced import PacedClock  # noqa: PLC0415
 

@@ -1,7 +1,8 @@
-"""Which frames of the service go out on the bus, and which that came in go to the service. Pure, a table.
+"""Filter for the frames relayed between the service and the bus. Pure.
 
-The service does SDO and NMT with the axes' nodes and nothing else: SYNC, set-points and the master's
-heartbeat come from the loop alone. While an axis may move, its nodes are read but not written or restarted.
+The service may send SDO and NMT frames to the axes' nodes and nothing else: SYNC, set-points and the
+master's heartbeat come from the loop alone. While an axis may move, its nodes can be read but not written
+or restarted.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ _ABORT, _UPLOAD, _UPLOAD_SEGMENT, _BLOCK_UPLOAD = 4, 2, 3, 5
 READING: Final = frozenset({_UPLOAD, _UPLOAD_SEGMENT, _ABORT, _BLOCK_UPLOAD})
 """Command specifiers (CiA 301) of SDO requests that change nothing in the node."""
 MAY_MOVE: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
-"""States in which nodes of an axis are not written to or restarted."""
+"""States in which an axis's nodes must not be written or restarted."""
 
 
 def nodes_of(drive: int, load_encoder: int | None) -> tuple[int, ...]:
-    """The nodes of an axis."""
+    """Returns the node ids of an axis."""
     return (drive,) if load_encoder is None else (drive, load_encoder)
 
 
 def incoming_ids(nodes: Iterable[int]) -> frozenset[int]:
-    """Identifiers of received frames that the service wants: SDO answers, emergencies, all heartbeats."""
+    """Returns the identifiers that the service receives: SDO answers, emergencies, all heartbeats."""
     own = {base + node for node in nodes for base in (COB_SDO_ANSWER, COB_EMCY)}
     return frozenset(own | {COB_HEARTBEAT + node for node in range(1, _NODE + 1)})
 
 
 def why_refused(can_id: int, data: bytes, states: dict[int, AxisState]) -> str | None:
-    """Why a frame of the service is not sent, in words; None: it is sent.
+    """Returns the reason why a frame of the service must not be sent; None if it may be.
 
-    ``states`` has the axis's state for each node of the machine.
+    ``states`` maps each node of the machine to its axis's state.
     """
     if can_id == COB_NMT:
         node = data[1] if len(data) == 2 else -1

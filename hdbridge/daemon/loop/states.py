@@ -1,11 +1,12 @@
-"""The states of an axis in the control loop, as a table.
+"""State table of an axis in the control loop.
 
-What may live here: the states, the rows, and what follows from the rows alone: what is accepted where, why
-not, the diagram. No bus, no clock, no drive. The drive has power states of its own (`hdbridge.drive.states`);
-these say what the loop may do with the axis. What is not in the table is refused and changes nothing.
+This module holds the states, the rows and what follows from them alone: which commands are accepted, the text
+of a refusal, the diagram. It uses no bus, clock or drive. The drive has its own power states
+(`hdbridge.drive.states`); these states say what the loop may do with the axis. A command without a row is
+refused and changes nothing.
 
-No row leads to ENABLING but that of an ENABLE command, and none to ENABLED but from ENABLING: so nothing
-enables an axis by itself, and nothing does after a stop before the latch was released.
+Only an ENABLE command leads to ENABLING, and only ENABLING leads to ENABLED. So no axis is enabled
+automatically, nor after a stop before its latch is released.
 """
 
 from __future__ import annotations
@@ -17,28 +18,28 @@ from hdbridge.daemon.memory.layout import CommandKind
 
 
 class AxisState(IntEnum):
-    """The numbers are part of the shared memory: add, never renumber."""
+    """State of an axis. The numbers are part of the shared memory: add, never renumber."""
 
     UNVERIFIED = 0
-    """Nothing is known of the drive: no RPDO; TPDOs are taken if they come."""
+    """The drive was not verified. No RPDO is sent; received TPDOs are evaluated."""
     DISABLED = 1
-    """Verified; the RPDO goes, with the actual position as target and power off."""
+    """The drive was verified. The RPDO carries the actual position as target, with power off."""
     ENABLING = 2
-    """On the way to 'operation enabled', standing still."""
+    """Changing to 'operation enabled', at rest."""
     ENABLED = 3
-    """The set-point is followed."""
+    """The axis follows its set-point."""
     STOPPING = 4
-    """Braking in order, then power off."""
+    """Braking to rest, then switching power off."""
     LENT = 5
-    """The service moves the drive by SDO: no RPDO."""
+    """The service controls the drive by SDO. No RPDO is sent."""
     QUICK_STOPPED = 6
-    """A quick stop is latched; its RPDO goes on."""
+    """A quick stop is latched. RPDOs continue."""
     LATCHED = 7
-    """The drive has to be verified again: no RPDO."""
+    """The drive must be verified again. No RPDO is sent."""
 
 
 class Happening(Enum):
-    """What leads to another state without a command."""
+    """Events other than commands that cause a transition."""
 
     POWERED = "operation is enabled and the channels are known"
     POWER_OFF = "power is off"
@@ -88,13 +89,13 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.STOPPING, _H.OVERDUE, _S.QUICK_STOPPED),
     Transition(_S.QUICK_STOPPED, _C.RESET, _S.STOPPING),
     Transition(_S.LATCHED, _C.RESET, _S.UNVERIFIED),
-    # To stop is never refused, where nothing moves either.
+    # A stop is never refused, even if nothing moves.
     *(Transition(state, _C.STOP, state) for state in _S),
     *(
         Transition(state, _C.QUICK_STOP, state)
         for state in (_S.UNVERIFIED, _S.DISABLED, _S.QUICK_STOPPED, _S.LATCHED)
     ),
-    # What compensates is the service's choice at any time.
+    # The service may change the compensation at any time.
     *(Transition(state, _C.CHANGE, state) for state in _S),
     *(Transition(state, _H.STOP_LATCHED, _S.QUICK_STOPPED) for state in _SPEAKING),
     *(
@@ -102,7 +103,7 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
         for state in (*_SPEAKING, _S.LENT, _S.QUICK_STOPPED)
     ),
 )
-"""Every row; a command that has none in a state is refused there."""
+"""All transitions; a command without a row in a state is refused there."""
 
 _TARGETS: Final = {(row.source, row.cause): row.target for row in TRANSITIONS}
 
@@ -116,26 +117,26 @@ _WAY_OUT: Final = {
     _S.QUICK_STOPPED: "remove the cause, then reset it: hdbridge ctl reset AXIS",
     _S.LATCHED: "remove the cause, then reset it, which verifies the drive again: hdbridge ctl reset AXIS",
 }
-"""What a person does where a command is refused."""
+"""Advice for a refused command, by state."""
 
 
 def target_of(state: AxisState, cause: Cause) -> AxisState | None:
-    """Where ``cause`` leads in ``state``; None: it is refused, or means nothing there."""
+    """Returns the target of ``cause`` in ``state``; None if it is refused or has no effect."""
     return _TARGETS.get((state, cause))
 
 
 def refusal(state: AxisState, kind: CommandKind) -> str:
-    """Why a command is refused in a state, in words."""
+    """Returns the message for a command that is refused in a state."""
     return f"{label(kind)} is not possible while the axis is {label(state)}: {_WAY_OUT[state]}"
 
 
 def label(name: AxisState | CommandKind) -> str:
-    """``quick stopped``."""
+    """Returns a name in words, such as ``quick stopped``."""
     return name.name.lower().replace("_", " ")
 
 
 def mermaid() -> str:
-    """The table as a Mermaid state diagram, without the rows that change nothing."""
+    """Returns the table as a Mermaid state diagram, without rows that keep the state."""
     lines = ["stateDiagram-v2", f"    [*] --> {AxisState.UNVERIFIED.name}"]
     causes: dict[tuple[AxisState, AxisState], list[str]] = {}
     for row in TRANSITIONS:
@@ -150,7 +151,7 @@ def mermaid() -> str:
 
 
 def table() -> str:
-    """Which commands each state takes, as a Markdown table; docs/daemon-internals.md holds its text."""
+    """Returns the commands accepted in each state as a Markdown table, for docs/daemon-internals.md."""
     lines = ["| state | commands that it takes |", "|---|---|"]
     for state in AxisState:
         kinds = [kind.name for kind in CommandKind if target_of(state, kind) is not None]

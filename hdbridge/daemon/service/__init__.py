@@ -1,1 +1,1 @@
-"""What the service process does for clients: lease, motion queue, commissioning, jobs."""
+"""The service process's work for clients: lease, motion queue, commissioning, jobs."""

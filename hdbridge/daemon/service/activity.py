@@ -1,4 +1,4 @@
-"""What moves an axis at present, on whose behalf. A newer one takes the place of an older one."""
+"""The present motion of an axis and the client that began it. A new activity replaces the present one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import Enum
 
 
 class Kind(Enum):
-    """What a client may have an axis do."""
+    """Kind of an activity."""
 
     MOVE = "a move"
     JOG = "a jog"
@@ -18,23 +18,23 @@ class Kind(Enum):
 
 
 ENDS_WITH_LEASE = frozenset({Kind.JOG, Kind.QUEUE, Kind.STREAM})
-"""What is stopped when the lease ends under which it began. A move has an end of its own, a job as well."""
+"""Activities that are stopped when the lease under which they began ends. Moves and jobs end on their own."""
 
 
 @dataclass(slots=True, eq=False)
 class Activity:
-    """One of them; it is over when something else has taken its place or it came to its end."""
+    """One activity; it is over when another replaces it or when it has completed."""
 
     kind: Kind
     holder: str
     """Token of the lease under which it began."""
     command_id: int = 0
-    """Of the command to the control process whose motion this is."""
+    """Id of the command to the control process that began this motion."""
     since: int = 0
-    """Number of the newest log entry before it began: what became of it is told after that."""
+    """Number of the newest log entry before it began; later entries report its outcome."""
     over: str = ""
-    """Why it is over, in words; empty while it goes on."""
+    """Reason for its end; empty while it lasts."""
 
     def end(self, why: str) -> None:
-        """It is over; the first reason counts."""
+        """Ends the activity; only the first reason counts."""
         self.over = self.over or why

@@ -1,7 +1,7 @@
-"""The adaptation of one axis behind the service: the model in use, moved as the load encoder says.
+"""Adaptation of one axis: the parameters of the model in use follow the load encoder.
 
-What is in use stays the committed model, by its version; the control process compensates by it as it was
-moved, whichever part of it compensates. When another one is committed the adaptation begins anew.
+The committed model and its version stay in use. The control process compensates with the adapted parameters,
+whatever the scheme. The adaptation restarts when another model is committed.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ _log = logging.getLogger(__name__)
 
 
 class Adapting:
-    """A sink of the observer, and what the bridge calls an adaptation."""
+    """Runs the adaptation of one axis: a sink of the observer and the bridge's `Adaptation`."""
 
     def __init__(
         self, place: int, axis: ServiceAxis, settings: AdaptationSettings, folder: Path, writer: Executor
     ) -> None:
-        """``place`` is the axis's index in a sample, ``folder`` where its state and history are kept."""
+        """``place`` is the axis's index in a sample, ``folder`` contains its state and history."""
         self._place, self._axis = place, axis
         self._settings, self._folder, self._writer = settings, folder, writer
         self._of: TransmissionModel | None = None
-        """The committed model that it is of."""
+        """Committed model that is being adapted."""
         self._sink: AdaptationSink | None = None
         self._health: EncoderHealth | None = None
         self._problem = ""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples and events from the observer; restarts if another model was committed."""
         if self._axis.models.chosen.model is not self._of:
             self._begin(self._axis.models.chosen.model)
         if self._sink is None or self._health is None:
@@ -52,7 +52,7 @@ class Adapting:
         self._sink.take(samples, events, lost)
 
     def state(self) -> messages.AdaptationState:
-        """What clients are told."""
+        """Returns the state of the adaptation for clients."""
         if self._sink is None:
             return messages.AdaptationState(
                 mode=messages.AdaptationMode(self._settings.mode), frozen=self._problem or None
@@ -60,7 +60,7 @@ class Adapting:
         return self._sink.state(0)
 
     async def set_mode(self, mode: messages.AdaptationMode) -> None:
-        """Another mode from here on."""
+        """Changes the mode."""
         self._settings = self._settings.model_copy(update={"mode": mode.value})
         if self._sink is None:
             self._of = None  # begins with the next samples
@@ -68,15 +68,15 @@ class Adapting:
             self._sink.adapt(0, mode.value)
 
     async def back(self) -> None:
-        """Back to the committed model, and observe only."""
+        """Restores the committed model and switches the adaptation to observation only."""
         if self._sink is not None:
             self._sink.back(0)
             await self.follow()
 
     async def follow(self) -> None:
-        """Have the control process compensate by the model as it was moved, where it does not yet.
+        """Has the control process compensate with the adapted model, if it does not yet.
 
-        A job measures with one model: it is not changed until the job has ended.
+        Waits for the end of a job, because a job measures with one model.
         """
         if self._sink is None or self._axis.models.chosen.model is not self._of:
             return
@@ -97,12 +97,12 @@ class Adapting:
             _log.info("adaptation applied", {"axis": self._axis.name})
 
     def close(self) -> None:
-        """Keep what was learnt last."""
+        """Stores the adaptation's state."""
         if self._sink is not None:
             self._sink.close()
 
     def _begin(self, model: TransmissionModel) -> None:
-        """Follow another committed model from here on."""
+        """Starts to adapt another committed model."""
         self.close()
         self._of, self._sink, self._health, self._problem = model, None, None, ""
         if self._settings.mode == "off":

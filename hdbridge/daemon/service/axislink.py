@@ -1,4 +1,4 @@
-"""One axis of the control process: commands with their answers, and what the newest cycle says of it."""
+"""Connection to one axis of the control process: commands with their answers, and its newest sample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _POWER: Final = tuple(State)
 
 
 class AxisLink:
-    """The way to one axis; ``index`` is its place in the shared memory."""
+    """Connection to one axis; ``index`` is its place in the shared memory."""
 
     def __init__(self, core: Core, index: int, name: str) -> None:
         self.core = core
@@ -33,17 +33,17 @@ class AxisLink:
     # ---------------------------------------------------------------- the newest cycle
 
     def value(self, field: str) -> float:
-        """A field of `AXIS_SAMPLE`, by the newest cycle; 0 before the first."""
+        """Returns a field of `AXIS_SAMPLE` in the newest cycle; 0 before the first."""
         newest = self.core.observer.newest
         return float(newest[0]["axes"][self.index][field]) if newest is not None else 0.0
 
     def flag(self, flag: SampleFlag) -> bool:
-        """Whether it is set in the newest cycle."""
+        """Returns True if the flag is set in the newest cycle."""
         return bool(int(self.value("flags")) & flag)
 
     @property
     def state(self) -> AxisState:
-        """Where the control process has it."""
+        """State of the axis in the control process."""
         return AxisState(int(self.value("state")))
 
     @property
@@ -57,14 +57,14 @@ class AxisLink:
     async def do(
         self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """As `Dispatcher.do`; what the newest cycle says is from after the answer."""
+        """Runs `Dispatcher.do`, then waits until the newest sample is later than the answer."""
         answer = await self.core.dispatch.do(kind, self.index, within_s, **arguments)
         observer = self.core.observer
         await self.until(lambda: observer.cycle > answer.cycle, ANSWER_S)
         return answer
 
     async def until(self, found: Callable[[], bool], within_s: float) -> bool:
-        """Wait until ``found``, which is asked anew with each cycle; whether it was within that time."""
+        """Waits until ``found()`` is True, checking each cycle; returns False after ``within_s``."""
         timing, observer = self.core.timing, self.core.observer
         deadline_s = timing.clock.now() + within_s
         observer.poll()
@@ -77,11 +77,11 @@ class AxisLink:
         return True
 
     async def arrival(self, activity: Activity, waiting: Activity | None = None) -> None:
-        """Wait until a motion has come to its end.
+        """Waits until a motion has ended.
 
-        ``waiting`` is what waits for it, where that is another activity: once over, it waits no more.
-        SafetyStop where the supervision stopped it, RefusedError where something else has taken its place,
-        InputError where a set-point of it was refused, DaemonError where the control process is gone.
+        ``waiting`` is the activity that waits for it, if it is another one; the wait ends when it is over.
+        Raises SafetyStop if the supervision stopped the motion, RefusedError if another activity replaced
+        it, InputError if one of its set-points was refused, and DaemonError if the control process is gone.
         """
         stopping = False
         while True:
@@ -99,13 +99,13 @@ class AxisLink:
             await self.core.timing.sleep(POLL_S)
 
     def look(self, activity: Activity) -> None:
-        """What has become of a motion so far; raises as `arrival`, and does not wait."""
+        """Checks a motion without waiting; raises as `arrival` does."""
         done, _ = self._look(activity, stopping=False)
         if done or activity.over:
             raise RefusedError(f"{self.name}: {activity.over}")
 
     def _look(self, activity: Activity, stopping: bool) -> tuple[bool, bool]:
-        """Whether a motion came to its end, and whether the axis is stopping for a reason still to come."""
+        """Returns (motion has ended, axis is stopping for a reason that is yet to be reported)."""
         self.core.observer.poll()
         log = self.core.log
         newest = log.newest
@@ -123,7 +123,7 @@ class AxisLink:
         return False, stopping
 
     def _ended(self, event: Event, activity: Activity) -> bool:
-        """Whether an event of a motion says that it came to its end; raises where it says that it did not."""
+        """Returns True if an event reports that the motion ended; raises if it ended early."""
         if event.kind is EventKind.STREAM_REFUSED:
             activity.end(event.text)
             raise InputError(f"{self.name}: {event.text}; the axis brakes")

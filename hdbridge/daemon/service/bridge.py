@@ -1,10 +1,10 @@
-"""The machine, for those above: its axes, the lease, coordinated moves, jobs, what is and what has happened.
+"""The machine as the API sees it: axes, lease, coordinated moves, jobs, state and events.
 
     async with ServiceBridge(machine, memory, timing) as bridge:
         ...
 
-Everything here runs in one event loop. Nothing of it is needed for an axis to hold where it is: when this
-process dies the axes go to the end of what they were told, and the next one finds them there.
+All of it runs in one event loop. An axis holds its position without this process: if the process dies, the
+axes complete the commands they have, and the next service process takes them over as they are.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
-"""Pauses before a drive is asked for again that could not be verified; the last one repeats."""
+"""Pauses before each attempt to verify a drive that did not answer; the last one repeats."""
 SETTLE_AGAIN_S: Final = 0.5
-"""Pause before a compensation is sent again that the control process has not acknowledged."""
+"""Pause before a compensation that was not acknowledged is sent again."""
 EVENTS_TOLD: Final = 1000
 _log = logging.getLogger(__name__)
 
 
 class Adaptation(Protocol):
-    """What follows the parameters of one axis."""
+    """Adaptation of one axis, as the bridge uses it."""
 
     def state(self) -> messages.AdaptationState: ...
     async def set_mode(self, mode: messages.AdaptationMode) -> None: ...
@@ -55,7 +55,7 @@ class Adaptation(Protocol):
 
 
 class ServiceBridge:
-    """The machine; `interface.Bridge` says what each method does."""
+    """The machine; `interface.Bridge` documents each method."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class ServiceBridge:
         runner: Runner = in_own_process,
         simulated: bool = False,
     ) -> None:
-        """``recordings`` says where the recordings of an axis's jobs go, ``runner`` how they are done."""
+        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job."""
         self.machine = machine
         self.core = Core.of(memory, timing, machine.lease_s)
         self.book = JobBook(self.core, recordings, runner)
@@ -76,18 +76,18 @@ class ServiceBridge:
             for index, axis in enumerate(machine.axes)
         }
         self.adaptations: dict[str, Adaptation] = {}
-        """By axis, where something adapts."""
+        """Adaptations by axis name."""
         self.advice: Callable[[str], Sequence[str]] = lambda _: ()
-        """What the watch says of an axis."""
+        """Returns the watch's advice about an axis."""
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
-        """Who wants to hear of remarks: the recorder."""
+        """Receivers of remarks, such as the recorder."""
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
         self._stopped: dict[str, Entry] = {}
         self._loop_doubts: dict[str, str] = {}
-        """Text of the last event of each load loop."""
+        """Text of the last event of each axis's load loop."""
         self._seen = 0
         self._bus_up = True
         self._loop_pid = 0
@@ -97,7 +97,7 @@ class ServiceBridge:
         self.core.lease.doing = self._doing
 
     def _doing(self) -> str:
-        """The jobs and motions of the axes at present, in words for a client without the lease."""
+        """Returns the present jobs and motions in words, for a client without the lease."""
         states = [axis.state() for axis in self.axes.values()]
         jobs = [reports.job_words(each.job, " --force") for each in states if each.job is not None]
         moving = [
@@ -109,13 +109,13 @@ class ServiceBridge:
 
     @property
     def lease(self) -> Lease:
-        """The right to move."""
+        """The lease, which is the right to move."""
         return self.core.lease
 
-    # ---------------------------------------------------------------- its life
+    # ---------------------------------------------------------------- begin and end
 
     async def __aenter__(self) -> Self:
-        """Begin: find every axis as it is, and look after them from now on.
+        """Takes over every axis in its present state and monitors all of them from now on.
 
         Returns when the control process compensates each axis by its setting, or does not answer.
         """
@@ -123,7 +123,7 @@ class ServiceBridge:
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
-        # From here on each is being taken over: before its state is known, nobody else asks anything of it.
+        # Let each take-over start, so that no other request precedes it.
         await asyncio.sleep(0)
         timing = self.core.timing
         deadline_s = timing.clock.now() + ANSWER_S
@@ -132,7 +132,7 @@ class ServiceBridge:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """End: jobs are cancelled; the axes go on with what they were told."""
+        """Cancels jobs and stops monitoring; the axes complete the commands they have."""
         await self.book.close()
         for task in tuple(self._tasks):
             task.cancel()
@@ -141,7 +141,7 @@ class ServiceBridge:
             await axis.close()
 
     async def _watch(self) -> None:
-        """Every `PERIOD_S`: what the control process tells, the lease, drives that must be verified again."""
+        """Reads events, checks the lease and verifies drives again, every `PERIOD_S`."""
         core = self.core
         while True:
             core.observer.poll()
@@ -161,7 +161,7 @@ class ServiceBridge:
             await core.timing.sleep(PERIOD_S)
 
     def _look(self) -> None:
-        """Take note of what has happened."""
+        """Evaluates new events: stops, load loops, bus failures and restarts of the control process."""
         for entry in self.core.log.since(self._seen):
             self._seen = entry.number
             event = entry.event
@@ -171,7 +171,7 @@ class ServiceBridge:
             if event.kind is EventKind.STOPPED:
                 self._stopped[name] = entry
             elif event.kind is EventKind.STATE and event.code in LATCHED:
-                self._stopped.pop(name, None)  # why it stopped is told when it stands
+                self._stopped.pop(name, None)  # the reason is reported once it stands
             elif event.kind is EventKind.LOAD_LOOP:
                 self._loop_doubts[name] = event.text
             elif event.kind is EventKind.BUS_DOWN:
@@ -186,7 +186,7 @@ class ServiceBridge:
             self._loop_pid = pid
 
     async def _settle(self, axis: ServiceAxis) -> None:
-        """Send the chosen compensation until the control process has acknowledged it."""
+        """Sends the chosen compensation until the control process has acknowledged it."""
         noted = ""
         try:
             while axis.unsettled:
@@ -211,7 +211,7 @@ class ServiceBridge:
             )
 
     async def _verify(self, axis: ServiceAxis) -> None:
-        """Boot and verify a drive, again and again until it is there. It stays disabled."""
+        """Boots and verifies a drive, repeatedly until it succeeds. The axis stays disabled."""
         told = ""
         try:
             for attempt in range(1_000_000):
@@ -228,10 +228,10 @@ class ServiceBridge:
         finally:
             self._verifying.discard(axis.name)
 
-    # ---------------------------------------------------------------- what is
+    # ---------------------------------------------------------------- state
 
     def state(self) -> messages.MachineState:
-        """Everything about the machine at the newest cycle."""
+        """Returns the state of the machine in the newest cycle."""
         core = self.core
         newest = core.observer.newest
         head = newest[0] if newest is not None else None
@@ -263,7 +263,7 @@ class ServiceBridge:
         )
 
     def axis_state(self, name: str) -> messages.AxisState:
-        """Everything about one axis at the newest cycle."""
+        """Returns the state of one axis in the newest cycle."""
         self._look()
         adaptation = self.adaptations.get(name)
         return reports.axis_state(
@@ -291,7 +291,7 @@ class ServiceBridge:
         return warnings
 
     def events(self, since: int = 0) -> messages.Events:
-        """Events with a higher sequence number than ``since``, oldest first; the newest where it is many."""
+        """Returns at most the newest `EVENTS_TOLD` events after number ``since``, oldest first."""
         told = self.core.log.told(since)[-EVENTS_TOLD:]
         newest = told[-1].number if told else self.core.log.newest_told
         return messages.Events(
@@ -301,7 +301,7 @@ class ServiceBridge:
         )
 
     def subscribe(self, most: int = 512) -> Subscription:
-        """Samples and events as they come."""
+        """Subscribes to samples and events."""
         return Subscription(self.core.observer, self._messages_since, most)
 
     def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
@@ -310,13 +310,13 @@ class ServiceBridge:
         return [reports.event_message(each, self._names) for each in entries], newest
 
     def jobs(self) -> list[messages.Job]:
-        """The jobs that run and the last ones that ran, newest last."""
+        """Returns the running jobs and the last finished ones, newest last."""
         return self.book.all()
 
-    # ---------------------------------------------------------------- what it is told
+    # ---------------------------------------------------------------- requests
 
     async def quick_stop(self) -> None:
-        """Every axis at once."""
+        """Quick-stops all axes."""
         for axis in self.axes.values():
             axis.give_up("it was stopped by a quick stop")
         await self.core.dispatch.do(CommandKind.QUICK_STOP)
@@ -324,34 +324,34 @@ class ServiceBridge:
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        """Move several axes so that all begin and end together."""
+        """Moves several axes so that all begin and end together."""
         if not moves:
             raise InputError("a coordinated move of no axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
 
     async def cancel_job(self, holder: str, job_id: str) -> None:
-        """Stop a job's axis in order; what it has measured is kept."""
+        """Cancels a job and brakes its axis to rest; its measurements are kept."""
         self.core.lease.check(holder)
         self.book.cancel(job_id)
 
     def mark(self, text: str) -> None:
-        """A remark for the event log and the flight recorder, at the present cycle."""
+        """Adds a remark to the event log and the flight recorder, at the present cycle."""
         self.core.log.note(text)
         for hear in self.marks:
             hear(text)
 
     async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        """Switch an axis's slow integral of the measured error on or off."""
+        """Switches an axis's load loop on or off."""
         await self._axis(axis).switch_load_loop(holder, on=on)
 
     async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
-        """How an axis's parameters follow the load encoder from now on."""
+        """Sets the adaptation mode of an axis."""
         self.core.lease.check(holder)
         await self._adaptation(axis).set_mode(mode)
 
     async def adaptation_back(self, holder: str, axis: str) -> None:
-        """Forget what the adaptation of an axis has changed."""
+        """Discards the adapted parameters of an axis."""
         self.core.lease.check(holder)
         await self._adaptation(axis).back()
 
@@ -376,7 +376,7 @@ class ServiceBridge:
         task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        """An error that nobody foresaw is logged. Without `_watch` the keeper starts the service again."""
+        """Logs an unexpected error of a task. If `_watch` fails, the keeper restarts the service."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             _log.error("an error in hdbridge", exc_info=error)

@@ -1,8 +1,8 @@
-"""One axis's drive by SDO, through the control process: boot and verify, make ready, home, read, write.
+"""SDO access to one axis's drive through the control process: boot, verify, prepare, home, read, write.
 
-All of this blocks and runs in worker threads. One thing at a time is asked of a drive; what finds it busy
-waits for a while. Whether another master is on the bus was listened for before the control process sent its
-first frame, so nothing is listened for here.
+All methods block and run in worker threads. A drive serves one request at a time; a request that finds it
+busy waits for `BUSY_S`. Other masters were listened for before the control process sent its first frame, so
+nothing here listens for them.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ if TYPE_CHECKING:
     from hdbridge.drive.bootup import BootReport
 
 BUSY_S = 3.0
-"""So long is waited for a drive that something else is asked of."""
+"""Maximum wait for a drive that is busy with another request."""
 TOWARDS_SWITCH = 0.1
-"""Of the axis's highest speed, where none is given."""
+"""Default speed towards the switch, as a share of the axis's velocity limit."""
 TOWARDS_ZERO = 0.02
 
 
 class Seeds(NamedTuple):
-    """Where a drive stands, for the control process to begin from."""
+    """Position and statusword of a drive from which the control process starts."""
 
     motor_counts: int
     load_counts: int
     statusword: int
 
     def arguments(self) -> Arguments:
-        """As VERIFIED, UNLEND and ENABLE have them."""
+        """Returns them as arguments of VERIFIED, UNLEND and ENABLE."""
         return Arguments(i=self.motor_counts, j=self.load_counts, k=self.statusword)
 
 
 class HomingRun(NamedTuple):
-    """How to home; speeds and acceleration at the load, None for those of the axis."""
+    """Parameters of a homing run; speeds and acceleration at the load, None for the axis's defaults."""
 
     method: int
     switch_velocity_deg_s: float | None = None
@@ -68,16 +68,16 @@ class Commissioning:
 
     @property
     def report(self) -> BootReport | None:
-        """What was found when it was verified; None before."""
+        """Result of the verification; None before."""
         return self._drive.report
 
     @property
     def identity(self) -> Identity:
-        """Which drive it is: what it has answered, else what the axis file expects."""
+        """Identity that the drive reported, else the one that the axis file expects."""
         return self._drive.identity
 
     def verify(self) -> Seeds:
-        """Boot the drive and compare everything with the axis file; power is off then.
+        """Boots the drive and compares it with the axis file; power is off afterwards.
 
         Raises as `Drive.boot` does.
         """
@@ -86,37 +86,37 @@ class Commissioning:
             return self._seeds(self._drive.read_positions())
 
     def take_over(self) -> None:
-        """Compare a drive that the control process drives already with the axis file; nothing is written."""
+        """Compares a drive under control of the control process with the axis file; writes nothing."""
         with self._asked("it is being compared with its axis file"):
             self._drive.take_over()
 
     def abandon_homing(self) -> None:
-        """Stop a drive that was lent to a service that is gone, and switch its power off."""
+        """Stops a drive that was lent to an earlier service, and switches its power off."""
         with self._asked("it is being stopped"):
             if self._drive.state() is State.OPERATION_ENABLED:
                 self._drive.quick_stop()
             self._drive.disable()
 
     def prepare(self) -> Seeds:
-        """Make ready to be enabled by the control process. Raises as `Drive.enable` does."""
+        """Prepares the drive to be enabled by the control process. Raises as `Drive.enable` does."""
         with self._asked("it is being made ready"):
             return self._seeds(self._drive.prepare())
 
     def rest(self) -> None:
-        """After the control process has switched power off: the drive need no longer watch the master."""
+        """Ends the drive's monitoring of the master; power is off already."""
         with self._asked("it is being switched off"):
             self._drive.disable()
 
     def clear_fault(self) -> None:
-        """Reset a fault of the drive, while the control process sends it nothing."""
+        """Resets a fault of the drive, while the control process sends it nothing."""
         with self._asked("its fault is being reset"):
             if self._drive.state() is State.FAULT:
                 self._drive.fault_reset()
 
     def home(self, run: HomingRun) -> tuple[Positions, Seeds]:
-        """Home, while the control process has lent the drive; power is off again then.
+        """Homes a drive that the control process has lent; power is off afterwards.
 
-        Raises as `Drive.home` does; the axis is stopped and power off in any case that can be reached.
+        Raises as `Drive.home` does; even then the axis stops and its power is off, if the drive answers.
         """
         limits = self._drive.axis.limits
         with self._asked("it is being homed"):
@@ -134,12 +134,12 @@ class Commissioning:
             return positions, self._seeds(positions)
 
     def interrupt(self, reason: str) -> None:
-        """End what is under way with these words; a homing run stops the axis by that. From any thread."""
+        """Interrupts the present request with this reason; a homing axis stops. Thread-safe."""
         if self._busy.locked():
             self.bus.interrupt(reason)
 
     def read(self, object_: str) -> tuple[Object, Value]:
-        """An object, by its number or its name in the EDS."""
+        """Reads an object by its number or its EDS name."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: can only be written, by the EDS")
@@ -147,7 +147,7 @@ class Commissioning:
             return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
 
     def write(self, object_: str, text: str) -> Object:
-        """Write an object; the control process refuses it while the axis is enabled."""
+        """Writes an object; the control process refuses this while the axis is enabled."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.writable:
             raise InputError(f"{wanted}: can only be read, by the EDS")
@@ -157,12 +157,12 @@ class Commissioning:
         return wanted
 
     def seeds(self) -> Seeds:
-        """Where the drive stands now."""
+        """Reads the drive's present position and statusword."""
         with self._asked("its position is being read"):
             return self._seeds(self._drive.read_positions())
 
     def close(self) -> None:
-        """Leave the relay; the drive stays as it is."""
+        """Closes the relay bus; the drive stays as it is."""
         self.bus.shutdown()
 
     def _seeds(self, positions: Positions) -> Seeds:

@@ -23,10 +23,10 @@ ROOM_POLL_S: Final = 0.05
 async def run_together(
     holder: str, axes: Sequence[ServiceAxis], targets_deg: Mapping[str, float], share: float, *, wait: bool
 ) -> None:
-    """Plan from where the axes stand, and have them begin in one cycle; with ``wait`` until all have arrived.
+    """Plans a move from the present targets and begins it on all axes in one cycle; ``wait`` awaits its end.
 
-    InputError for targets outside the limits, RefusedError for an axis that is not enabled or in motion; then
-    none has moved.
+    Raises InputError for targets outside the limits, and RefusedError for an axis that is in motion or not
+    enabled; none has moved then.
     """
     for axis in axes:
         axis.check_may(holder)
@@ -54,19 +54,19 @@ async def run_together(
             axis.motion.replace(activity, "a coordinated move took its place")
     following = asyncio.ensure_future(_follow(waiting, activities))
     if wait:
-        await asyncio.shield(following)  # who waits may go away; the move is looked after nonetheless
+        await asyncio.shield(following)  # the move is supervised even if its client disconnects
     else:
         following.add_done_callback(_heard)
 
 
 def _heard(future: asyncio.Future[None]) -> None:
-    """Nobody waits for it: what became of it is in the event log."""
+    """Retrieves the result of a move that nobody waits for; the event log contains it."""
     if not future.cancelled():
         future.exception()
 
 
 async def _follow(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[ServiceAxis, Activity]) -> None:
-    """Until all have arrived; when one does not, the others are stopped, and its error is raised."""
+    """Waits until all axes have arrived. If one fails, stops the others and raises its error."""
     arrivals = [axis.link.arrival(activity) for axis, activity in activities.items()]
     try:
         await asyncio.gather(_feed(waiting, activities), *arrivals)
@@ -80,7 +80,7 @@ async def _follow(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[Se
 
 
 async def _feed(waiting: dict[ServiceAxis, list[Knot]], activities: Mapping[ServiceAxis, Activity]) -> None:
-    """Hand over what had no room, and then say that no more comes."""
+    """Hands over the remaining knots as the queues empty, then ends the streams."""
     core = next(iter(waiting)).core
     while any(waiting.values()):
         await core.timing.sleep(ROOM_POLL_S)

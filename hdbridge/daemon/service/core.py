@@ -1,4 +1,4 @@
-"""What all parts of the service share."""
+"""Objects that all parts of the service share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hdbridge.daemon.service.timing import Timing
 
 @dataclass(frozen=True)
 class Core:
-    """The way to the control process, time, and the right to move."""
+    """Access to the control process, the clock and the lease."""
 
     memory: Memory
     log: EventLog
@@ -27,17 +27,17 @@ class Core:
     _streams: Iterator[int] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Streams are numbered from the present time: those of a service before have other numbers."""
+        """Numbers streams from the present time, so that those of an earlier service differ."""
         object.__setattr__(self, "_streams", count(int(1000.0 * self.timing.clock.now()) + 1))
 
     @classmethod
     def of(cls, memory: Memory, timing: Timing, lease_s: float) -> Core:
-        """All of it for a machine's memory."""
+        """Builds all parts for a machine's shared memory."""
         log = EventLog(memory.event_reader())
         dispatch = Dispatcher(memory, log, timing)
         observer = Observer(memory, log, timing.clock)
         return cls(memory, log, dispatch, observer, timing, Lease(lease_s, timing.clock.now))
 
     def next_stream(self) -> int:
-        """A number that no stream had before."""
+        """Returns an unused stream number."""
         return next(self._streams)

@@ -1,4 +1,4 @@
-"""Commands to the control process, each with its answer: for coroutines and for blocking work."""
+"""Commands to the control process and their answers, for coroutines and for blocking code."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from hdbridge.daemon.service.timing import POLL_S, Timing
 from hdbridge.errors import DaemonError, RefusedError
 
 ANSWER_S = 5.0
-"""The control process answers within a few cycles; after so long it is not there. ENABLE and DISABLE are
-answered when they are done."""
+"""Time-out of an answer. The control process normally answers within a few cycles, but ENABLE and DISABLE
+only when they are complete.
+"""
 
 
 class Arguments(TypedDict, total=False):
-    """The fields of a `Command`; `CommandKind` says what they mean."""
+    """Fields of a `Command`; `CommandKind` documents their meaning."""
 
     a: float
     b: float
@@ -37,10 +38,10 @@ class Dispatcher:
     async def do(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Post a command and wait until it is carried out, or has begun; the event that says so.
+        """Posts a command and returns the event that reports that it was carried out or has begun.
 
-        RefusedError with the control process's own words, and nothing was done; DaemonError where it does
-        not answer.
+        Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
+        does not answer within ``within_s``.
         """
         loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)
@@ -53,7 +54,7 @@ class Dispatcher:
     def do_now(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """The same for blocking work."""
+        """Does the same as `do`, for blocking code."""
         clock = self._timing.clock
         loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)

@@ -1,8 +1,8 @@
-"""What has happened: the control process's events and the service's own notes, in bounded lists.
+"""Event log: the control process's events and the service's notes, in two bounded lists. Thread-safe.
 
-Thread-safe: whoever waits for something polls. All of it is in one list, for the service itself. What is
-routine (`_routine`) is left out of a second one, which clients see: a calibration ends thousands of legs, and
-must not push out what stopped an axis yesterday. Each has a count of its own.
+One list has every entry, for the service itself. Clients see the other one, which omits routine entries
+(`_routine`): a calibration ends thousands of legs, which must not displace yesterday's stop. Each list has
+its own numbering.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _ANSWERS = (EventKind.DONE, EventKind.REFUSED)
 
 
 class Entry(NamedTuple):
-    """Something that happened."""
+    """Entry of the event log."""
 
     number: int
-    """Counts from 1 at the start of the service, within its list."""
+    """Number within its list, from 1 at the start of the service."""
     date: datetime
     axis: int
-    """Index of the axis; -1: the machine."""
+    """Index of the axis; -1 is the machine."""
     event: Event | None
-    """Of the control process; None: a note of the service."""
+    """Event of the control process; None for a note of the service."""
     text: str
     hint: str = ""
 
@@ -39,7 +39,7 @@ class EventLog:
     """The newest `KEPT` entries, and the answers to the newest commands."""
 
     def __init__(self, reader: EventReader, now: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
-        """``now`` gives the date of an entry."""
+        """``now`` returns the date of an entry."""
         self._reader = reader
         self._date = now
         self._lock = threading.Lock()
@@ -48,7 +48,7 @@ class EventLog:
         self._answers: dict[int, Event] = {}
         self._number = self._told_number = 0
         self.lost = 0
-        """Events that came faster than they were read."""
+        """Events lost because they were not read in time."""
 
     @property
     def newest(self) -> int:
@@ -57,11 +57,11 @@ class EventLog:
 
     @property
     def newest_told(self) -> int:
-        """Number of the newest entry that clients see; 0 before the first."""
+        """Number of the newest entry for clients; 0 before the first."""
         return self._told_number
 
     def poll(self) -> None:
-        """Take in what the control process has told since."""
+        """Reads new events of the control process."""
         with self._lock:
             events, lost = self._reader.read()
             self.lost += lost
@@ -73,26 +73,26 @@ class EventLog:
                 del self._answers[next(iter(self._answers))]
 
     def note(self, text: str, axis: int = -1, hint: str = "") -> None:
-        """Add a note of the service."""
+        """Adds a note of the service."""
         with self._lock:
             self._add(axis, None, text, hint)
 
     def answer(self, command_id: int) -> Event | None:
-        """DONE or REFUSED of a command; None while there is none."""
+        """Returns the DONE or REFUSED event of a command; None until it comes."""
         return self._answers.get(command_id)
 
     def since(self, number: int) -> list[Entry]:
-        """The entries after that number that are kept, oldest first."""
+        """Returns the retained entries after ``number``, oldest first."""
         with self._lock:
             return _newest(self._entries, self._number - number)
 
     def told(self, number: int) -> list[Entry]:
-        """Those that clients see after that number of theirs, oldest first."""
+        """Returns the entries for clients after their ``number``, oldest first."""
         with self._lock:
             return _newest(self._told, self._told_number - number)
 
     def of_axis(self, axis: int, since: int) -> list[Event]:
-        """The control process's events of one axis, those of the whole machine included."""
+        """Returns the control process's events of one axis and of the machine after number ``since``."""
         entries = self.since(since)
         return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
 
@@ -111,6 +111,6 @@ def _newest(entries: deque[Entry], count: int) -> list[Entry]:
 
 
 def _routine(event: Event) -> bool:
-    """An answer to a command, and the end of a stream: who asked for it is told."""
+    """Returns True for a completed command and the end of a stream, which only their client needs."""
     stream = event.kind is EventKind.MOTION_ENDED and event.code == MotionMode.STREAM
     return stream or event.kind is EventKind.DONE

@@ -1,13 +1,13 @@
-"""What the service offers to those above it: the API, the jobs, the command line of the daemon.
+"""Interface of the service for the API, the jobs and the daemon's command line.
 
-Angles are of the load, in degrees; speeds in deg/s. ``holder`` is the token of the lease. All coroutines
-raise an `HdbridgeError` whose text is one line that a person can act on:
+Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease token. All coroutines raise an
+`HdbridgeError` whose text is one line with the cause and the remedy:
 
-    InputError      a value is wrong: outside the limits, not finite, no such model or object
-    RefusedError    not in this state: not enabled, in motion, a job runs, a fault is latched
+    InputError      a value is invalid: outside the limits, not finite, no such model or object
+    RefusedError    not possible in this state: not enabled, in motion, a job runs, a fault is latched
     LeaseError      ``holder`` is not the token of the present lease
-    DriveError      the drive refuses, or answers no more
-    SafetyStop      the supervision stopped the axis while it was waited for
+    DriveError      the drive refuses the request or does not answer
+    SafetyStop      the supervision stopped the axis during the call
     BusError        the CAN interface is gone
 """
 
@@ -31,35 +31,35 @@ class WayPoint(NamedTuple):
 
     target_deg: float
     velocity_deg_s: float | None = None
-    """Else the axis's limit."""
+    """Maximum velocity; None for the axis's limit."""
     acceleration_deg_s2: float | None = None
-    """Else the axis's limit."""
+    """Maximum acceleration; None for the axis's limit."""
     dwell_s: float = 0.0
-    """To rest there before the next one."""
+    """Rest before the next move."""
 
 
 class StreamPoint(NamedTuple):
     """One set-point of a stream."""
 
     time_s: float
-    """Since the stream began; each later than the one before."""
+    """Time since the stream began; later than that of the point before."""
     position_deg: float
     velocity_deg_s: float | None = None
-    """Of the path there; else the slope between its neighbours, and rest at the last."""
+    """Velocity of the path at this point; None for the slope between its neighbours, or rest at the last."""
 
 
 class Batch(NamedTuple):
-    """What a subscriber gets at a time."""
+    """Samples and events delivered to a subscriber at once."""
 
     samples: SampleArray
-    """One row per cycle, as `hdbridge.daemon.memory.sample_dtype` has it."""
+    """One row per cycle, with the fields of `hdbridge.daemon.memory.sample_dtype`."""
     events: Sequence[messages.Event]
     lost: int
-    """Cycles that this subscriber was too slow for."""
+    """Cycles lost because the subscriber was too slow."""
 
 
 class Feed(Protocol):
-    """Batches as they come; `close` it when no more are wanted."""
+    """Asynchronous iterator over batches; `close` it to end the subscription."""
 
     def __aiter__(self) -> AsyncIterator[Batch]: ...
     async def __anext__(self) -> Batch: ...
@@ -67,7 +67,7 @@ class Feed(Protocol):
 
 
 class StreamPort(Protocol):
-    """A stream of set-points that is under way. An asynchronous context manager: it ends with the block."""
+    """An open stream of set-points. An asynchronous context manager: the stream ends with the block."""
 
     async def __aenter__(self) -> Self: ...
     async def __aexit__(
@@ -75,47 +75,47 @@ class StreamPort(Protocol):
     ) -> None: ...
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
-        """Hand over set-points; waits while the buffer is full. Raises where the stream has ended."""
+        """Hands over set-points; waits while the buffer is full. Raises if the stream has ended."""
         ...
 
     async def end(self) -> None:
-        """No more set-points come: follow what was handed over, come to rest there, and return then."""
+        """Ends the stream; returns when the axis has followed all set-points and is at rest."""
         ...
 
     @property
     def buffered_s(self) -> float:
-        """Time for which set-points are there."""
+        """Duration of the buffered set-points."""
         ...
 
 
 class AxisPort(Protocol):
-    """One axis. Whatever moves it asks for the lease; to stop and to look takes none."""
+    """One axis. Every method that moves it requires the lease; stopping and reading do not."""
 
     @property
     def name(self) -> str: ...
 
     def state(self) -> messages.AxisState:
-        """Everything about it at the newest cycle."""
+        """Returns the state of the axis in the newest cycle."""
         ...
 
     async def enable(self, holder: str) -> None:
-        """Power on, standing still; the drive is booted and verified first where it is not."""
+        """Switches power on at rest; boots and verifies the drive first if that was not done."""
         ...
 
     async def disable(self, holder: str) -> None:
-        """Brake to rest, then power off. Cancels the axis's job."""
+        """Brakes to rest, then switches power off. Cancels the axis's job."""
         ...
 
     async def quick_stop(self) -> None:
-        """Stop at once, latched until `reset`. Everybody may, without a lease."""
+        """Quick-stops the axis and latches the stop until `reset`. Requires no lease."""
         ...
 
     async def stop(self) -> None:
-        """Brake to rest within the limits and stay enabled. Cancels queue, stream and job. No lease."""
+        """Brakes to rest and stays enabled. Cancels queue, stream and job. Requires no lease."""
         ...
 
     async def reset(self, holder: str) -> None:
-        """Release a latched stop: reset the drive's fault, verify it again where that is due; disabled."""
+        """Releases a latched stop: resets the drive's fault, verifies the drive if needed; disabled."""
         ...
 
     async def home(
@@ -128,7 +128,7 @@ class AxisPort(Protocol):
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
     ) -> float:
-        """Home by a method of 6098h, from disabled; ends disabled. The load angle where the axis then is."""
+        """Homes by a method of 6098h, disabled before and after. Returns the load angle afterwards."""
         ...
 
     async def move(
@@ -139,54 +139,54 @@ class AxisPort(Protocol):
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        """Move, or send a motion under way to ``target_deg``; with ``wait`` until it stands there.
+        """Moves to ``target_deg``, or redirects a present motion there; with ``wait`` returns at rest there.
 
-        RefusedError where another command has taken the place of this one before it came to its end.
+        Raises RefusedError if another command replaced this one before its end.
         """
         ...
 
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
-        """Turn at a speed; brakes to rest unless it is called again within ``timeout_s``."""
+        """Turns at a speed; brakes to rest unless called again within ``timeout_s``."""
         ...
 
     async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
-        """Append moves, each begun when the one before stands; how many wait now."""
+        """Appends moves, each begun when the one before has ended; returns the number of waiting moves."""
         ...
 
     async def clear_queue(self, holder: str) -> int:
-        """Forget the moves that have not begun; how many those were. The present one goes to its end."""
+        """Discards the waiting moves and returns their number. The present move continues."""
         ...
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> StreamPort:
-        """Follow set-points. It begins where the axis stands, with the first ones that are put.
+        """Opens a stream of set-points. It begins at rest, with the first set-points that are put.
 
-        When none come for ``timeout_s`` and the last ones are used up, the axis brakes to rest.
+        If none come for ``timeout_s`` and all are used up, the axis brakes to rest.
         """
         ...
 
     async def compensate(self, holder: str, scheme: Scheme) -> None:
-        """Compensate by this part of the model in use; faded over, also in motion."""
+        """Selects the part of the model that compensates; fades it in, also during motion."""
         ...
 
     async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
-        """Make another model of the profile the active one and use it: a version, ``pending`` or ``active``.
+        """Activates a model of the profile and uses it: a version, ``pending`` or ``active``.
 
-        ``pending`` commits it; ``active`` reads the profile's model again. Faded over, also in motion.
+        ``pending`` commits it; ``active`` reads the profile's model again. Fades it in, also during motion.
         """
         ...
 
     async def sdo_read(self, object_: str) -> tuple[Object, Value]:
-        """An object of the drive, by its number (``6064h``, ``0x1018:4``) or its name in the EDS."""
+        """Reads an object of the drive by its number (``6064h``, ``0x1018:4``) or EDS name."""
         ...
 
     async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
-        """Write an object of the drive, the value as text; refused while the axis is enabled."""
+        """Writes an object of the drive, given as text; refused while the axis is enabled."""
         ...
 
     async def job(
         self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
     ) -> messages.Job:
-        """Begin a job; `Bridge.jobs` tells how far it is. ``options``: of the command of that name."""
+        """Begins a job with the options of the command of that name; `Bridge.jobs` reports progress."""
         ...
 
 
@@ -199,47 +199,47 @@ class Bridge(Protocol):
     def lease(self) -> Lease: ...
 
     def state(self) -> messages.MachineState:
-        """Everything about the machine at the newest cycle."""
+        """Returns the state of the machine in the newest cycle."""
         ...
 
     def events(self, since: int = 0) -> messages.Events:
-        """Events with a higher sequence number than ``since``, oldest first."""
+        """Returns the events after sequence number ``since``, oldest first."""
         ...
 
     def jobs(self) -> list[messages.Job]:
-        """The jobs that run and the last ones that ran, newest last."""
+        """Returns the running jobs and the last finished ones, newest last."""
         ...
 
     async def quick_stop(self) -> None:
-        """Every axis at once."""
+        """Quick-stops all axes. Requires no lease."""
         ...
 
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        """Move several axes so that all begin and end together; ``speed`` is a share of the limits."""
+        """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         ...
 
     def subscribe(self, most: int = 512) -> Feed:
-        """Samples and events as they come; of what is not fetched the newest ``most`` samples are kept."""
+        """Subscribes to samples and events; at most the newest ``most`` samples wait to be fetched."""
         ...
 
     async def cancel_job(self, holder: str, job_id: str) -> None:
-        """Stop a job's axis in order; what it has measured is kept."""
+        """Cancels a job and brakes its axis to rest; its measurements are kept."""
         ...
 
     def mark(self, text: str) -> None:
-        """A remark for the event log and the flight recorder, at the present cycle."""
+        """Adds a remark to the event log and the flight recorder, at the present cycle."""
         ...
 
     async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        """Switch an axis's slow integral of the measured error on or off; InputError where it has none."""
+        """Switches an axis's load loop on or off; raises InputError if it has none."""
         ...
 
     async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
-        """How an axis's parameters follow the load encoder from now on."""
+        """Sets how an axis's model parameters follow the load encoder."""
         ...
 
     async def adaptation_back(self, holder: str, axis: str) -> None:
-        """Forget what the adaptation of an axis has changed: the model as it was activated."""
+        """Discards the adapted parameters of an axis and restores its model as it was activated."""
         ...

@@ -1,6 +1,6 @@
-"""What a job is: its options, what it is handed, and how it tells how far it is.
+"""Job order: the options of a job, what its process receives, and how it reports progress.
 
-Apart from `jobwork`, so that the service takes and refuses jobs without loading what they do.
+Separate from `jobwork`, so that the service accepts and refuses jobs without importing their code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.profile import Profile
 
 _Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
-"""Of a plan or a folder: a name and no path, for it comes from a client."""
+"""Name of a plan or a folder, never a path, because it comes from a client."""
 
 
 class _Options(BaseModel):
@@ -28,27 +28,27 @@ class _Options(BaseModel):
 
 
 class StepOptions(_Options):
-    """Of ``hdbridge step``."""
+    """Options of ``hdbridge step``."""
 
     scheme: tuple[Scheme, ...] | Scheme | None = None
     count: int = Field(240, ge=2, le=100_000)
     step_deg: float = 43.56
     start_deg: float = 0.0
     model: int | None = Field(None, ge=1)
-    """Number of a version; else the active one."""
+    """Model version; None for the active model."""
 
 
 class CalibrateOptions(_Options):
-    """Of ``hdbridge calibrate``."""
+    """Options of ``hdbridge calibrate``."""
 
     plan: _Name = "quick"
-    """A bundled one, or the file of that name (and ``.yaml``) beside the axis file."""
+    """A bundled plan, or the file of that name (with ``.yaml``) next to the axis file."""
     resume: _Name | None = None
-    """Folder, within the axis's recordings, of one that goes on."""
+    """Folder of the recording to continue, within the axis's recordings."""
 
 
 class ImproveOptions(CalibrateOptions):
-    """Of ``hdbridge improve``."""
+    """Options of ``hdbridge improve``."""
 
     auto: bool = False
     rounds: int = Field(3, ge=1, le=20)
@@ -62,7 +62,7 @@ OPTIONS: Final[Mapping[JobKind, type[_Options]]] = {
 
 
 def options_of(kind: JobKind, given: Mapping[str, Any]) -> _Options:
-    """The options of a job, checked; InputError names the wrong one."""
+    """Returns the validated options of a job; InputError names the invalid one."""
     try:
         return OPTIONS[kind].model_validate(dict(given))
     except ValidationError as error:
@@ -74,25 +74,25 @@ def options_of(kind: JobKind, given: Mapping[str, Any]) -> _Options:
 
 @dataclass(frozen=True)
 class Work:
-    """A job as it is handed to its process."""
+    """A job, as its process receives it."""
 
     kind: JobKind
     options: _Options
     profile: Profile
     axis: AxisConfig
     recordings: Path
-    """Where recordings of this axis go."""
+    """Folder for recordings of this axis."""
     date: datetime
 
 
 @dataclass(frozen=True)
 class Told:
-    """How a job tells how far it is."""
+    """Callbacks by which a job reports its progress."""
 
     phase: Callable[[str, float, float], None]
-    """What is going on, seconds done of its phase, seconds of the phase in all."""
+    """Called with the name of the phase, its elapsed time and its total time in seconds."""
     line: Callable[[str], None]
     folder: Callable[[Path], None]
-    """Where what is measured goes."""
+    """Called with the folder of the measurements."""
     interrupted: Callable[[], bool]
-    """Asked in each cycle; a yes stops the axis."""
+    """Called in each cycle; if it returns True, the axis stops."""

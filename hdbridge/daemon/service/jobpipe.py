@@ -1,9 +1,9 @@
-"""The pipe between the service and a job's process: the job asks for runs on the axis, the service runs them.
+"""Pipe between the service and a job's process: the job requests runs on the axis, the service executes them.
 
     job's process -> service      Ask (a run), Stop, Phase, Line, Folder, Result, Failure
     service -> job's process      Cycles, Share, Done
 
-What travels is pickled: both ends are hdbridge, on one machine, and nobody else has the pipe.
+Messages are pickled: both ends are hdbridge on the same computer, and no other process has the pipe.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from hdbridge.records.recording import Segment
 
 Outcome = TypeVar("Outcome")
 CYCLES_TOLD: Final = 25
-"""Cycles between two words on how far a run is."""
+"""Cycles between two reports of a run's progress."""
 POLL_S: Final = 0.1
 
 
 @dataclass(frozen=True)
 class Begin:
-    """The first message: the job, and the drive that answers."""
+    """First message: the job and the identity of the drive."""
 
     work: Work
     identity: Identity
 
 
 class Ask(NamedTuple):
-    """Run this procedure."""
+    """Request to run a procedure."""
 
     compensation: Compensation | None
     procedure: Procedure[Any]
 
 
 class Stop(NamedTuple):
-    """End the present run: the job was interrupted."""
+    """Request to end the present run, because the job was interrupted."""
 
 
 class Phase(NamedTuple):
-    """How far the job is."""
+    """Progress of the job's present phase."""
 
     name: str
     done_s: float
@@ -62,43 +62,43 @@ class Phase(NamedTuple):
 
 
 class Line(NamedTuple):
-    """What the job is at."""
+    """Status line of the job."""
 
     text: str
 
 
 class Folder(NamedTuple):
-    """Where what is measured goes."""
+    """Folder of the measurements."""
 
     path: Path
 
 
 class Result(NamedTuple):
-    """The job is done."""
+    """Result of a completed job."""
 
     document: dict[str, Any]
 
 
 class Failure(NamedTuple):
-    """The job has failed, or was interrupted."""
+    """Error of a job that failed or was interrupted."""
 
     error: BaseException
 
 
 class Cycles(NamedTuple):
-    """So many cycles more of the present run."""
+    """Number of further cycles that the present run has executed."""
 
     cycles: int
 
 
 class Share(NamedTuple):
-    """So much of the present run is done."""
+    """Share of the present run that is done."""
 
     share: float
 
 
 class Done(NamedTuple):
-    """The run is over: what it gave, or why it did not come to its end; and what was measured."""
+    """End of a run: its result, or the error that ended it, and the measurements."""
 
     run: Run[Any] | None
     error: BaseException | None
@@ -111,7 +111,7 @@ class Done(NamedTuple):
 
 
 class Served:
-    """Serves a job's process from a worker thread of the service."""
+    """Serves a job's process, from a worker thread of the service."""
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class Served:
         alive: Callable[[], str],
         interrupt: Callable[[], None],
     ) -> None:
-        """``alive`` says how the process has ended, in words, or nothing; ``interrupt`` interrupts it."""
+        """``alive`` returns how the process has ended, or an empty string; ``interrupt`` interrupts it."""
         self._connection = connection
         self._rig = rig
         self._told = told
@@ -130,7 +130,10 @@ class Served:
         self._interrupted = False
 
     def until_done(self) -> dict[str, Any]:
-        """Serve it to its end; the job's document. Raises what the job raises, DaemonError where it died."""
+        """Serves the process to its end and returns the job's document.
+
+        Raises the job's error, or DaemonError if the process died.
+        """
         connection = self._connection
         while True:
             try:
@@ -153,7 +156,7 @@ class Served:
                     self._hear(message)
 
     def _hear(self, message: Phase | Line | Folder | Stop) -> bool:
-        """What a job says meanwhile; whether it wants the present run to end."""
+        """Handles a message from the job during a run; returns True if the run is to end."""
         match message:
             case Phase():
                 self._told.phase(*message)
@@ -164,7 +167,7 @@ class Served:
         return isinstance(message, Stop)
 
     def _look(self) -> None:
-        """Between two runs: interrupt the process where the job was cancelled while it computes."""
+        """Interrupts the process if the job was cancelled between two runs."""
         if self._told.interrupted() and not self._interrupted:
             self._interrupted = True
             self._interrupt()
@@ -198,7 +201,7 @@ class Served:
 
 
 class PipedBench:
-    """As `Bench`: asks the service for its runs."""
+    """A `Bench` whose runs are executed by the service."""
 
     def __init__(
         self, connection: Connection, compensation: Compensation | None, interrupted: Callable[[], bool]
@@ -210,22 +213,22 @@ class PipedBench:
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """The moves that the last procedure has run."""
+        """Moves of the last procedure."""
         return self._done.legs if self._done is not None else ()
 
     @property
     def survived(self) -> tuple[Survived, ...]:
-        """What it has gone on in spite of."""
+        """Faults that the last procedure tolerated."""
         return self._done.survived if self._done is not None else ()
 
     def record(self) -> Record:
-        """What it has measured."""
+        """Returns the record of the last procedure; empty before the first."""
         return self._done.record if self._done is not None else Record(dict.fromkeys(REQUIRED, np.empty(0)))
 
     def run(
         self, procedure: Procedure[Outcome], progress: Callable[[float], None] = lambda _: None, /
     ) -> Run[Outcome]:
-        """Run one procedure to its end; raises as `Bench.run` does."""
+        """Runs one procedure to its end; raises as `Bench.run` does."""
         connection = self._connection
         connection.send(Ask(self._compensation, procedure))
         stopped = False
@@ -246,7 +249,7 @@ class PipedBench:
 
 
 class PipedRig:
-    """`hdbridge.control.rig.Rig` at the job's end."""
+    """`hdbridge.control.rig.Rig` in the job's process."""
 
     def __init__(self, connection: Connection, axis: AxisConfig, identity: Identity) -> None:
         self._connection = connection
@@ -256,12 +259,12 @@ class PipedRig:
     def bench(
         self, compensation: Compensation | None = None, *, interrupted: Callable[[], bool] = lambda: False
     ) -> PipedBench:
-        """A bench on the service's axis."""
+        """Returns a bench on the service's axis."""
         return PipedBench(self._connection, compensation, interrupted)
 
 
 def told_over(connection: Connection, interrupted: Callable[[], bool]) -> Told:
-    """`Told` that tells the service."""
+    """Returns a `Told` that reports to the service."""
     return Told(
         phase=lambda name, done_s, total_s: connection.send(Phase(name, done_s, total_s)),
         line=lambda text: connection.send(Line(text)),
@@ -272,7 +275,7 @@ def told_over(connection: Connection, interrupted: Callable[[], bool]) -> Told:
 
 @contextlib.contextmanager
 def telling_failure(connection: Connection) -> Iterator[None]:
-    """Tell the service of what goes wrong within."""
+    """Reports an error within the block to the service."""
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:

@@ -1,6 +1,7 @@
 """The process of one job: ``python -m hdbridge.daemon.service.jobprocess FD``, started by the service.
 
-It has low priority, the end of a pipe to the service, and nothing of the bus. When the service dies it ends.
+It runs at low priority, holds one end of a pipe to the service and has no access to the bus. It ends when
+the service dies.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from hdbridge.errors import InputError
 
 NICENESS: Final = 10
 END_S: Final = 5.0
-"""By then a process whose work is over has ended; else it is killed."""
+"""Time in which a process that has finished must exit; then it is killed."""
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -33,20 +34,20 @@ class JobProcess:
         self.connection = connection
 
     def ended(self) -> str:
-        """How it has ended, in words; empty while it runs."""
+        """Returns the exit status or signal in words; empty while the process runs."""
         with suppress(subprocess.TimeoutExpired):
             status = self._process.wait(END_S)
             return f" (signal {-status})" if status < 0 else f" (exit status {status})"
         return ""
 
     def interrupt(self) -> None:
-        """As Ctrl-C does."""
+        """Interrupts the process, as Ctrl-C does."""
         self._process.send_signal(signal.SIGINT)
 
 
 @contextmanager
 def job_process(begin: Begin) -> Iterator[JobProcess]:
-    """Start a job's process; it is gone when the block ends."""
+    """Starts a job's process and ends it with the block."""
     here, there = socketpair()
     with there:
         process = subprocess.Popen(
@@ -68,7 +69,7 @@ def job_process(begin: Begin) -> Iterator[JobProcess]:
 
 
 def main(arguments: list[str]) -> int:
-    """The job's process itself."""
+    """Runs the job's process; returns the exit status."""
     from hdbridge.daemon.service.jobwork import run  # noqa: PLC0415 - the service, which starts it, does no job
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)

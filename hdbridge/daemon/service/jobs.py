@@ -1,8 +1,8 @@
 """Jobs: procedures that run through the daemon while it holds the bus. At most one per axis.
 
-A job has the axis to itself: whatever else would move it is refused until the job has ended, but anybody may
-stop it. It goes on when the lease runs out under which it began. Afterwards the axis is disabled, and
-compensated as before.
+A job has exclusive use of its axis: other motion is refused until it ends, but any client may stop it. It
+continues when the lease under which it began expires. Afterwards the axis is disabled, and compensated as
+before.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ JOBS_KEPT: Final = 100
 _log = logging.getLogger(__name__)
 
 Runner = Callable[[Work, DaemonRig, Told], dict[str, Any]]
-"""Does a job, blocking."""
+"""Function that runs a job; it blocks."""
 
 
 def in_own_process(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
-    """In a process of its own, with low priority."""
+    """Runs a job in its own process at low priority."""
     with job_process(Begin(work, rig.identity)) as process:
         return Served(process.connection, rig, told, process.ended, process.interrupt).until_done()
 
 
 class _Running:
-    """A job and what is known of it; the worker thread writes, the event loop reads."""
+    """A job and its state; the worker thread writes, the event loop reads."""
 
     def __init__(self, job: messages.Job, axis: ServiceAxis, activity: Activity) -> None:
         self.job = job
@@ -52,11 +52,11 @@ class _Running:
         self.cancelled = threading.Event()
 
     def update(self, **changes: Any) -> None:
-        """Another state of it."""
+        """Changes fields of the job's message."""
         self.job = self.job.model_copy(update=changes)
 
     def phase(self, name: str, done_s: float, total_s: float) -> None:
-        """How far it is."""
+        """Updates the progress; the share never decreases."""
         share = min(max(done_s / total_s, 0.0), 1.0) if total_s > 0.0 else 0.0
         self.update(text=name, share=max(share, self.job.share))
 
@@ -70,7 +70,7 @@ class JobBook:
         recordings: Callable[[ServiceAxis], Path],
         runner: Runner = in_own_process,
     ) -> None:
-        """``recordings`` says where an axis's recordings go."""
+        """``recordings`` returns the folder for an axis's recordings."""
         self._core = core
         self._recordings = recordings
         self._runner = runner
@@ -79,16 +79,16 @@ class JobBook:
         self._numbers = itertools.count(1)
 
     def all(self) -> list[messages.Job]:
-        """Those that run and the last ones that ran, newest last."""
+        """Returns the running jobs and the last finished ones, newest last."""
         return [each.job for each in self._jobs.values()]
 
     def of_axis(self, name: str) -> messages.Job | None:
-        """The one that runs on an axis."""
+        """Returns the job that runs on an axis, or None."""
         running = (each.job for each in self._jobs.values() if each.job.axis == name)
         return next((each for each in running if each.state is JobState.RUNNING), None)
 
     def begin(self, axis: ServiceAxis, holder: str, kind: JobKind, given: Mapping[str, Any]) -> messages.Job:
-        """Begin a job; it runs when this returns. InputError for options that it does not have."""
+        """Begins a job, which runs when this returns. Raises InputError for invalid options."""
         options = options_of(kind, given)
         axis.check_free()
         now = datetime.now(UTC)
@@ -118,7 +118,7 @@ class JobBook:
         return job
 
     def cancel(self, job_id: str) -> None:
-        """Stop a job's axis in order; what it has measured is kept. InputError where there is no such job."""
+        """Cancels a job: its axis brakes to rest, its measurements are kept. InputError for an unknown id."""
         running = self._jobs.get(job_id)
         if running is None:
             raise InputError(
@@ -127,7 +127,7 @@ class JobBook:
         running.cancelled.set()
 
     async def close(self) -> None:
-        """Cancel what runs, and wait for its end."""
+        """Cancels all running jobs and waits for their end."""
         for each in self._jobs.values():
             each.cancelled.set()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -168,7 +168,7 @@ class JobBook:
 
 
 def _uninterrupted(runner: Runner, work: Work, rig: DaemonRig, told: Told) -> dict[str, Any] | None:
-    """The job's document; None where it was interrupted."""
+    """Runs a job; returns its document, or None if it was interrupted."""
     try:
         return runner(work, rig, told)
     except KeyboardInterrupt:

@@ -1,6 +1,6 @@
-"""What a job does, on whatever rig it is given: step, calibrate, improve, as the commands of these names do.
+"""Work of the jobs step, calibrate and improve on any rig, as the commands of these names do it.
 
-It runs in a process of its own (`jobprocess`), so that hours of fitting cost the clients nothing.
+It runs in its own process (`jobprocess`), so that hours of fitting do not slow down the service.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ PAGE_NAME: Final = "report.html"
 
 
 def run(work: Work, rig: Rig, told: Told) -> dict[str, Any]:
-    """Do it; the document that the command of the same name writes. Raises as that does.
+    """Runs a job and returns the document that the command of the same name writes; raises as that does.
 
-    KeyboardInterrupt where it was interrupted; what was measured is kept.
+    Raises KeyboardInterrupt if the job was interrupted; its measurements are kept.
     """
     match work.options:
         case StepOptions() as options:
@@ -147,7 +147,7 @@ def _model(work: Work, version: int | None) -> TransmissionModel:
 
 
 def _journal(work: Work, options: CalibrateOptions, rig: Rig, told: Told) -> tuple[Plan, Path, Journal]:
-    """The recording that goes on, else a new one."""
+    """Returns the journal of the recording to continue, else of a new one."""
     if options.resume is not None:
         folder = work.recordings / options.resume
         journal = Journal.open(folder)
@@ -156,7 +156,7 @@ def _journal(work: Work, options: CalibrateOptions, rig: Rig, told: Told) -> tup
         return journal.plan, folder, journal
     own = work.profile.folder / f"{options.plan}.yaml"
     plan = Plan.load(str(own) if own.is_file() else options.plan)
-    outlook(plan, work.axis)  # refused before a folder is made
+    outlook(plan, work.axis)  # raises before a folder is created
     folder = _new_folder(work, "")
     told.folder(folder)
     return plan, folder, start_journal(folder, work.axis, plan, work.date, rig.identity)
@@ -174,7 +174,7 @@ def _kept(folder: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 class _Phases:
-    """Phases that follow each other, told as one: each total is another phase."""
+    """Combines consecutive phases into one progress; a different total marks a new phase."""
 
     def __init__(self, told: Told, total_s: float) -> None:
         self._told = told

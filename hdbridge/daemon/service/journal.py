@@ -1,4 +1,4 @@
-"""What the control process tells, as lines of the log: it logs nothing itself."""
+"""Log lines for the control process's events, because that process writes no log."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _LEVELS: Final = {
     EventKind.DONE: logging.DEBUG,
     EventKind.MOTION_ENDED: logging.DEBUG,
 }
-"""Of the others INFO."""
+"""Log levels by kind of event; all others are INFO."""
 
 
 class Journal:
-    """A sink of the observer: an event a line, with the name of its axis."""
+    """A sink of the observer that logs one line per event, with the name of its axis."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples and events from the observer."""
         if lost:
             _log.warning("cycles lost", {"cycles": lost})
         for event in events:

@@ -1,8 +1,8 @@
-"""The lease: one client at a time holds the right to move. Pure: the clock is passed in.
+"""The lease: only one client at a time may move axes. Pure: the clock is passed in.
 
-A client takes the lease and gets a token; whatever moves an axis asks for the token. The lease runs out when
-its holder has not been heard of for its time-out, so that a client that died does not keep the machine. To
-watch, to stop and to quick-stop takes no lease.
+A client takes the lease and receives a token, which every request that moves an axis must carry. The lease
+expires when its holder has made no request during the time-out, so that a dead client does not block the
+machine. Reading, stopping and quick-stopping require no lease.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from hdbridge.errors import InputError, LeaseError
 
 TOKEN_BYTES = 16
 LONGEST_NAME = 400
-"""A client's own name, and its user and process."""
+"""Maximum length of a client's name, which includes its user and process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who holds the right to move."""
+    """Holder of the lease."""
 
     client: str
-    """Its name, for people."""
+    """Name of the client."""
     taken_s: float
-    """When it was taken, on the lease's clock."""
+    """Time at which it was taken; lease's clock."""
     expires_s: float
-    """When it runs out, unless its holder is heard of before."""
+    """Time at which it expires unless the holder makes a request before."""
 
 
 class Lease:
-    """The right to move. Not thread-safe: one thread asks.
+    """The lease. Not thread-safe: use it from one thread.
 
-    ``now`` gives the seconds of a monotonic clock; ``new_token`` is for tests.
+    ``now`` returns the seconds of a monotonic clock; ``new_token`` can be replaced in tests.
     """
 
     def __init__(
@@ -55,16 +55,16 @@ class Lease:
 
     @property
     def holder(self) -> Holder | None:
-        """Who holds it now; None where nobody does."""
+        """Present holder; None if the lease is free."""
         self._expire()
         if self._token is None:
             return None
         return Holder(self._client, self._taken_s, self._heard_s + self.timeout_s)
 
     def take(self, client: str, *, force: bool = False) -> str:
-        """Take it; the token that shows it. ``force`` takes it from another holder.
+        """Takes the lease and returns its token. ``force`` takes it from another holder.
 
-        LeaseError where another client holds it; InputError for a client without a name.
+        Raises LeaseError if another client holds it, InputError if the client's name is empty or too long.
         """
         if not client.strip() or len(client) > LONGEST_NAME:
             raise InputError(
@@ -85,18 +85,18 @@ class Lease:
         return self._token
 
     def renew(self, token: str) -> Holder:
-        """Its holder is still there: it lasts for another time-out. LeaseError as `check`."""
+        """Extends the lease by its time-out. Raises LeaseError as `check` does."""
         self.check(token)
         assert self.holder is not None
         return self.holder
 
     def release(self, token: str) -> None:
-        """Give it back. LeaseError as `check`, so that nobody gives back what another has taken."""
+        """Releases the lease. Raises LeaseError as `check` does, so that only its holder can release it."""
         self.check(token)
         self._end()
 
     def check(self, token: str) -> None:
-        """LeaseError unless ``token`` is the present holder's, who has been heard of by that."""
+        """Raises LeaseError unless ``token`` is the present holder's; extends the lease by its time-out."""
         holder = self.holder
         if holder is None:
             raise LeaseError("nobody holds the right to move, or it has run out: take the lease first")
@@ -108,13 +108,13 @@ class Lease:
         self._heard_s = self._now()
 
     def holds(self, token: str) -> bool:
-        """Whether ``token`` is the present holder's; it is not heard of by that."""
+        """Returns True if ``token`` is the present holder's; does not extend the lease."""
         return self.holder is not None and token == self._token
 
     def ended(self) -> tuple[str, ...]:
-        """The clients whose lease has ended since this was last asked, in that order: for what follows it.
+        """Returns the clients whose leases have ended since the last call, in order.
 
-        Ended means released, run out or taken by force.
+        A lease ends when it is released, expires or is taken by force.
         """
         self._expire()
         ended, self._ended = tuple(self._ended), []

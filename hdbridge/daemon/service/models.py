@@ -1,8 +1,8 @@
-"""The model that compensates an axis: what clients have chosen, and what the control process uses.
+"""Model that compensates an axis: the one that clients chose and the one that the control process uses.
 
-The two differ after a restart of the control process and during a job. `AxisModels.in_use` follows the
-acknowledgement of the control process, so nobody is shown a model that is not at work. While
-`AxisModels.settled` is False the service sends what was chosen again.
+They differ after a restart of the control process and during a job. `AxisModels.in_use` follows the
+acknowledgement of the control process, so clients never see a model that is not in effect. While
+`AxisModels.settled` is False, the service sends the chosen setting again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class AxisModels:
     """The models of one axis."""
 
     def __init__(self, axis: Axis, slot: SettingSlot) -> None:
-        """Takes over the setting that an earlier service has sent; else the active model is chosen."""
+        """Adopts the setting that an earlier service sent; else chooses the active model."""
         self._axis = axis
         self._slot = slot
         self._sent: dict[int, CompensationSetting] = {}
@@ -35,28 +35,28 @@ class AxisModels:
         with suppress(InputError):
             self._sent[slot.number] = CompensationSetting.from_json(slot.get(slot.number))
         self.chosen = self._sent.get(slot.number) or self._active()
-        """The setting that the axis is to use."""
+        """Setting that the axis is to use."""
 
     @property
     def in_use(self) -> CompensationSetting:
-        """The setting that the control process uses; uncompensated before it has taken any."""
+        """Setting that the control process uses; uncompensated before the first."""
         return self._sent.get(self._slot.in_use, self._none)
 
     @property
     def settled(self) -> bool:
-        """Whether the control process uses the setting that was chosen, and none is under way to it."""
+        """True if the control process uses the chosen setting and no other is being sent."""
         number = self._slot.in_use
         return self._slot.number == number and self._sent.get(number) is self.chosen
 
     def send(self, setting: CompensationSetting) -> int:
-        """Store a setting for the control process; returns the argument of CHANGE."""
+        """Stores a setting for the control process; returns the argument of CHANGE."""
         number = self._slot.put(setting.to_json())
         in_use = self._slot.in_use
         self._sent = {in_use: self._sent.get(in_use, self._none), number: setting}
         return number
 
     def send_for_job(self, model: TransmissionModel) -> int:
-        """The same for a model that a job runs with. The load loop is off: the job measures without it."""
+        """Stores the setting of a job's model, without the load loop; returns the argument of CHANGE."""
         setting = CompensationSetting(model, Scheme.EXTENDED if model.effects else Scheme.NONE)
         for scheme in Scheme:
             known = replace(self.chosen, scheme=scheme, load_loop=False)
@@ -66,11 +66,11 @@ class AxisModels:
         return self.send(setting)
 
     def check_drive(self, identity: Identity) -> None:
-        """InputError if the chosen model is of another drive than the one that answers."""
+        """Raises InputError if the chosen model belongs to another drive than ``identity``."""
         self.chosen.model.check_bound_to(self._axis.config, identity)
 
     def with_scheme(self, scheme: Scheme) -> CompensationSetting:
-        """The chosen model by another scheme. InputError if there is no model."""
+        """Returns the chosen setting with another scheme. Raises InputError if there is no model."""
         if scheme is Scheme.EXTENDED and not self.chosen.model.effects:
             raise InputError(
                 f"{self._axis.name}: there is no model to compensate with; calibrate first, or use 'none'"
@@ -78,15 +78,15 @@ class AxisModels:
         return self._checked(replace(self.chosen, scheme=scheme))
 
     def with_load_loop(self, on: bool) -> CompensationSetting:
-        """The chosen model with the load loop on or off. InputError if the axis has none."""
+        """Returns the chosen setting with the load loop on or off. Raises InputError if the axis has none."""
         if self._axis.load_loop is None:
             raise InputError(f"{self._axis.name}: has no load loop; give the axis one in the machine file")
         return replace(self.chosen, load_loop=on)
 
     def found(self, version: int | Literal["pending", "active"], identity: Identity) -> CompensationSetting:
-        """A model of the profile, by the present scheme.
+        """Returns the setting of another model of the profile, with the present scheme.
 
-        InputError if there is no such model, or it is of another axis, drive or gear.
+        Raises InputError if there is no such model, or it belongs to another axis, drive or gear.
         """
         found = store.find(self._axis.profile.folder, str(version))
         found.content.check_bound_to(self._axis.config, identity)
@@ -97,7 +97,7 @@ class AxisModels:
     def activate(
         self, version: int | Literal["pending", "active"], identity: Identity, date: datetime
     ) -> None:
-        """Make the model in use, found under this name, the active model of the profile."""
+        """Makes the model in use, found by `found` under ``version``, the active model of the profile."""
         folder, number = self._axis.profile.folder, self.chosen.version
         if version == store.PENDING:
             number = store.commit(folder, date, identity)
@@ -106,7 +106,7 @@ class AxisModels:
         self.chosen = replace(self.chosen, version=number, file=self._axis.profile.model)
 
     def moved(self, model: TransmissionModel) -> CompensationSetting:
-        """The chosen model with other parameters: ``model`` is the whole of it, as it was moved."""
+        """Returns the chosen setting with adapted parameters; ``model`` is the complete adapted model."""
         return self._checked(replace(self.chosen, adapted=model))
 
     def _checked(self, setting: CompensationSetting) -> CompensationSetting:
@@ -114,7 +114,7 @@ class AxisModels:
         return setting
 
     def _active(self) -> CompensationSetting:
-        """The active model, with its number in the history, by the scheme of the machine file."""
+        """Returns the setting of the active model, with its version, by the machine file's scheme."""
         axis = self._axis
         number = None
         if axis.profile.model.exists():

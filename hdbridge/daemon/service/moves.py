@@ -1,7 +1,7 @@
-"""Motion of one axis for clients: moves, jogs, a queue of way points, streams; what takes whose place.
+"""Motion of one axis for clients: moves, jogs, streams and a queue of way points.
 
-The newest wins: a move takes the place of whatever moves the axis, and the queue is forgotten. Whether a
-motion is possible the control process decides, before anything of the present one has changed.
+The newest request wins: a move replaces any present motion and clears the queue. The control process decides
+if a motion is possible, before the present one changes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from hdbridge.axis.config import Limits
 
 QUEUE_MOST: Final = 1000
-"""Way points that wait."""
+"""Maximum number of waiting way points."""
 
 
 class AxisMotion:
-    """What moves one axis at present, and what waits."""
+    """The present motion of one axis and its queue."""
 
     def __init__(self, link: AxisLink, limits: Limits) -> None:
         self._link = link
@@ -36,28 +36,28 @@ class AxisMotion:
         self.activity: Activity | None = None
         self._points: deque[WayPoint] = deque()
         self.commanding = asyncio.Lock()
-        """Held while one motion takes the place of another."""
+        """Held while one motion replaces another."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def queued(self) -> int:
-        """Way points that wait."""
+        """Number of waiting way points."""
         return len(self._points)
 
     def busy(self, *kinds: Kind) -> bool:
-        """Whether one of these is under way."""
+        """Returns True if an activity of one of these kinds is under way."""
         activity = self.activity
         return activity is not None and not activity.over and activity.kind in kinds
 
     def replace(self, activity: Activity | None, why: str) -> None:
-        """Another activity, or none, in place of the present one; what waits in the queue is forgotten."""
+        """Replaces the present activity by another or none, and clears the queue."""
         if self.activity is not None:
             self.activity.end(why)
         self._points.clear()
         self.activity = activity
 
     def without_lease(self) -> bool:
-        """Whether something goes on that must not, because the lease has ended under which it began."""
+        """Returns True if the present activity must stop because the lease under which it began has ended."""
         activity = self.activity
         return (
             self.busy(*ENDS_WITH_LEASE)
@@ -66,7 +66,7 @@ class AxisMotion:
         )
 
     async def move(self, holder: str, point: WayPoint) -> Activity:
-        """Move, from rest or from any motion; has begun when this returns."""
+        """Begins a move, from rest or during any motion."""
         self._check(point)
         activity = Activity(Kind.MOVE, holder)
         async with self.commanding:
@@ -75,7 +75,7 @@ class AxisMotion:
         return activity
 
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float) -> None:
-        """Turn at a speed until the time-out."""
+        """Turns at a speed until the time-out."""
         activity = Activity(Kind.JOG, holder)
         async with self.commanding:
             activity.since = self._link.core.log.newest
@@ -84,7 +84,7 @@ class AxisMotion:
             self.replace(activity, "a jog took its place")
 
     async def stream(self, holder: str, timeout_s: float) -> ServiceStream:
-        """Follow set-points; begins with the first ones that are put."""
+        """Opens a stream, which begins with the first set-points that are put."""
         activity = Activity(Kind.STREAM, holder)
         async with self.commanding:
             link = self._link
@@ -95,9 +95,10 @@ class AxisMotion:
         return stream
 
     async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
-        """Append moves, each begun when the one before stands; how many wait now.
+        """Appends all or none of these moves, each begun when the one before has ended.
 
-        All are taken or none.
+        Returns the number of waiting moves. Raises InputError for an invalid point, RefusedError if another
+        motion is under way or the queue is full.
         """
         name = self._link.name
         for point in points:
@@ -121,13 +122,13 @@ class AxisMotion:
         return self.queued
 
     def clear_queue(self) -> int:
-        """Forget the moves that have not begun; how many those were."""
+        """Discards the waiting moves and returns their number."""
         forgotten = self.queued
         self._points.clear()
         return forgotten
 
     async def close(self) -> None:
-        """Nothing more is begun; the axis goes on with what it was told."""
+        """Ends the queue; the axis completes its present motion."""
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -144,7 +145,7 @@ class AxisMotion:
         activity.command_id = answer.id
 
     async def _run(self, activity: Activity, before: Activity | None) -> None:
-        """The way points one after the other, until there are no more or something else moves the axis."""
+        """Runs the way points in turn, until none is left or another activity replaces the queue."""
         link = self._link
         try:
             if before is not None and before.kind is Kind.MOVE and not before.over:
@@ -155,7 +156,7 @@ class AxisMotion:
                         return
                     point = self._points[0]
                     await self._goto(activity, point)
-                    # The queue may have been cleared while the loop was told of this one.
+                    # The queue may have been cleared while this move was being sent.
                     if not activity.over and self._points and self._points[0] is point:
                         self._points.popleft()
                 await self._leg(activity)
@@ -168,7 +169,7 @@ class AxisMotion:
             activity.end("the queue came to its end")
 
     async def _leg(self, activity: Activity) -> None:
-        """Wait for the end of the present move of a queue, which goes on after it."""
+        """Waits for the end of one move of the queue, without ending the queue."""
         move = Activity(Kind.MOVE, activity.holder, activity.command_id, activity.since)
         await self._link.arrival(move, activity)
 

@@ -1,4 +1,4 @@
-"""What the control process tells, handed on to whoever looks: recorder, watch, adaptation, live clients."""
+"""Distribution of samples and events to the recorder, the watch, the adaptation and live clients."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from hdbridge.daemon.service.interface import Batch
 
 PERIOD_S = 0.02
 GONE_S = 3.0
-"""Without a turn for so long the control process hangs or is gone."""
+"""Time without a turn after which the control process is considered hung or gone."""
 _log = logging.getLogger(__name__)
 
 
 class Sink(Protocol):
-    """Takes what comes; it must not block: what takes time is for a thread of its own and a bounded queue."""
+    """Receiver of samples and events. It must not block; slow work needs a thread and a bounded queue."""
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Cycles and events since the last call, oldest first, and how many cycles were lost before them."""
+        """Takes the samples and events since the last call, oldest first, and the number of lost cycles."""
         ...
 
 
 class Observer:
-    """Reads the rings every `PERIOD_S` and hands on what came."""
+    """Reads the rings every `PERIOD_S` and passes new samples and events to the sinks."""
 
     def __init__(self, memory: Memory, log: EventLog, clock: Clock) -> None:
         self._reader = memory.reader()
@@ -44,18 +44,18 @@ class Observer:
         self._sinks: list[Sink] = []
         self._broken: set[int] = set()
         self.none: SampleArray = np.empty(0, sample_dtype(memory.axes))
-        """No samples, of the right kind."""
+        """Empty array of samples."""
         self.newest: SampleArray | None = None
-        """The newest sample, shape (1,); None before the first."""
+        """Newest sample, shape (1,); None before the first."""
         self.lost = 0
-        """Cycles that this process was too slow for."""
+        """Cycles lost because this process was too slow."""
 
     def add(self, sink: Sink) -> None:
-        """Hand on to ``sink`` too, from now on."""
+        """Adds a sink."""
         self._sinks.append(sink)
 
     def remove(self, sink: Sink) -> None:
-        """Hand nothing more to it."""
+        """Removes a sink."""
         self._sinks.remove(sink)
 
     @property
@@ -65,11 +65,11 @@ class Observer:
 
     @property
     def alive(self) -> bool:
-        """Whether the control process has turned lately."""
+        """True if the control process has completed a turn within `GONE_S`."""
         return self._clock.now() - self._turned_s < GONE_S
 
     def poll(self) -> None:
-        """Read what came and hand it on. One sink's error stays its own; it is logged once."""
+        """Reads the rings and calls the sinks. An error of a sink is logged once and affects no other."""
         samples, lost = self._reader.read()
         self._log.poll()
         turns = self._status.loop_count
@@ -93,9 +93,9 @@ class Observer:
 
 
 class Subscription:
-    """One live client's share: the newest samples until they are fetched. An asynchronous iterator.
+    """Buffer of one live client: the newest samples until they are fetched. An asynchronous iterator.
 
-    A client that is too slow loses samples, not memory; each batch tells how many.
+    A client that is too slow loses samples; each batch contains the number lost.
     """
 
     def __init__(
@@ -104,7 +104,9 @@ class Subscription:
         events_since: Callable[[int], tuple[list[messages.Event], int]],
         most: int,
     ) -> None:
-        """At most ``most`` samples wait; ``events_since`` gives the events after a number, and the newest."""
+        """Keeps at most ``most`` samples; ``events_since`` returns the events after a number, and the newest
+        number.
+        """
         self._observer = observer
         self._most = most
         self._samples: deque[SampleArray] = deque()
@@ -116,7 +118,7 @@ class Subscription:
         observer.add(self)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer, in the thread of the event loop."""
+        """Takes samples from the observer, in the thread of the event loop."""
         self._lost += lost + max(len(samples) - self._most, 0)
         kept = samples[-self._most :]
         if len(kept):
@@ -132,11 +134,10 @@ class Subscription:
         self._came.set()
 
     def __aiter__(self) -> AsyncIterator[Batch]:
-        """Itself."""
         return self
 
     async def __anext__(self) -> Batch:
-        """What came since the last one; waits until there is something."""
+        """Returns the next batch; waits until there is one."""
         await self._came.wait()
         self._came.clear()
         events, self._seen = self._events_since(self._seen)
@@ -147,5 +148,5 @@ class Subscription:
         return batch
 
     def close(self) -> None:
-        """Nothing more is wanted."""
+        """Ends the subscription."""
         self._observer.remove(self)

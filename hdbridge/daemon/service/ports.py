@@ -1,4 +1,4 @@
-"""One axis, for clients: who may ask, and what it then does; the parts of it do the rest."""
+"""One axis, for clients: checks who may ask, and delegates the work to its parts."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from hdbridge.model import TransmissionModel
 
 CHANGE_S: Final = 120.0
-"""By then another compensation has been faded in, however slow its ramp."""
+"""Time in which another compensation is faded in, however slow its ramp."""
 _POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
 
 
 class ServiceAxis:
-    """One axis of the machine; `interface.AxisPort` says what each method does."""
+    """One axis of the machine; `interface.AxisPort` documents each method."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class ServiceAxis:
         begin_job: Callable[[ServiceAxis, str, messages.JobKind, Mapping[str, Any]], messages.Job],
         report: Callable[[str], messages.AxisState],
     ) -> None:
-        """``begin_job`` begins a job for the lease's holder, ``report`` says everything about an axis."""
+        """``begin_job`` begins a job for the lease's holder, ``report`` returns the state of an axis."""
         self.axis = axis
         self.name = axis.name
         self.core = core
@@ -61,25 +61,25 @@ class ServiceAxis:
         self._changing = asyncio.Lock()
         self._job_runs = False
         self._doing = ""
-        """What a client has begun that has the drive to itself, in words."""
+        """Client request that has exclusive use of the drive, in words; empty if none."""
         self._drive = asyncio.Lock()
-        """Held by whatever has the drive to itself, also by what nobody asked for: that is waited for."""
+        """Held during exclusive use of the drive, also by the service's own work, for which clients wait."""
 
-    # ---------------------------------------------------------------- who may
+    # ---------------------------------------------------------------- checks
 
     def state(self) -> messages.AxisState:
-        """Everything about it at the newest cycle."""
+        """Returns the state of the axis in the newest cycle."""
         return self._report(self.name)
 
     def check_may(self, holder: str) -> None:
-        """LeaseError unless the lease is theirs; RefusedError while something has the axis to itself."""
+        """Raises LeaseError unless ``holder`` has the lease, RefusedError if a job or request uses it."""
         self.core.lease.check(holder)
         if self.motion.busy(Kind.JOB):
             raise self._job_refusal()
         self.check_free()
 
     def check_free(self) -> None:
-        """RefusedError while something has the drive to itself."""
+        """Raises RefusedError if another request has exclusive use of the drive."""
         if self._doing:
             raise RefusedError(
                 f"{self.name}: {self._doing}; wait for its end, or end it with "
@@ -93,7 +93,7 @@ class ServiceAxis:
 
     @asynccontextmanager
     async def _alone(self, doing: str) -> AsyncIterator[None]:
-        """Nothing else begins meanwhile; to stop is possible at any time."""
+        """Reserves the drive for one request; a stop remains possible at any time."""
         self.check_free()
         holder = self.core.lease.holder
         self._doing = doing if holder is None else f"{doing} for '{holder.client}'"
@@ -106,7 +106,7 @@ class ServiceAxis:
     # ---------------------------------------------------------------- power
 
     async def enable(self, holder: str) -> None:
-        """Power on, standing still."""
+        """Switches power on, at rest."""
         self.check_may(holder)
         async with self._alone("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled anew")
@@ -114,41 +114,41 @@ class ServiceAxis:
             await self.power.enable()
 
     async def disable(self, holder: str) -> None:
-        """Brake to rest, then power off."""
+        """Brakes to rest, then switches power off."""
         self.core.lease.check(holder)
         self.motion.replace(None, "the axis was disabled")
         async with self._alone("the axis is being disabled"):
             await self.power.disable()
 
     def give_up(self, why: str) -> None:
-        """Nothing that is under way goes on: what waits, what is asked of the drive by SDO."""
+        """Ends the present activity and interrupts SDO requests to the drive."""
         self.motion.replace(None, why)
         self.power.interrupt(f"{self.name}: {why}")
 
     async def quick_stop(self) -> None:
-        """Stop at once, latched."""
+        """Quick-stops the axis and latches the stop."""
         self.give_up("it was stopped by a quick stop")
         await self.link.do(CommandKind.QUICK_STOP)
 
     async def stop(self) -> None:
-        """Brake to rest within the limits, and stay enabled."""
+        """Brakes to rest within the limits and stays enabled."""
         self.give_up("it was stopped by a client")
         await self.link.do(CommandKind.STOP)
 
     async def reset(self, holder: str) -> None:
-        """Release what is latched; disabled then."""
+        """Releases a latched stop; the axis is disabled afterwards."""
         self.check_may(holder)
         async with self._alone("the axis is being reset"):
             self.motion.replace(None, "the axis was reset")
             await self.power.reset()
 
     async def take_over(self) -> None:
-        """The service begins: take the axis as an earlier one has left it."""
+        """Takes over the axis from an earlier service process."""
         async with self._drive:
             await self.power.take_over()
 
     async def verify(self) -> None:
-        """Boot the drive and compare it with its axis file, where that is due; disabled then."""
+        """Boots and verifies the drive if it is not verified; the axis is disabled afterwards."""
         async with self._drive:
             if self.link.state not in UNKNOWN:
                 return
@@ -165,7 +165,7 @@ class ServiceAxis:
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
     ) -> float:
-        """Home by the drive's own method; disabled before and after."""
+        """Homes by the drive's own method, disabled before and after; returns the load angle."""
         self.check_may(holder)
         run = HomingRun(
             method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
@@ -183,59 +183,59 @@ class ServiceAxis:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        """Move, from rest or from any motion."""
+        """Moves to a target, from rest or during any motion."""
         self.check_may(holder)
         activity = await self.motion.move(holder, WayPoint(target_deg, velocity_deg_s, acceleration_deg_s2))
         if wait:
             await self.link.arrival(activity)
 
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
-        """Turn at a speed until the time-out."""
+        """Turns at a speed until the time-out."""
         self.check_may(holder)
         await self.motion.jog(holder, velocity_deg_s, timeout_s)
 
     async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
-        """Append moves, each begun when the one before stands."""
+        """Appends moves to the queue; returns the number of waiting moves."""
         self.check_may(holder)
         return await self.motion.queue(holder, points)
 
     async def clear_queue(self, holder: str) -> int:
-        """Forget the moves that have not begun."""
+        """Discards the waiting moves and returns their number."""
         self.check_may(holder)
         return self.motion.clear_queue()
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
-        """Follow set-points."""
+        """Opens a stream of set-points."""
         self.check_may(holder)
         return await self.motion.stream(holder, timeout_s)
 
     async def end_without_lease(self) -> None:
-        """Stop what must not go on, because the lease has ended under which it began."""
+        """Stops an activity that must end with its lease, if that lease has ended."""
         if not self.motion.without_lease():
             return
         async with self.motion.commanding:
-            # Meanwhile the motion of another client may have taken its place: that one goes on.
+            # Another client's motion may have replaced it meanwhile; that one continues.
             activity = self.motion.activity
             if activity is None or not self.motion.without_lease():
                 return
             self.motion.replace(None, "the lease has ended")
             if activity.kind is Kind.JOG and self.link.value("mode") == MotionMode.HOLD:
-                return  # it has run out by itself
+                return  # its time-out has stopped it already
             self.core.log.note(
                 f"{activity.kind.value} was stopped: the lease of its client has ended", self.link.index
             )
             await self.link.do(CommandKind.STOP)
 
-    # ---------------------------------------------------------------- what compensates it
+    # ---------------------------------------------------------------- compensation
 
     async def compensate(self, holder: str, scheme: Scheme) -> None:
-        """Compensate by this part of the model in use."""
+        """Selects the part of the model that compensates."""
         self.check_may(holder)
         async with self._changing:
             await self._use(await self.core.timing.work(self.models.with_scheme, scheme))
 
     async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
-        """Make another model of the profile the active one, and use it."""
+        """Makes another model of the profile the active one, and uses it."""
         self.check_may(holder)
         identity = self.commissioning.identity
         async with self._changing:
@@ -246,28 +246,28 @@ class ServiceAxis:
 
     @property
     def unsettled(self) -> bool:
-        """Whether the control process does not use the chosen setting, and no job is the reason."""
+        """True if the control process does not use the chosen setting, and no job is the reason."""
         return not self.models.settled and not self._job_runs
 
     async def settle(self) -> None:
-        """Have the control process compensate by the chosen setting, if it does not."""
+        """Has the control process compensate by the chosen setting, if it does not."""
         async with self._changing:
             if not self.models.settled:
                 await self._use(self.models.chosen)
 
     async def follow(self, model: TransmissionModel) -> None:
-        """Compensate by the chosen model with the parameters moved; the model keeps its version."""
+        """Compensates with the adapted parameters of the chosen model, which keeps its version."""
         async with self._changing:
             await self._use(await self.core.timing.work(self.models.moved, model))
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
-        """Switch the load loop on or off."""
+        """Switches the load loop on or off."""
         self.check_may(holder)
         async with self._changing:
             await self._use(self.models.with_load_loop(on))
 
     async def _use(self, setting: CompensationSetting) -> None:
-        """Have the control process compensate by a setting, and wait until it does."""
+        """Sends a setting to the control process and waits until it is in effect."""
         if self._job_runs:
             raise self._job_refusal()
         log, index = self.core.log, self.link.index
@@ -281,11 +281,11 @@ class ServiceAxis:
     # ---------------------------------------------------------------- objects of the drive, jobs
 
     async def sdo_read(self, object_: str) -> tuple[Object, Value]:
-        """An object of the drive."""
+        """Reads an object of the drive."""
         return await self.core.timing.work(self.commissioning.read, object_)
 
     async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
-        """Write an object of the drive, while it is not enabled."""
+        """Writes an object of the drive, unless the axis is enabled."""
         self.check_may(holder)
         if self.link.state in _POWERED:
             raise RefusedError(
@@ -296,22 +296,22 @@ class ServiceAxis:
     async def job(
         self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
     ) -> messages.Job:
-        """Begin a job."""
+        """Begins a job."""
         self.check_may(holder)
         return self._begin_job(self, holder, kind, options or {})
 
     def occupy(self, activity: Activity) -> None:
-        """A job has the axis and its compensation from now on, until `vacate`."""
+        """Reserves the axis and its compensation for a job, until `vacate`."""
         self.motion.replace(activity, "a job took its place")
         self._job_runs = True
 
     async def vacate(self) -> None:
-        """The job has ended: the axis is compensated as before."""
+        """Releases the axis after a job and restores its compensation."""
         self._job_runs = False
         with suppress(HdbridgeError):  # the bridge tries again
             await self.settle()
 
     async def close(self) -> None:
-        """Nothing more is begun; the axis goes on with what it was told."""
+        """Ends queue and SDO access; the axis completes its present motion."""
         await self.motion.close()
         self.commissioning.close()

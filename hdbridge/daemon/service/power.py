@@ -1,8 +1,8 @@
-"""Power of one axis: what has to precede it, what follows it, and what leads back after a stop.
+"""Power of one axis: verification, preparation, enabling, disabling and reset.
 
-The drive is booted and verified by SDO before the control process sends it anything; it is made ready by SDO
-before each time that power is switched on; it is verified again after it restarted or the bus was down. The
-axis is never enabled by itself.
+The drive is booted and verified by SDO before the control process sends it anything. It is prepared by SDO
+each time before power is switched on, and verified again after it restarted or the bus was down. An axis is
+never enabled automatically.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
     from hdbridge.axis import Identity
 
 POWER_S: Final = 20.0
-"""By then the drive has power or was refused it; or it was braked and is without."""
+"""Time-out for ENABLE and DISABLE, braking included."""
 FAULT_RESET_S: Final = 2.0
 UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})
-"""States in which the drive has to be verified before anything else."""
+"""States in which the drive must be verified before any other request."""
 
 
 class AxisPower:
-    """One axis. Its coroutines do not go together: the caller has one run at a time."""
+    """Power of one axis. The caller runs one coroutine at a time."""
 
     def __init__(
         self, link: AxisLink, commissioning: Commissioning, check_drive: Callable[[Identity], None]
     ) -> None:
-        """``check_drive`` raises InputError where the model that compensates is of another drive."""
+        """``check_drive`` raises InputError if the compensating model belongs to another drive."""
         self._link = link
         self._drive = commissioning
         self._check_drive = check_drive
         self._work = link.core.timing.work
 
     async def enable(self) -> None:
-        """Power on, standing still. Raises what refuses it; nothing has moved then."""
+        """Switches power on, at rest. Raises the reason for a refusal; nothing has moved then."""
         link = self._link
         if link.state is AxisState.ENABLED:
             return
@@ -60,18 +60,18 @@ class AxisPower:
             raise
 
     async def disable(self) -> None:
-        """Brake to rest, then power off."""
+        """Brakes to rest, then switches power off."""
         await self._link.do(CommandKind.DISABLE, POWER_S)
         await self._rest()
 
     async def _rest(self) -> None:
-        """Where power is off the drive need no longer watch the master."""
+        """Ends the drive's monitoring of the master if power is off."""
         if self._link.state is AxisState.DISABLED and self._link.power is not State.FAULT:
-            with suppress(HdbridgeError):  # it is asked for again each time that power is switched on
+            with suppress(HdbridgeError):  # monitoring is set up again each time power is switched on
                 await self._work(self._drive.rest)
 
     async def reset(self) -> None:
-        """Release what is latched; disabled then."""
+        """Releases a latched stop and resets the drive's fault; the axis is disabled afterwards."""
         link = self._link
         if link.state in UNKNOWN:
             await self.verify(clear_fault=True)
@@ -88,7 +88,7 @@ class AxisPower:
         await self._rest()
 
     async def verify(self, *, clear_fault: bool = False) -> None:
-        """Boot the drive, compare it with its axis file, and let the control process speak to it."""
+        """Boots and verifies the drive, then lets the control process communicate with it."""
         seeds = await self._work(self._drive.verify)
         if clear_fault:
             await self._work(self._drive.clear_fault)
@@ -98,7 +98,7 @@ class AxisPower:
         await self._link.do(CommandKind.VERIFIED, **seeds.arguments())
 
     async def take_over(self) -> None:
-        """A service begins: take the axis as it is. What was lent to the one before is stopped."""
+        """Takes over the axis as it is; stops a drive that was lent to an earlier service."""
         link = self._link
         await link.until(lambda: link.core.observer.newest is not None, ANSWER_S)
         if link.state is AxisState.LENT:
@@ -108,13 +108,13 @@ class AxisPower:
             await self._work(self._drive.take_over)
 
     async def home(self, run: HomingRun) -> float:
-        """Home by the drive's own method, disabled before and after; the load angle where it then stands."""
+        """Homes by the drive's own method, disabled before and after; returns the load angle afterwards."""
         link = self._link
         await link.do(CommandKind.LEND)
         try:
             positions, seeds = await self._work(self._drive.home, run)
         except BaseException:
-            # Where it stands may not be known any more: it has to be verified anew.
+            # The position may be lost, so the drive must be verified again.
             with suppress(HdbridgeError):
                 await link.do(CommandKind.RELEASE)
             raise
@@ -122,5 +122,5 @@ class AxisPower:
         return positions.load_deg
 
     def interrupt(self, reason: str) -> None:
-        """End what is asked of the drive by SDO; homing stops by that."""
+        """Interrupts the present SDO request; a homing axis stops."""
         self._drive.interrupt(reason)

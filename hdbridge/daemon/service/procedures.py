@@ -1,11 +1,10 @@
-"""Procedures on an axis that the daemon holds: a rig whose benches run through the control process.
+"""Procedures on an axis under control of the daemon: a bench that runs through the control process.
 
-Each leg's path is sampled at the cycle, handed over as knots and followed from rest to rest; the samples
-come back from the ring. A leg that stands still (a rest, a hold) sends nothing. So a run is what `Bench.run`
-gives: samples of the same cycles, with a few cycles of standing between two legs, which is how long it takes
-to hear of a leg's end and to begin the next.
+The path of each leg is sampled once per cycle, sent as knots and followed from rest to rest; the samples are
+read from the ring. A leg without motion (a rest, a hold) sends nothing. The result equals that of `Bench.run`
+apart from a few cycles of standstill between legs: the time to detect a leg's end and to begin the next one.
 
-Blocking: it runs in a worker thread. Power is on only while a procedure runs.
+Blocking: use it in a worker thread. Power is on only while a procedure runs.
 """
 
 from __future__ import annotations
@@ -35,31 +34,34 @@ if TYPE_CHECKING:
 
 Outcome = TypeVar("Outcome")
 POLL_S: Final = 0.01
-"""How often is looked for new samples."""
+"""Interval between checks for new samples."""
 STREAM_TIMEOUT_S: Final = 10.0
 BRAKE_S: Final = 30.0
-"""By then an axis that was told to stop stands, and its power is off."""
+"""Time in which an axis that was told to stop is at rest with its power off."""
 _HALVINGS: Final = 5
-"""Of a period between two knots, at most."""
+"""Maximum number of times that a period between two knots is halved."""
 _VELOCITY_SHARE: Final = 1.0 + 3e-7
 _ACCELERATION_SHARE: Final = 1.045
-"""Of the limits, to what more knots are of use: a stream may have a little more."""
+"""Shares of the velocity and acceleration limits above which knots are added; a stream may exceed its limits
+slightly.
+"""
 _JERK_SHARE: Final = 0.3
-"""Most that the acceleration may change within a period, of its limit: where it is more, the cubic between
-two knots would pass that limit however near they are."""
+"""Largest change of acceleration per period, as a share of its limit. Above it, the cubic between two knots
+would exceed the acceleration limit however close they are.
+"""
 _SLOPE_S: Final = 1e-5
-"""Half the time over which a path's velocity is taken."""
+"""Half the interval of the difference quotient for a path's velocity."""
 _ROUNDING_S: Final = 1e-9
 _COLUMNS: Final = Sample._fields[1:-1]
-"""Fields of a sample in the ring that a procedure's sample has by the same name."""
+"""Fields of a procedure's sample that have the same name in the ring."""
 _NOT_SURVIVED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED, AxisState.UNVERIFIED})
 
 
 def knots_of(path: Path, stream: int, period_s: float, limits: MotionLimits) -> Iterator[Knot]:
-    """A path as knots, at rest at both ends; at whole periods they are a bench's targets.
+    """Yields a path as knots, at rest at both ends; at whole periods they equal a bench's targets.
 
-    Where the cubic between two of them would pass a limit that the path itself keeps, as it does when the
-    jerk changes in between, there are more of them.
+    Adds knots where the cubic between two of them would exceed a limit that the path itself keeps, for
+    example at a change of jerk.
     """
     cycles = max(math.ceil(path.duration_s / period_s - _ROUNDING_S), 1)
     before = Knot(stream, 0.0, path.at(0.0), 0.0)
@@ -73,7 +75,7 @@ def knots_of(path: Path, stream: int, period_s: float, limits: MotionLimits) -> 
 
 
 def streamed_view(axis: AxisConfig) -> AxisView:
-    """What a procedure may know of an axis that follows streams: with a jerk that they can follow."""
+    """Returns the view of an axis that follows streams: its jerk limit is reduced to what they can follow."""
     view = axis_view(axis)
     limits = view.limits
     jerk = min(limits.jerk_deg_s3, _JERK_SHARE * limits.acceleration_deg_s2 / axis.drive.cycle_s)
@@ -89,7 +91,7 @@ def _knot(path: Path, stream: int, time_s: float) -> Knot:
 
 
 def _refined(path: Path, begin: Knot, end: Knot, limits: MotionLimits, halvings: int) -> Iterator[Knot]:
-    """``end``, and what has to come before it."""
+    """Yields ``end``, preceded by the knots that must be added before it."""
     cubic = Cubic.between(*begin[1:], *end[1:])
     kept = (
         cubic.fastest_deg_s() <= _VELOCITY_SHARE * limits.velocity_deg_s
@@ -105,7 +107,7 @@ def _refined(path: Path, begin: Knot, end: Knot, limits: MotionLimits, halvings:
 
 @dataclass(slots=True)
 class _Measured:
-    """What a run has measured so far."""
+    """Measurements of a run so far."""
 
     samples: list[Sample] = field(default_factory=list)
     legs: list[Segment] = field(default_factory=list)
@@ -114,7 +116,7 @@ class _Measured:
     skipped: int = 0
 
     def take_fault(self, event: Event) -> None:
-        """A fault that the supervision let pass, or that has stopped the axis."""
+        """Counts a fault, tolerated or not."""
         fault = fault_of(event.code)
         if fault is not None:
             self.faults[fault.value] += 1
@@ -122,12 +124,11 @@ class _Measured:
 
 
 class DaemonBench:
-    """As `Bench`, on an axis that the daemon holds."""
+    """A `Bench` on an axis under control of the daemon."""
 
     def __init__(
         self, rig: DaemonRig, compensation: Compensation | None, interrupted: Callable[[], bool]
     ) -> None:
-        """Made by `DaemonRig.bench`."""
         self._rig = rig
         self._axis = rig.axis
         self._compensation = compensation or rig.uncompensated()
@@ -137,21 +138,21 @@ class DaemonBench:
         self._measured = _Measured()
         self._reader: SampleReader = rig.core.memory.reader()
         self._pending: list[tuple[int, Sample]] = []
-        """Samples that have come and were not given to a leg yet, with their cycles."""
+        """Samples, with their cycles, that are not yet part of a leg."""
         self._place = 0.0
         self._since = 0
         self._skipped: int | None = None
 
-    # ---------------------------------------------------------------- as Bench has them
+    # ---------------------------------------------------------------- interface of Bench
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """The moves that the present procedure has run so far."""
+        """Moves of the present procedure so far."""
         return tuple(self._measured.legs)
 
     @property
     def survived(self) -> tuple[Survived, ...]:
-        """What the present procedure has gone on in spite of so far; the fault that stopped it included."""
+        """Faults that the present procedure tolerated so far, and the one that stopped it."""
         measured = self._measured
         found = [
             Survived(what=what, cycles=cycles, first=measured.first.get(what, ""))
@@ -162,7 +163,7 @@ class DaemonBench:
         return tuple(found)
 
     def record(self) -> Record:
-        """What the present procedure has measured so far; without a channel that was lost on the way."""
+        """Returns the record of the present procedure so far, without a channel that was lost."""
         return record_of(self._measured.samples, self._axis)
 
     def run(
@@ -171,9 +172,9 @@ class DaemonBench:
         progress: Callable[[float], None] = lambda _: None,
         /,
     ) -> Run[Outcome]:
-        """Run one procedure to its end. Refuses and raises as `Bench.run` does.
+        """Runs one procedure to its end. Refuses and raises as `Bench.run` does.
 
-        RefusedError where another client has stopped the axis.
+        Raises RefusedError if another client stopped the axis.
         """
         rig = self._rig
         self._compensation.model.check_bound_to(self._axis, rig.identity)
@@ -185,7 +186,7 @@ class DaemonBench:
             self._begin()
             outcome = walk(procedure, self._view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
-            raise  # it stands, or stops by itself; the latch stays
+            raise  # it is at rest or stopping; the latch remains
         except BaseException:
             rig.stop()
             raise
@@ -205,7 +206,7 @@ class DaemonBench:
     # ---------------------------------------------------------------- legs
 
     def _begin(self) -> None:
-        """The axis is enabled: what it does is measured from now on."""
+        """Starts measuring, after the axis was enabled."""
         self._reader = self._rig.core.memory.reader()
         self._pending.clear()
         self._skipped = None
@@ -215,7 +216,7 @@ class DaemonBench:
         self._place = self._pending[-1][1].load_target_deg
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
-        """One move, from where the load target stands."""
+        """Runs one move from the present load target."""
         if path.lowest_deg == path.highest_deg:
             begin = None
             feed: Iterator[Knot] = iter(())
@@ -231,7 +232,7 @@ class DaemonBench:
                     if begin is not None and cycle < begin:
                         continue
                     samples.append(sample)
-                    # Counted in cycles that were run, as a stream's time is: one may have been skipped.
+                    # Counts executed cycles, as a stream does, because cycles may be skipped.
                     elapsed_s = (len(samples) - 1) * self._period_s
                     if elapsed_s < path.duration_s - _ROUNDING_S:
                         continue
@@ -253,7 +254,7 @@ class DaemonBench:
                 )
 
     def _arrived(self, sample: Sample, path: Path, elapsed_s: float) -> bool:
-        """Whether the set-point stands at the end of a leg: knots that came late have delayed it."""
+        """Returns True if the set-point has reached the end of a leg, which late knots may delay."""
         end_deg = path.at(path.duration_s)
         if abs(sample.load_target_deg - end_deg) <= BEGIN_DEG:
             return True
@@ -265,7 +266,7 @@ class DaemonBench:
         return False
 
     def _hand_over(self, knots: Iterator[Knot]) -> Iterator[Knot]:
-        """As many knots as there is room for; the rest of them."""
+        """Sends as many knots as the queue accepts; returns the rest."""
         queue = self._rig.knots
         while queue.free:
             knot = next(knots, None)
@@ -275,14 +276,14 @@ class DaemonBench:
         return knots
 
     def _keep(self, count: int) -> None:
-        """So many of the pending samples belong to the record now."""
+        """Moves the first ``count`` pending samples to the record."""
         self._measured.samples += [sample for _, sample in self._pending[:count]]
         del self._pending[:count]
 
     # ---------------------------------------------------------------- samples
 
     def _take(self) -> None:
-        """Wait for samples; raises where the axis was stopped, or the run is to end."""
+        """Waits for samples; raises if the axis was stopped or the run is to end."""
         rig = self._rig
         rig.wait(POLL_S)
         rows, lost = self._reader.read()
@@ -293,13 +294,13 @@ class DaemonBench:
             )
         self._add(rows)
         self._look()
-        # Asked once per cycle, as a bench does.
+        # Called once per cycle, as by a bench.
         if sum(self._interrupted() for _ in range(max(len(rows), 1))):
             raise KeyboardInterrupt
         rig.check_alive()
 
     def _add(self, rows: SampleArray) -> None:
-        """Samples as a procedure sees them, to those that wait."""
+        """Converts rows of the ring to samples and appends them to the pending ones."""
         if not len(rows):
             return
         axis = rows["axes"][:, self._rig.index]
@@ -319,7 +320,7 @@ class DaemonBench:
         self._skipped = skipped
 
     def _look(self) -> None:
-        """What the control process has told of the axis meanwhile."""
+        """Evaluates new events of the axis; raises if one ended the run."""
         rig = self._rig
         log = rig.core.log
         newest = log.newest

@@ -1,7 +1,7 @@
 """The service process: ``python -m hdbridge.daemon.service.process FD``, started by the keeper.
 
-It puts the parts together (bridge, API, recorder, watch, adaptation, log) and ends them in order. It has one
-event loop; what blocks runs in threads. When it dies the axes go to the end of what they were told.
+It assembles bridge, API, recorder, watch, adaptation and log, and ends them in order. It has one event loop;
+blocking work runs in threads. If it dies, the axes complete the commands they have.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from hdbridge.daemon.start import Start, begin_child
 from hdbridge.errors import HdbridgeError
 
 THREADS_PER_AXIS: Final = 2
-"""An axis may be verified while another of its requests blocks."""
+"""Threads per axis; its drive may be verified while another of its requests blocks."""
 SPARE_THREADS: Final = 4
 LOOK_S: Final = 1.0
-"""How often the socket file is looked for."""
+"""Interval between checks for the socket file."""
 FOLLOW_S: Final = 1.0
-"""How often is looked whether an adaptation proposes another model."""
+"""Interval between checks for adapted models."""
 LAST_WORDS_S: Final = 35.0
-"""How long is waited for the control process to bring its axes to rest, so that it is recorded."""
+"""Maximum wait for the control process to bring its axes to rest, so that this is recorded."""
 
 
 def main(arguments: list[str]) -> int:
-    """Serve until SIGTERM; the exit status."""
+    """Serves until SIGTERM; returns the exit status."""
     try:
         start = Start.inherited(arguments)
         begin_child(start, "hdbridge-serve")
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
 
 async def serve(start: Start, memory: Memory) -> None:
-    """All of the service, from its begin to its end."""
+    """Runs the service until SIGTERM and the end of the control process."""
     machine = start.machine
     told = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
@@ -99,7 +99,7 @@ async def serve(start: Start, memory: Memory) -> None:
 
 
 def _adaptations(machine: Machine, bridge: ServiceBridge, stack: AsyncExitStack) -> list[Adapting]:
-    """One per axis, known to the bridge; their files are written in a thread of their own."""
+    """Creates the adaptations and registers them with the bridge; one thread writes their files."""
     writer = ThreadPoolExecutor(1, thread_name_prefix="adaptation")
     stack.callback(writer.shutdown)
     made = []
@@ -114,7 +114,7 @@ def _adaptations(machine: Machine, bridge: ServiceBridge, stack: AsyncExitStack)
 
 
 async def _follow(adapting: Sequence[Adapting]) -> None:
-    """Have the control process compensate by what the adaptations propose."""
+    """Applies adapted models to the control process."""
     while True:
         for each in adapting:
             await each.follow()
@@ -122,7 +122,7 @@ async def _follow(adapting: Sequence[Adapting]) -> None:
 
 
 def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:
-    """What the keeper has opened: the Unix socket, and a TCP port for the machine's clients or the page."""
+    """Returns listeners for the keeper's sockets: the Unix socket, and a TCP port for clients or the page."""
     unix, *others = [socket.socket(fileno=each) for each in descriptors]
     made = [Listener(unix, Policy())]
     tcp = machine.api.tcp
@@ -135,7 +135,7 @@ def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | No
 
 
 async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
-    """Bind the Unix socket again whenever its file is gone; connections that are open stay."""
+    """Binds the Unix socket again whenever its file is gone; open connections stay."""
     path, bound, noted = start.socket, start.socket_file, ""
     while True:
         found = (0, 0)
@@ -160,14 +160,14 @@ async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], No
 
 
 async def _say_when_served(server: ApiServer, memory: Memory) -> None:
-    """The keeper waits for the number of this process in the shared memory."""
+    """Writes this process's id to the shared memory once the server has started; the keeper waits for it."""
     while not server.started:
         await asyncio.sleep(0.01)
     memory.status.set(Cell.SERVICE_PID, os.getpid())
 
 
 async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
-    """Go on while the axes are brought to rest: clients see it, and it is recorded."""
+    """Continues while the axes are brought to rest, so that clients see it and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
     while bridge.core.observer.alive and asyncio.get_running_loop().time() < end_s:
         try:

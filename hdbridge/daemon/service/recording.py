@@ -1,4 +1,4 @@
-"""The flight recorder behind the service: what it is told of models and remarks, and what it says."""
+"""Connection of the flight recorder to the service: its models, remarks and state."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _log = logging.getLogger(__name__)
 
 
 class Recording:
-    """A sink of the observer. Without a folder that can be made it records nothing, and says so."""
+    """A sink of the observer. If the folder cannot be created, it records nothing and reports that."""
 
     def __init__(self, machine: Machine, bridge: ServiceBridge) -> None:
-        """It is known to the bridge from now on, as its recorder and for its remarks."""
+        """Registers itself with the bridge as recorder and receiver of remarks."""
         self._folder = machine.recorder_folder()
         self._bridge = bridge
         self._note: str | None = None
         self.recorder: FlightRecorder | None = None
-        """None where there is no folder for it."""
+        """None if the folder could not be created."""
         self._told: dict[str, CompensationSetting] = {}
         about = About.of(
             machine.name, tuple(AxisAbout.of(axis.config) for axis in machine.axes), machine.cycle_s
@@ -39,7 +39,7 @@ class Recording:
         bridge.recorder = self.state
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples and events from the observer."""
         if self.recorder is None:
             return
         for name, axis in self._bridge.axes.items():
@@ -51,7 +51,7 @@ class Recording:
         self.recorder.take(samples, events, lost)
 
     def state(self) -> messages.RecorderState:
-        """What clients are told."""
+        """Returns the state of the recorder for clients."""
         if self.recorder is None:
             return messages.RecorderState(on=False, folder=str(self._folder), note=self._note)
         counts = self.recorder.counts
@@ -60,12 +60,12 @@ class Recording:
         )
 
     def close(self) -> None:
-        """Finish the file; returns when it is on the disk."""
+        """Finishes the file; returns when it is on the disk."""
         if self.recorder is not None:
             self.recorder.close()
 
     def _tell(self, text: str) -> None:
-        """From the recorder's thread, too."""
+        """Notes and logs a message; also called from the recorder's thread."""
         self._note = text
         self._bridge.core.log.note(text)
         _log.warning("recorder", {"text": text})

@@ -1,8 +1,8 @@
-"""A python-can bus whose frames go through the control process, which has the real one.
+"""A python-can bus whose frames are relayed by the control process, which has the real bus.
 
-The service's SDO clients and boot-up run on it unchanged. What the service must not send never gets as far:
-SYNC, set-points and the master's heartbeat are the control process's own. It sends one relayed frame a cycle
-at most, and refuses NMT commands and SDO downloads to an axis that is enabled.
+The service's SDO clients and boot-up run on it unchanged. It rejects frames that only the control process
+may send: SYNC, set-points and the master's heartbeat. The control process sends at most one relayed frame
+per cycle, and refuses NMT commands and SDO downloads to an enabled axis.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from hdbridge.drive import objects
 from hdbridge.errors import DaemonError
 
 POLL_S: Final = 0.001
-"""How often is looked for a frame: less than the period of any cycle."""
+"""Interval between checks for a frame; shorter than any cycle."""
 _FUNCTION: Final = 0x780
 _NODE: Final = 0x7F
 _FROM_NODES: Final = frozenset({objects.COB_EMCY, objects.COB_SDO_ANSWER, objects.COB_HEARTBEAT})
 
 
 class RelayBus(can.BusABC):
-    """The bus of one axis as blocking work sees it; its `recv` waits on the clock that is passed in.
+    """The bus of one axis for blocking code; `recv` waits on the clock that is passed in.
 
-    ``nodes`` are those of the axis: the drive, and an encoder that is a node of its own. One thread uses it;
+    ``nodes`` are those of the axis: the drive, and an encoder with its own node. One thread uses it;
     `interrupt` may be called from any.
     """
 
@@ -45,16 +45,16 @@ class RelayBus(can.BusABC):
         self._reason = ""
 
     def interrupt(self, reason: str) -> None:
-        """Let what is under way on this bus fail at its next wait, once, with these words."""
+        """Makes the present operation fail at its next wait, once, with ``reason``."""
         self._reason = reason
         self._interrupted.set()
 
     def begin(self) -> None:
-        """Something else begins: an interruption that came too late for what was before is none of it."""
+        """Begins another operation; discards an interruption of the one before."""
         self._interrupted.clear()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hand a frame over. The master's heartbeat is left out: the control process sends it."""
+        """Sends a frame. Drops the master's heartbeat, which the control process sends."""
         can_id = msg.arbitration_id
         function, node = can_id & _FUNCTION, can_id & _NODE
         if function == objects.COB_HEARTBEAT:
@@ -88,7 +88,7 @@ class RelayBus(can.BusABC):
             clock.sleep_until(min(now_s + POLL_S, deadline_s) if timeout is not None else now_s + POLL_S)
 
     def _next(self) -> RelayedFrame | None:
-        """The next frame of one of the axis's nodes."""
+        """Returns the next frame from one of the axis's nodes."""
         if not self._waiting:
             frames, _ = self._incoming.read()
             self._waiting.extend(frames)
@@ -99,12 +99,12 @@ class RelayBus(can.BusABC):
         return None
 
     def shutdown(self) -> None:
-        """Nothing of its own is open."""
+        """Closes the bus."""
         super().shutdown()
 
     @property
     def state(self) -> can.BusState:
-        """Active: whether the real one is, the control process knows."""
+        """Always active; only the control process knows the state of the real bus."""
         return can.BusState.ACTIVE
 
     @state.setter

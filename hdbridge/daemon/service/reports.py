@@ -1,4 +1,4 @@
-"""What the service tells of itself, in the messages of the API."""
+"""Conversion of the service's state and events to messages of the API."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
 
 
 def fault_of(code: int) -> Fault | None:
-    """A fault by its number in samples and events."""
+    """Returns the fault with this number in samples and events; None if there is none."""
     return FAULTS[code] if 0 <= code < len(FAULTS) else None
 
 
 def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
-    """An entry of the log; ``names`` are those of the axes."""
+    """Returns the message for an entry of the event log; ``names`` are those of the axes."""
     axis = names[entry.axis] if 0 <= entry.axis < len(names) else None
     event = entry.event
     if event is None:
@@ -65,7 +65,7 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
 
 
 def stop_hint(stopped: Event, axis: str) -> str:
-    """What a person does about a stop."""
+    """Returns the advice for a stop."""
     fault = fault_of(stopped.code)
     if stopped.id:
         return EXPLAINED_HINT
@@ -77,7 +77,7 @@ def _reset_hint(axis: str) -> str:
 
 
 def _words(event: Event, fault: Fault | None) -> str:
-    """An event in words."""
+    """Returns the text of an event."""
     match event.kind:
         case EventKind.STATE:
             return STATES[event.code].value
@@ -91,7 +91,7 @@ def _words(event: Event, fault: Fault | None) -> str:
 
 
 def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
-    """Who may move."""
+    """Returns the state of the lease."""
     holder = lease.holder
     if holder is None:
         return messages.LeaseState(held=False, timeout_s=lease.timeout_s)
@@ -106,7 +106,7 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
 
 
 def job_words(job: messages.Job, options: str = "") -> str:
-    """A job that runs: how far it is, who began it, and the command that ends it, with these options."""
+    """Describes a running job: its progress, its client, and the command (with ``options``) that ends it."""
     begun = f", begun by '{job.client}'" if job.client else ""
     return (
         f"job {job.id} runs on axis '{job.axis}' ({100 * job.share:.0f} % done{begun}); "
@@ -115,7 +115,7 @@ def job_words(job: messages.Job, options: str = "") -> str:
 
 
 def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
-    """The model and its age; None where there is none."""
+    """Returns the model in use and its age; None if there is no model."""
     if not in_use.model.effects:
         return None
     date = _date(in_use.model.provenance.get("date"))
@@ -131,7 +131,7 @@ def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
 
 
 def limits(config: AxisConfig) -> messages.Limits:
-    """What the axis may do."""
+    """Returns the limits of an axis."""
     own = config.limits
     return messages.Limits(
         position_min_deg=own.position_min_deg,
@@ -150,8 +150,9 @@ def axis_state(
     adaptation: messages.AdaptationState,
     advice: Sequence[str],
 ) -> messages.AxisState:
-    """Everything about an axis; ``stopped`` is the entry of its last stop, ``loop_doubt`` the text of
-    its load loop's last event.
+    """Returns the state of an axis.
+
+    ``stopped`` is the entry of its last stop, ``loop_doubt`` the text of its load loop's last event.
     """
     link, config = axis.link, axis.axis.config
     flags = SampleFlag(int(link.value("flags")))
@@ -208,7 +209,7 @@ def axis_state(
 
 
 def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
-    """What stopped the axis, while that is latched or the drive is in fault."""
+    """Returns the cause of a latched stop or a drive fault; None without either."""
     link = axis.link
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
@@ -237,7 +238,7 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
 
 
 def _date(value: object) -> datetime | None:
-    """A date of a provenance; None where it is none."""
+    """Returns a date of a provenance; None if it is not a date."""
     if isinstance(value, datetime):
         return value if value.tzinfo is not None else value.replace(tzinfo=UTC)
     try:

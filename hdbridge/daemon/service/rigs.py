@@ -1,6 +1,6 @@
-"""The axis that a job works on: power, compensation and samples for the benches of `procedures`.
+"""Rig of a job: power, compensation and samples for the benches of `procedures`.
 
-Blocking, for one worker thread; several benches of a job follow each other.
+Blocking, for one worker thread; the benches of a job run one after the other.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.ports import ServiceAxis
 
 STOP_WORDS_S: Final = 3.0
-"""The control process tells why it has stopped an axis when that stands."""
+"""Time in which the control process reports the reason for a stop, once the axis is at rest."""
 
 
 class DaemonRig:
-    """`hdbridge.control.rig.Rig` of an axis that the daemon holds, for one job."""
+    """`hdbridge.control.rig.Rig` of an axis under control of the daemon, for one job."""
 
     def __init__(self, axis: ServiceAxis, activity: Activity) -> None:
-        """``activity`` is the job's: once it is over, whatever runs here stops."""
+        """``activity`` is the job's; everything here stops once it is over."""
         self._axis = axis
         self._activity = activity
         self.core = axis.core
@@ -49,12 +49,12 @@ class DaemonRig:
 
     @property
     def axis(self) -> AxisConfig:
-        """The axis file."""
+        """Configuration of the axis."""
         return self._axis.axis.config
 
     @property
     def identity(self) -> Identity:
-        """Which drive answers."""
+        """Identity of the drive."""
         return self._axis.commissioning.identity
 
     def bench(
@@ -63,21 +63,21 @@ class DaemonRig:
         *,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> DaemonBench:
-        """A bench on this axis; without a compensation it runs uncompensated."""
+        """Returns a bench on this axis; without a compensation it runs uncompensated."""
         return DaemonBench(self, compensation, interrupted)
 
     # ---------------------------------------------------------------- for its benches
 
     def uncompensated(self) -> Compensation:
-        """Of a model without effects."""
+        """Returns the compensation of a model without effects."""
         return compensation_for(self.axis, TransmissionModel(self.axis.gear.ratio))
 
     def command(self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]) -> Event:
-        """As `Dispatcher.do_now`."""
+        """Runs `Dispatcher.do_now` for this axis."""
         return self.core.dispatch.do_now(kind, self.index, within_s, **arguments)
 
     def enable(self, compensation: Compensation) -> None:
-        """Power on, standing still, compensated anew from here on."""
+        """Switches power on, at rest, with the compensation reset to the present position."""
         if self.state is not AxisState.DISABLED:
             self.disable()
         self.command(CommandKind.CHANGE, i=self._axis.models.send_for_job(compensation.model))
@@ -85,24 +85,24 @@ class DaemonRig:
         self.command(CommandKind.ENABLE, POWER_S, **seeds.arguments())
 
     def disable(self) -> None:
-        """Brake to rest, power off."""
+        """Brakes to rest, then switches power off."""
         self.command(CommandKind.DISABLE, POWER_S)
         self.wait(2.0 * self.period_s)
         if self.state is AxisState.DISABLED:
             self._axis.commissioning.rest()
 
     def stop(self) -> None:
-        """`disable` as far as it can be done; what cannot is the drive's own watchdogs' to do."""
+        """Calls `disable` and ignores errors; the drive's own watchdogs stop what does not answer."""
         with suppress(HdbridgeError):
             self.disable()
 
     @property
     def state(self) -> AxisState:
-        """Where the control process has the axis."""
+        """State of the axis in the control process."""
         return AxisState(int(self.value("state")))
 
     def value(self, field: str) -> float:
-        """A field of the newest sample."""
+        """Returns a field of the newest sample; waits for the first one."""
         self._look()
         while self._newest is None:
             self.wait(self.period_s)
@@ -111,17 +111,17 @@ class DaemonRig:
         return self._newest[1][field]
 
     def wait(self, duration_s: float) -> None:
-        """Let time pass, and take in what was told."""
+        """Sleeps, then reads new events."""
         clock = self.core.timing.clock
         clock.sleep_until(clock.now() + duration_s)
         self.core.log.poll()
 
     def why_over(self) -> str:
-        """Why the job is to end, in words; empty while it goes on."""
+        """Returns the reason why the job must end; empty while it may run."""
         return self._activity.over
 
     def check_alive(self) -> None:
-        """DaemonError where the control process has not turned lately."""
+        """Raises DaemonError if the control process has not completed a turn within `ANSWER_S`."""
         turns, now_s = self.core.memory.status.loop_count, self.core.timing.clock.now()
         if turns != self._turns:
             self._turns, self._turned_s = turns, now_s
@@ -131,7 +131,7 @@ class DaemonRig:
             )
 
     def stopped(self) -> SafetyStop:
-        """The error for an axis that the control process has stopped, in its words once it has told them."""
+        """Returns the error for a stopped axis, with the control process's reason if it arrives in time."""
         log, clock = self.core.log, self.core.timing.clock
         deadline_s = clock.now() + STOP_WORDS_S
         since = max(log.newest - 50, 0)

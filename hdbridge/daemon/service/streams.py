@@ -1,8 +1,8 @@
-"""Set-points of a client, handed on to the control process as knots with velocities.
+"""Streams: set-points of a client, sent to the control process as knots with velocities.
 
-A point without a velocity gets the slope between its neighbours, so it waits for the next one; the last one
-of a stream is at rest. The stream's time begins when `LEAD_S` of path is there, or its end, so that a client
-may be late by as much.
+A point without a velocity gets the slope between its neighbours, so it waits for the next point; the last
+point of a stream is at rest. The stream begins once it has `LEAD_S` of path or its end, so that the client
+may lag by that time.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from hdbridge.daemon.service.interface import StreamPoint
 from hdbridge.errors import InputError, RefusedError
 
 LEAD_S: Final = 0.1
-"""Path that waits before a stream begins."""
+"""Duration of buffered path before a stream begins."""
 ROOM_POLL_S: Final = 0.02
 BEGIN_DEG: Final = 1e-6
-"""A stream begins so near to where the axis stands."""
+"""Maximum distance between the first point of a stream and the axis's position."""
 
 
 class Knots:
-    """Points of a stream, in order, made into knots. Pure.
+    """Converts the points of a stream to knots. Pure.
 
-    ``begin_deg`` is where the axis stands at rest at time 0.
+    ``begin_deg`` is the position of the axis, at rest at time 0.
     """
 
     def __init__(self, stream: int, begin_deg: float) -> None:
         self._stream = stream
         self._begin_deg = begin_deg
         self._before: StreamPoint | None = None
-        """The last point whose knot was made."""
+        """Last point with a knot."""
         self._held: StreamPoint | None = None
-        """The newest point, where its velocity is not known yet."""
+        """Newest point, if its velocity is not known yet."""
 
     def add(self, points: Sequence[StreamPoint]) -> list[Knot]:
-        """The knots that these points complete; InputError, and none of them is taken, for a bad one."""
+        """Returns the knots that these points complete; InputError if any is invalid, and none is taken."""
         newest = self._held or self._before
         chain = [*([newest] if newest else []), *points]
         self._check(points, chain)
@@ -66,7 +66,7 @@ class Knots:
         return knots
 
     def end(self) -> list[Knot]:
-        """The last knot, at rest, where it was still held back."""
+        """Returns the last knot, at rest, if it was held back."""
         held, self._held = self._held, None
         if held is None:
             return []
@@ -107,10 +107,10 @@ def _slope(one: StreamPoint, other: StreamPoint) -> float:
 
 
 class ServiceStream:
-    """A stream under way; `interface.StreamPort` says what each method does."""
+    """An open stream; `interface.StreamPort` documents each method."""
 
     def __init__(self, link: AxisLink, activity: Activity, timeout_s: float) -> None:
-        """It is of ``activity``, and over with it."""
+        """The stream belongs to ``activity`` and ends with it."""
         self._link = link
         self._activity = activity
         self._timeout_s = timeout_s
@@ -119,12 +119,12 @@ class ServiceStream:
         self._queue = link.core.memory.knots[link.index]
         self._begun_cycle: int | None = None
         self._last_s = 0.0
-        """Time of the last knot that was handed over."""
+        """Time of the last knot that was sent."""
         self._ended = False
 
     @property
     def buffered_s(self) -> float:
-        """Time of path that is there and was not followed yet."""
+        """Duration of the path that was sent and not followed yet."""
         if self._begun_cycle is None:
             return self._last_s
         core = self._link.core
@@ -132,7 +132,7 @@ class ServiceStream:
         return max(self._last_s - run_s, 0.0)
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
-        """Hand over set-points; waits while the buffer is full."""
+        """Sends set-points; waits while the buffer is full."""
         self._check_open()
         if self._knots is None:
             await self._link.until(lambda: True, 0.0)
@@ -142,7 +142,7 @@ class ServiceStream:
             await self._begin()
 
     async def end(self) -> None:
-        """Follow what was handed over, come to rest there, and return then."""
+        """Ends the stream; returns when the axis has followed it and is at rest."""
         self._check_open()
         if self._knots is None:
             self._ended = True
@@ -175,7 +175,7 @@ class ServiceStream:
                 self._check_open()
 
     def _check_open(self) -> None:
-        """RefusedError where the stream has ended, with the reason; LeaseError where the lease has."""
+        """Raises RefusedError with the reason if the stream has ended, LeaseError if the lease has."""
         self._link.core.lease.check(self._activity.holder)
         if self._begun_cycle is not None and not self._ended:
             self._link.look(self._activity)
@@ -184,12 +184,14 @@ class ServiceStream:
             raise RefusedError(f"{self._link.name}: the stream is over: {why}")
 
     async def __aenter__(self) -> Self:
-        """Itself."""
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """`end`, unless it is over, or the block fails: then the axis brakes when the buffer is used up."""
+        """Calls `end`, unless the stream is over or the block failed.
+
+        After a failure the axis brakes once the buffer is used up.
+        """
         if error is None and not (self._activity.over or self._ended):
             await self.end()

@@ -1,4 +1,4 @@
-"""The watch of the load encoders behind the service: which model predicts, and what it says to whom."""
+"""Connection of the load encoders' watch to the service: the models it uses and the advice it gives."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _log = logging.getLogger(__name__)
 
 
 class Watching:
-    """A sink of the observer; what it has to say is the bridge's advice from now on."""
+    """A sink of the observer; its advice is the bridge's from now on."""
 
     def __init__(self, machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None) -> None:
-        """``recorder`` is what a diagnosis reads; without one nothing is diagnosed."""
+        """``recorder`` supplies the data of a diagnosis; without it nothing is diagnosed."""
         self._names = [axis.name for axis in machine.axes]
         self._bridge = bridge
         self._sink = WatchSink.of(machine, self._tell, recorder)
@@ -27,7 +27,7 @@ class Watching:
         bridge.advice = self._sink.advice
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer. The whole committed model is watched, whatever part compensates or adapts."""
+        """Takes samples from the observer; watches the committed model, whatever the scheme or adaptation."""
         for place, port in enumerate(self._bridge.axes.values()):
             model = port.models.chosen.model
             if self._used[place] is not model:
@@ -36,10 +36,10 @@ class Watching:
         self._sink.take(samples, events, lost)
 
     def close(self) -> None:
-        """End its thread and what it has started."""
+        """Ends the watch's thread and the processes it started."""
         self._sink.close()
 
     def _tell(self, words: str, place: int) -> None:
-        """From the watch's thread."""
+        """Notes and logs a message, from the watch's thread."""
         self._bridge.core.log.note(words, place)
         _log.warning("watch", {"axis": self._names[place], "text": words})
