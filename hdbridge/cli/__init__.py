@@ -1,9 +1,9 @@
-"""The command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
+"""Command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
 
 Exit status: 0 done; 1 an error in hdbridge itself; 2 bad input (nothing was written, nothing moved); 3 the
-bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (what was measured is
-printed); 7 the daemon is not reached, or does not do this for this client now; 130 Ctrl-C (the axis was
-stopped, the record kept).
+bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (the measured figures
+are printed); 7 the daemon cannot be reached, or refuses this client now; 130 Ctrl-C (the axis was stopped,
+the record kept).
 """
 
 from __future__ import annotations
@@ -73,15 +73,15 @@ PANELS: Final = {
         "compensation.",
     },
 }
-"""Every command, under the heading that `hdbridge --help` gives it, and what it says of it there.
+"""Every command under its heading in `hdbridge --help`, with its summary there.
 
-The command itself is the file of that name in this folder. It says the same, and is imported for its own help
-or to be run; what it computes with it loads when it runs.
+The command is the file of that name in this folder, with the same summary. It is imported only for its own
+help or to be run, and it imports what it computes with when it runs.
 """
 
 
 def load(name: str) -> typer.Typer:
-    """Import a command: an app with nothing but what its file registers, which checks its outputs first."""
+    """Imports a command; returns an app with only that command, which checks its outputs before it runs."""
     guarded = import_module(f"{__name__}.outputs").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
     import_module(f"{__name__}.{name.replace('-', '_')}").register(loaded)
@@ -93,7 +93,7 @@ def load(name: str) -> typer.Typer:
 
 
 class _LoadedToRun(TyperGroup):
-    """Puts the real command in the place of what only stands in the overview."""
+    """Command group that replaces the placeholders of the overview by the real commands."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, _, rest = super().resolve_command(ctx, args)
@@ -103,7 +103,7 @@ class _LoadedToRun(TyperGroup):
 
 @cache
 def _built(name: str) -> Any:
-    """The command with its options; once, where a process runs it more often."""
+    """Returns the command with its options; cached, because a process may run it several times."""
     return usage.strict(get_group(load(name)).commands[name])
 
 
@@ -123,7 +123,7 @@ app = typer.Typer(
 
 
 def _in_overview() -> None:
-    """What stands there for a command that is not imported."""
+    """Placeholder for a command that has not been imported."""
 
 
 for _panel, _commands in PANELS.items():
@@ -139,7 +139,7 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def _hdbridge(
-    version: Annotated[  # noqa: ARG001 - its callback has told it by then
+    version: Annotated[  # noqa: ARG001 - its callback has printed it by then
         bool, typer.Option("--version", help="Print the version and exit.", callback=_tell_version)
     ] = False,
     verbose: Annotated[
@@ -163,8 +163,8 @@ def _hdbridge(
 
 
 def main() -> None:
-    """Run the command line; errors raised on purpose are one line and their exit status."""
-    for name in ("stdout", "stderr"):  # closed by who started it: printed to nobody
+    """Runs the command line; an error of hdbridge becomes one line and its exit status."""
+    for name in ("stdout", "stderr"):  # closed by the parent process: output is discarded
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     for stream in (sys.stdout, sys.stderr):
@@ -184,7 +184,7 @@ def main() -> None:
         status = InputError.exit_status
     except typer.Abort:
         status = 130
-    except (BrokenPipeError, SystemExit):  # `hdbridge ... | head`, which typer makes an exit of
+    except (BrokenPipeError, SystemExit):  # `hdbridge ... | head`, which typer turns into an exit
         _close_output()
         status = 0
     except OSError as error:
@@ -198,7 +198,7 @@ def main() -> None:
 
 
 def _close_output() -> None:
-    """What is left in the buffer cannot be written, and must not fail again when the process ends."""
+    """Discards the output buffer, which cannot be written and must not fail again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,4 +1,4 @@
-"""``hdbridge demo``: the main job on a simulated axis, in one command."""
+"""``hdbridge demo``: the whole workflow on a simulated axis, in one command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("demo")(demo)
 
 

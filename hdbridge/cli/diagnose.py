@@ -1,4 +1,4 @@
-"""``hdbridge diagnose``: what the model gets wrong, and why."""
+"""``hdbridge diagnose``: errors of a model and their causes."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from hdbridge.records.recording import Recording
 
 WORTH_TELLING = 0.01
-"""A coordinate that less of the difference goes with is not printed."""
+"""Minimum share of the difference for a coordinate to be printed."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("diagnose")(run)
 
 
@@ -119,7 +119,7 @@ def run(
     options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
     said = [word for name, texts in options.items() for text in texts or () for word in (name, text)]
     document = result.as_dict()
-    # Files first: who reads the tables may have had enough of them (`| head`).
+    # Files first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, document)
     if html_file is not None:
         page = diagnosis_page(
@@ -137,7 +137,7 @@ def run(
 
 
 def print_diagnosis(result: Diagnosis) -> None:
-    """Verdict, findings, the next experiments, and what was not named."""
+    """Prints verdict, findings, next experiments, and causes that were not named."""
     _say(result.verdict())
     if result.findings:
         table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
@@ -157,7 +157,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """What is known of a finding in addition to its line in the table; nothing where there is no more."""
+    """Yields what is known of a finding beyond its line in the table."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
@@ -178,7 +178,7 @@ def _number(parameter: Parameter) -> str:
 
 
 def _say(line: str) -> None:
-    """A line as it is: whole in a pipe, and nothing in it is markup."""
+    """Prints a line unwrapped and without markup."""
     console.print(line, markup=False, soft_wrap=True)
 
 

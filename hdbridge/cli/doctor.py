@@ -1,4 +1,4 @@
-"""``hdbridge doctor``: is the axis what its file says, and does it stop?"""
+"""``hdbridge doctor``: checks that the drive matches its axis file and that it stops on command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LEFT_OUT = "left out by --no-motion"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("doctor")(doctor)
 
 
@@ -131,7 +131,7 @@ def doctor(
 def _confirm(torque_percent: float) -> bool:
     try:
         return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
-    except typer.Abort:  # no terminal, end of input
+    except typer.Abort:  # no terminal, or end of input
         notes.print("")
         return False
 

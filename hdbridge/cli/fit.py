@@ -1,4 +1,4 @@
-"""``hdbridge fit``: a model from recordings alone, hdbridge's own or anybody's CSV files."""
+"""``hdbridge fit``: a model from recordings alone, hdbridge's own or any CSV files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("fit")(command)
 
 

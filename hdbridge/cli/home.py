@@ -1,4 +1,4 @@
-"""``hdbridge home``: let the drive find its zero."""
+"""``hdbridge home``: homing by the drive."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from hdbridge.cli.options import (
 from hdbridge.files.profile import Profile
 
 TOWARDS_SWITCH = 0.1
-"""Of the axis's highest speed."""
+"""Share of the axis's velocity limit."""
 TOWARDS_ZERO = 0.02
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("home")(home)
 
 

@@ -1,4 +1,6 @@
-"""``hdbridge improve``: diagnose a drive, extend its model, step again, keep the better model as pending."""
+"""``hdbridge improve``: diagnoses a drive, extends its model, steps again, keeps the better
+model as pending.
+"""
 
 from __future__ import annotations
 
@@ -38,11 +40,11 @@ if TYPE_CHECKING:
     from hdbridge.model import TransmissionModel
 
 LEFT_OF_FLOOR = 1.5
-"""A stepping test this far above its floor has something left to find."""
+"""Ratio of a stepping test to its floor above which a further cause is suspected."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("improve")(command)
 
 
@@ -128,7 +130,7 @@ def command(
 def report(
     result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Tell the result, and what comes next."""
+    """Writes and prints the result and the next steps."""
     from hdbridge.calibration.validation import worse_ways
     from hdbridge.cli.calibration_output import (
         print_next,
@@ -173,7 +175,7 @@ def report(
 
 
 def write_page(path: Path, result: Improvement) -> None:
-    """The diagnosis with the stepping test, as a self-contained page."""
+    """Writes the diagnosis with the stepping test as a self-contained page."""
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render
 

@@ -1,4 +1,4 @@
-"""``hdbridge latency``: which cycle time does this machine carry?"""
+"""``hdbridge latency``: timer latency, and the shortest cycle that this computer sustains."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("latency")(latency)
 
 

@@ -1,4 +1,4 @@
-"""``hdbridge measure``: a recording of an axis by a plan, and nothing made of it."""
+"""``hdbridge measure``: a recording of an axis by a plan, without a fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("measure")(command)
 
 

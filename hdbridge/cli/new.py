@@ -1,4 +1,4 @@
-"""``hdbridge new``: a profile's folder to begin with."""
+"""``hdbridge new``: a new profile folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Source(Enum):
-    """What a new profile is made of."""
+    """Origin of a new profile."""
 
     DEMO = "demo"
     ARTICLE = "article"
@@ -25,7 +25,7 @@ class Source(Enum):
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("new")(new)
 
 

@@ -42,7 +42,7 @@ AllStatesOption = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
+    """Adds the commands."""
     group = typer.Typer(
         help="Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         no_args_is_help=True,
@@ -291,7 +291,7 @@ def _outside(about: Overview, begin_ns: int | None, end_ns: int | None) -> bool:
 
 
 def _need_extra() -> None:
-    """InputError where what reads recordings is not installed."""
+    """Raises `InputError` if the packages that read recordings are not installed."""
     lacking = [name for name in _EXTRA if not _found(name)]
     if lacking:
         raise InputError(

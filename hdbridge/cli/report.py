@@ -1,4 +1,4 @@
-"""``hdbridge report``: the report of a calibration again, from its recording."""
+"""``hdbridge report``: the report of a calibration, again from its recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("report")(command)
 
 

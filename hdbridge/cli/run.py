@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from hdbridge.daemon.start import Simulation
 
 _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
-"""What the extra ``daemon`` brings."""
+"""Packages of the extra ``daemon``."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("run")(run)
 
 

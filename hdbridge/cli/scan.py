@@ -1,4 +1,4 @@
-"""``hdbridge scan``: what answers on the bus."""
+"""``hdbridge scan``: the nodes on the bus."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("scan")(scan)
 
 

@@ -1,4 +1,4 @@
-"""``hdbridge simulate``: the simulated drive by itself, in real time, on any bus."""
+"""``hdbridge simulate``: the simulated drive on its own, in real time, on any bus."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("simulate")(simulate)
 
 

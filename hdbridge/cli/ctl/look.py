@@ -1,4 +1,4 @@
-"""What looks at a machine, and moves nothing."""
+"""Commands that look at a machine and move nothing."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def mark(text: Annotated[str, typer.Argument(metavar="TEXT", help="One line.")],
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:
-    """So many, each after the time between two."""
+    """Yields ``count`` numbers, with a pause between two."""
     for number in itertools.count() if count is None else range(count):
         if number:
             time.sleep(every_s)

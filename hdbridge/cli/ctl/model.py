@@ -1,4 +1,4 @@
-"""Which model compensates the axes of a daemon, by which part, and how it follows the load encoder."""
+"""Commands for compensation, models and adaptation of a daemon's axes."""
 
 from __future__ import annotations
 

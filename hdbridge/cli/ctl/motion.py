@@ -1,4 +1,4 @@
-"""Power and motion of the axes of a daemon. What moves takes the right to move for as long as it runs."""
+"""Power and motion of a daemon's axes. A command that moves holds the lease while it runs."""
 
 from __future__ import annotations
 
