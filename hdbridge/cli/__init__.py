@@ -32,32 +32,34 @@ PANELS: Final = {
     },
     "Before the first move": {
         "setup": "Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.",
-        "new": "Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of "
-        "itself.",
-        "check": "Read the files of an axis or of a machine; say what they mean, or what is wrong and where.",
+        "new": "Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the "
+        "bus.",
+        "check": "Check the files of an axis or of a machine; report what they mean, or what is wrong and "
+        "where.",
         "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
         "axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
         "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
-        "latency": "Measure how late this machine wakes up; print the histogram and the cycle time that it "
-        "carries.",
+        "latency": "Measure timer latency; print its histogram and the shortest cycle that this computer "
+        "sustains.",
     },
     "The model of an axis": {
         "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
         "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
-        "fit": "Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.",
-        "report": "Fit a recording again and tell its result; no axis is needed, nothing moves.",
-        "diagnose": "Compare records with a model; name what the model lacks, or say what cannot be told.",
-        "improve": "Say what the active model lacks, extend it, step with both, and keep the better one as "
+        "fit": "Fit a model to recordings; report parameter intervals and what the data cannot determine.",
+        "report": "Fit a recording again and report the result; needs no axis and moves nothing.",
+        "diagnose": "Compare records with a model; name the causes that it lacks and those that cannot be "
+        "separated.",
+        "improve": "Diagnose the active model, extend it, step with both, and keep the better one as "
         "pending.",
-        "twin": "Teach the simulated drive an axis from recordings; say what it got wrong, and keep the "
-        "twin as pending.",
-        "model": "The models of an axis: the active one, one that waits, and every one that there was.",
+        "twin": "Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as "
+        "pending.",
+        "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
     },
     "Day and night": {
-        "run": "Hold the drives of a machine, day and night, and take load angles from clients.",
-        "ctl": "Ask a daemon that runs: look, move, stop, compensate, run procedures.",
+        "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",
+        "ctl": "Control a running daemon: look, move, stop, compensate, run procedures.",
         "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
         "start of the computer.",
@@ -66,7 +68,8 @@ PANELS: Final = {
         "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
         "last.",
         "reset": "Reset a fault of the drive when its cause is gone; power stays off.",
-        "home": "Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.",
+        "home": "Home the drive by one of its own methods (CiA 402, mode HM); print the position of the "
+        "axis.",
         "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
         "measured.",
         "motion": "Run the axis at several speeds; print the ripple of the load without and with "
@@ -145,12 +148,14 @@ def _hdbridge(
     verbose: Annotated[
         int,
         typer.Option(
-            "--verbose", "-v", count=True, help="Tell what is done on the bus; -vv: every SDO transfer."
+            "--verbose", "-v", count=True, help="Report actions on the bus; -vv: every SDO transfer."
         ),
     ] = 0,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Append all that -vv tells, a JSON object per line."),
+        typer.Option(
+            "--log", metavar="FILE", help="Append everything that -vv reports, one JSON object per line."
+        ),
     ] = None,
 ) -> None:
     """Make a harmonic-drive axis point where it is told: a CANopen master that knows its gear.

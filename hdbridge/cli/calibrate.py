@@ -58,7 +58,7 @@ def command(
 
     The axis moves within the limits of its axis file, without compensation. Everything measured is kept;
     Ctrl-C stops the axis, and --resume goes on. The model is pending until `hdbridge model commit PROFILE`.
-    One that does not improve on data that it has not seen is not offered.
+    A model that does not improve on held-out data is not offered.
     """
     from hdbridge.calibration import calibrate
     from hdbridge.calibration.motion import motion_test_s

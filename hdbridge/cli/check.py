@@ -31,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 
 def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
-    """Read the files of an axis or of a machine; say what they mean, or what is wrong and where."""
+    """Check the files of an axis or of a machine; report what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machine import Machine, machine_file
 

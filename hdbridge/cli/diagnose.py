@@ -73,14 +73,14 @@ def run(
         typer.Option(
             "--plan",
             metavar="PLAN.yaml",
-            help="Without records: what this plan could detect and distinguish.",
+            help="Without records: causes that this plan could detect and separate.",
         ),
     ] = None,
 ) -> None:
-    """Compare records with a model; name what the model lacks, or say what cannot be told.
+    """Compare records with a model; name the causes that it lacks and those that cannot be separated.
 
-    With --plan and no record: which causes the planned procedures could detect, down to how many
-    arcseconds, and which they could not tell apart.
+    With --plan and no record: the causes that the planned procedures could detect, the detection limit of
+    each in arcseconds, and the causes that they could not separate.
     """
     from hdbridge.diagnose import diagnose
     from hdbridge.diagnose.planned import plan_report

@@ -76,11 +76,11 @@ def doctor(
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
 
-    Each line is one check. Where one fails, the line of the axis file to change stands under it, or what to
-    do.
+    Each line is one check. Under a failed check stands the line of the axis file to change, or what to do.
 
     Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed; 2 when the first
-    failure is a file, 3 when it is the bus. This is no safety function: an emergency stop stays in hardware.
+    failure is a file, 3 when it is the bus. This is not a safety function: the emergency stop must be in
+    hardware.
     """
     from hdbridge.bringup.checks import run_checks
     from hdbridge.bringup.context import BringUpContext

@@ -73,9 +73,9 @@ def home(
     force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.
+    """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
-    The drive moves by itself, within the speeds given. Ctrl-C stops it (exit status 130). A model belongs to
+    The drive plans the motion, within the given speeds. Ctrl-C stops it (exit status 130). A model belongs to
     the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
     """
     from hdbridge.drive.drive import Drive

@@ -68,12 +68,10 @@ def command(
     unwrap: UnwrapOption = None,
     auto: Annotated[
         bool,
-        typer.Option(
-            "--auto", help="Let the axis run further experiments where causes are not distinguished."
-        ),
+        typer.Option("--auto", help="Let the axis run further experiments if causes cannot be separated."),
     ] = False,
     rounds: Annotated[
-        int, typer.Option("--rounds", min=1, max=20, help="With --auto: so many experiments at most.")
+        int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
     ] = 3,
     out: Annotated[Path | None, out_option("Where the recordings go"), Kind.FOLDER] = None,
     resume: Annotated[
@@ -88,11 +86,11 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Say what the active model lacks, extend it, step with both, and keep the better one as pending.
+    """Diagnose the active model, extend it, step with both, and keep the better one as pending.
 
     The axis moves within the limits of its axis file; everything measured is kept, Ctrl-C stops the axis.
-    Where nothing is found, or nothing that can be compensated, or where the axis does not point better
-    with the extended model, nothing is proposed. The model is used after `hdbridge model commit PROFILE`.
+    No model is proposed if nothing is found, if nothing found can be compensated, or if the extended model
+    does not improve positioning. The model is used after `hdbridge model commit PROFILE`.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.improvement import Source, improve

@@ -52,8 +52,8 @@ def command(
 ) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
-    The axis moves as in a calibration, within the limits of its axis file and without compensation; no model
-    is fitted and none changes. Ctrl-C stops the axis, and --resume goes on.
+    The axis moves as in a calibration, within the limits of its axis file and without compensation. No model
+    is fitted or changed. Ctrl-C stops the axis, and --resume goes on.
     """
     from hdbridge.calibration import measure
     from hdbridge.cli.measuring import Measurement, phases

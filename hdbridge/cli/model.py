@@ -27,7 +27,7 @@ TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis 
 def register(app: typer.Typer) -> None:
     """Adds the commands."""
     group = typer.Typer(
-        help="The models of an axis: the active one, one that waits, and every one that there was.",
+        help="Manage the models of an axis: the active one, a pending one, and all earlier ones.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )

@@ -64,7 +64,7 @@ def motion(
 ) -> None:
     """Run the axis at several speeds; print the ripple of the load without and with compensation.
 
-    Measures how the axis answers a correction in motion, and makes up for it.
+    Measures the response of the axis to a correction in motion, and compensates for it.
     """
     from hdbridge.calibration.motion import motion_test, motion_test_s
     from hdbridge.cli.booted import booted

@@ -51,7 +51,7 @@ def move(
         list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
     ],
     relative: Annotated[
-        bool, typer.Option("--relative", help="Each angle counts from where the axis stood before it.")
+        bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
     velocity_deg_s: Annotated[
         float | None,
@@ -68,7 +68,7 @@ def move(
     model: ModelOption = None,
     compensated: Annotated[
         bool,
-        typer.Option("--compensated/--uncompensated", help="By the active model, where there is one."),
+        typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one."),
     ] = True,
     simulate: SimulateOption = False,
     truth: TruthOption = None,
@@ -81,8 +81,8 @@ def move(
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
 
     Each move is limited in speed, acceleration and jerk by the axis file, and refused before anything moves
-    where it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
-    ends the command in good order. Then power is off: what hangs on the axis needs a brake.
+    if it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
+    ends the command in good order. Power is then switched off: a suspended load needs a brake.
     """
     from hdbridge.cli.booted import booted
     from hdbridge.control.bench import Bench, axis_view, compensation_for

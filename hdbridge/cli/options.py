@@ -71,7 +71,7 @@ TruthOption = Annotated[
     typer.Option(
         "--truth",
         metavar="TRUTH.yaml",
-        help="What the simulated axis is like; else the profile's twin, or its truth file.",
+        help="Description of the simulated axis; else the profile's twin, or its truth file.",
     ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")]
@@ -81,7 +81,7 @@ InterfaceOption = Annotated[
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
 ForceOption = Annotated[
     bool,
-    typer.Option("--force", help="Speak even where another master is heard on the bus, or has its lock."),
+    typer.Option("--force", help="Send even if another master is heard on the bus or holds its lock."),
 ]
 ColumnsOption = Annotated[
     list[str] | None,
@@ -110,7 +110,7 @@ UnwrapOption = Annotated[
 ]
 JsonOption = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Write the result for machines; - is standard output."),
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - is standard output."),
     Kind.JSON,
 ]
 HtmlOption = Annotated[

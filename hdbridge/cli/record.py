@@ -37,7 +37,7 @@ OutOption = Annotated[
     ),
 ]
 AllStatesOption = Annotated[
-    bool, typer.Option("--all-states", help="Also samples in which the axis was not enabled.")
+    bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
 ]
 
 
@@ -81,7 +81,7 @@ def info(
     flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A flight recording.")],
     json_file: JsonOption = None,
 ) -> None:
-    """Tell what a recording holds: machine, axes, models, cycles that are missing, events."""
+    """Report the content of a recording: machine, axes, models, missing cycles, events."""
     _need_extra()
     import numpy as np
 
@@ -130,7 +130,7 @@ def info(
 
 
 def mend(flights: FlightsArgument) -> None:
-    """Finish recordings that were cut off (kill, power): whole up to their last second.
+    """Repair recordings that were cut off (kill, power): complete up to their last second.
 
     The daemon does this itself when it starts. One that is being written is refused.
     """
@@ -172,8 +172,8 @@ def export(
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. Where cycles are missing, or the axis was not enabled, a new part
-    begins: a recording folder has a file for each part. Of a CSV file there can be only one part.
+    Nothing is rounded or interpolated. A new part begins if cycles are missing or the axis was not enabled:
+    a recording folder has a file for each part, and a CSV file can hold only one.
     """
     _need_extra()
     from hdbridge.daemon.recorder.export import axis_of, exported, last_model

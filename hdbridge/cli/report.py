@@ -22,7 +22,7 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Fit a recording again and tell its result; no axis is needed, nothing moves."""
+    """Fit a recording again and report the result; needs no axis and moves nothing."""
     from hdbridge.calibration import concluded
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 

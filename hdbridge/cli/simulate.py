@@ -34,7 +34,8 @@ def simulate(
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.0, help="Stop after so many seconds; else at Ctrl-C.")
+        float | None,
+        typer.Option("--duration", min=0.0, help="Stop after this many seconds; else at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.

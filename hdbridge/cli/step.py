@@ -80,7 +80,7 @@ def step(
 ) -> None:
     """Step the axis both ways under each compensation scheme; print what the load encoder measured.
 
-    The article's four schemes, and the whole model where it has more than their two parts.
+    Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
     from hdbridge.control.bench import axis_view
     from hdbridge.model import TransmissionModel

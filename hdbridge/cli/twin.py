@@ -50,7 +50,7 @@ def command(
         typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in their order."),
     ],
     check: Annotated[
-        bool, typer.Option("--check", help="Only say what has changed since the profile's twin was made.")
+        bool, typer.Option("--check", help="Only report what has changed since the profile's twin was made.")
     ] = False,
     compare: Annotated[
         bool, typer.Option("--compare", help="Only compare the simulation as it is with the recordings.")
@@ -58,7 +58,7 @@ def command(
     truth: TruthOption = None,
     afresh: Annotated[
         bool,
-        typer.Option("--afresh", help="Begin from usual values, whatever the profile says of the plant."),
+        typer.Option("--afresh", help="Start from typical values, regardless of the profile's plant."),
     ] = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
@@ -66,11 +66,11 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Teach the simulated drive an axis from recordings; say what it got wrong, and keep the twin as pending.
+    """Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as pending.
 
-    The recordings' commands run through the simulated drive once more. It is what the profile's twin or truth
-    file says, else what is usual, and errs as the active model says. Friction, inertia, spring, loops and
-    delays are fitted until it does as the axis did. `--simulate` uses the twin after
+    The recordings' commands are replayed on the simulated drive. It starts from the profile's twin or truth
+    file, else from typical values, with the transmission error of the active model. Friction, inertia,
+    spring, loops and delays are fitted until it behaves as the axis did. `--simulate` uses the twin after
     `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig

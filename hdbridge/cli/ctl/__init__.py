@@ -22,7 +22,7 @@ _SIGNED = {"ignore_unknown_options": True}
 def register(app: typer.Typer) -> None:
     """Adds the commands."""
     group = typer.Typer(
-        help="Ask a daemon that runs: look, move, stop, compensate, run procedures.",
+        help="Control a running daemon: look, move, stop, compensate, run procedures.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )

@@ -48,7 +48,7 @@ def job(
         ),
     ] = None,
     wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait until it is done; else tell its name at once.")
+        bool, typer.Option("--wait/--no-wait", help="Wait until it is done; else print its name at once.")
     ] = True,
     at: AtOption = None,
     force: TakeOption = False,
