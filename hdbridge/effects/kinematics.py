@@ -2,9 +2,9 @@
 
 Backward differences over the samples' own time steps:
 
-  v[i] = (theta[i] - theta[i-1]) / (t[i] - t[i-1])        v[0] = 0
-  a[i] = (v[i] - v[i-1]) / (t[i] - t[i-1])                a[0] = a[1] = 0
-  d[i] = sign(theta[i] - theta[i-1]), held at rest
+    v[i] = (theta[i] - theta[i-1]) / (t[i] - t[i-1])        v[0] = 0
+    a[i] = (v[i] - v[i-1]) / (t[i] - t[i-1])                a[0] = a[1] = 0
+    d[i] = sign(theta[i] - theta[i-1]), held at rest
 
 A time step of zero gives a speed of zero. On line the angle is the uncompensated command (N times the load
 target): the compensation is far slower than the motion, and feeding it back would difference each cycle's
